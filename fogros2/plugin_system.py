@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plugins: entry points looked up by group and name, imported when first asked for."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from importlib import metadata
+from typing import Any
+
+from fogros2.errors import ConfigurationError, PrerequisiteError
+
+#: What a group's plugins are called in messages.
+GROUPS = {
+    'fogros2.provider': 'provider',
+    'fogros2.shell': 'shell',
+    'fogros2.vpn': 'VPN',
+    'fogros2.dds': 'DDS vendor',
+    'fogros2.image_transport': 'image transport',
+}
+
+
+@functools.lru_cache(maxsize=None)
+def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
+    return {point.name: point for point in metadata.entry_points(group=group)}
+
+
+def names(group: str) -> list[str]:
+    """Return the names of the plugins of a group, sorted; imports none of them."""
+    return sorted(_entry_points(group))
+
+
+def load(group: str, name: str) -> Any:
+    """
+    Import and return the object that the entry point ``name`` of ``group`` names.
+
+    :raises ConfigurationError: no such plugin; the hint holds the nearest names.
+    :raises PrerequisiteError: the plugin's own dependency isn't installed.
+    """
+    points = _entry_points(group)
+    if name not in points:
+        near = difflib.get_close_matches(name, points, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(sorted(points))}"
+        raise ConfigurationError(f"no {GROUPS.get(group, group)} is called '{name}'", hint)
+    try:
+        return points[name].load()
+    except ImportError as error:
+        raise PrerequisiteError(
+            f"the {GROUPS.get(group, group)} '{name}' can't be loaded: {error}",
+            f"python3 -m pip install {error.name or name}") from error

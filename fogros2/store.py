@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Local state: one folder per machine and per launch below the XDG state home.
+
+A cache, not the truth: a provider's tags say which machines exist. Folders are 0700, files 0600
+and replaced atomically.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import dataclasses
+import fcntl
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import tempfile
+from typing import Any, Optional
+
+from fogros2 import model
+from fogros2.errors import ConfigurationError, NameTaken, StoreError
+from fogros2.model import Endpoint, MachineSpec, VpnInterface
+
+_NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
+
+
+def state_home() -> Path:
+    """Return FogROS2's state folder; ``FOGROS2_STATE_HOME`` overrides the XDG one."""
+    own = os.environ.get('FOGROS2_STATE_HOME')
+    if own:
+        return Path(own)
+    base = os.environ.get('XDG_STATE_HOME') or os.path.expanduser('~/.local/state')
+    return Path(base) / 'fogros2'
+
+
+def check_name(name: str) -> str:
+    """
+    Return ``name`` if a machine can be called so.
+
+    :raises ConfigurationError: it isn't a DNS label of at most 40 characters.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigurationError(
+            f'{name!r} is no name for a machine',
+            'use 1 to 40 lower-case letters, digits and hyphens, such as slam-1')
+    return name
+
+
+def process_start(pid: int) -> Optional[int]:
+    """Return the start time of a process in clock ticks since boot, None if there is none."""
+    try:
+        stat = Path(f'/proc/{pid}/stat').read_text()
+    except OSError:
+        return None
+    # the command's name, in parentheses, may hold spaces
+    fields = stat.rpartition(')')[2].split()
+    return None if fields[0] == 'Z' else int(fields[19])
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """
+    What the robot remembers of a machine.
+
+    :param machine_id: the provider's id, None until ``create`` returned.
+    :param token: uuid of the creation attempt, stored before it.
+    :param created: seconds since the epoch when the creation was asked for.
+    :param launch: id of the launch that has the machine, '' when none has.
+    :param pid: process of that launch, with ``pid_start`` (clock ticks) against reuse of ids.
+    :param vpn: the machine's own VPN interface.
+    :param public_key: the machine's VPN public key.
+    :param robot_vpn: the robot's side of it.
+    :param agent: the agent's folder on the machine.
+    :param python: interpreter on the machine that runs the agent.
+    :param prepared: hash of what was installed and configured, for the next launch.
+    :param damage: why the record can't be read, '' when it can.
+    """
+
+    name: str
+    provider: str
+    spec: MachineSpec
+    token: str = ''
+    created: float = 0.0
+    machine_id: Optional[str] = None
+    launch: str = ''
+    pid: int = 0
+    pid_start: int = 0
+    shell: Optional[Endpoint] = None
+    vpn: Optional[VpnInterface] = None
+    public_key: str = ''
+    robot_vpn: Optional[VpnInterface] = None
+    agent: str = ''
+    agent_program: str = ''
+    python: str = 'python3'
+    prepared: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    damage: str = ''
+
+    @property
+    def launch_alive(self) -> bool:
+        """Whether the launch that took the machine still runs."""
+        return bool(self.pid) and process_start(self.pid) == self.pid_start
+
+
+class MachineDirectory:
+    """One machine's folder: its record, keys and lock."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.name = path.name
+
+    @property
+    def key_file(self) -> Path:
+        """Where the private login key is."""
+        return self.path / 'id_ed25519'
+
+    def exists(self) -> bool:
+        """Return whether there is a record."""
+        return (self.path / 'record.json').exists()
+
+    def load(self) -> Record:
+        """
+        Read the record.
+
+        :raises StoreError: there is none, or it is damaged.
+        """
+        path = self.path / 'record.json'
+        try:
+            return record_from_json(json.loads(path.read_text()))
+        except FileNotFoundError:
+            raise StoreError(f"nothing is known of a machine '{self.name}' here",
+                             'ros2 fog list shows the machines that exist') from None
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise StoreError(
+                f'{path} is damaged: {error}',
+                f'ros2 fog delete {self.name} finds the machine by its tags') from error
+
+    def save(self, record: Record) -> Record:
+        """Write the record in place of the one before, and return it."""
+        write_private(self.path / 'record.json', model.to_json(record).encode())
+        return record
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """
+        Hold the machine's name on this robot, for as long as a launch or a verb works on it.
+
+        :raises NameTaken: somebody else holds it.
+        """
+        # beside the folder, not in it: deleting the folder must not free the name half-way
+        path = self.path.with_name(f'.{self.name}.lock')
+        _make_folder(path.parent)
+        with contextlib.ExitStack() as undo:
+            while True:
+                handle = undo.enter_context(open(path, 'a'))
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise NameTaken(
+                        f"another launch on this robot has the machine '{self.name}'",
+                        'give the machine another name=, or end that launch') from None
+                # who held it before may have removed the file that we opened meanwhile
+                if path.exists() and os.path.samestat(os.fstat(handle.fileno()), path.stat()):
+                    break
+            undo.callback(path.unlink, missing_ok=True)
+            yield
+
+    def delete(self) -> None:
+        """Remove the folder with everything in it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+class Store:
+    """The state folder."""
+
+    def __init__(self, root: Optional[Path] = None) -> None:
+        self.root = root or state_home()
+
+    def machine(self, name: str) -> MachineDirectory:
+        """Return a machine's folder, whether or not it exists."""
+        return MachineDirectory(self.root / 'machines' / check_name(name))
+
+    def launch(self, launch_id: str) -> Path:
+        """Return a launch's folder (0700), made if needed."""
+        return _make_folder(self.root / 'launches' / launch_id)
+
+    def machines(self) -> list[Record]:
+        """Return all records, sorted by name; a damaged one says so in ``damage``."""
+        records = []
+        folder = self.root / 'machines'
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if path.name.startswith('.') or not path.is_dir():
+                continue
+            try:
+                records.append(MachineDirectory(path).load())
+            except StoreError as error:
+                spec = MachineSpec(path.name, '')
+                records.append(Record(path.name, '', spec, damage=str(error)))
+        return records
+
+
+def robot_name() -> str:
+    """Return this robot's name in tags: the host's name and the user's id."""
+    return f'{os.uname().nodename}-{os.getuid()}'
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """
+    Write a file of mode 0600 in a folder of mode 0700, in place of the one before, or not at all.
+
+    :raises StoreError: the disk is full, or the folder isn't ours.
+    """
+    _make_folder(path.parent)
+    try:
+        handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        try:
+            with os.fdopen(handle, 'wb') as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(aside, path)
+        except BaseException:
+            os.unlink(aside)
+            raise
+    except OSError as error:
+        raise StoreError(f'{path} can\'t be written: {error.strerror}',
+                         'FOGROS2_STATE_HOME names another folder for it') from error
+
+
+def _make_folder(path: Path) -> Path:
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f'{path} can\'t be made: {error.strerror}',
+                         'FOGROS2_STATE_HOME names another folder for it') from error
+    return path
+
+
+def record_from_json(data: Mapping[str, Any]) -> Record:
+    """Return the Record that ``model.to_json`` wrote; unknown keys of a later version are left."""
+    known = {f.name for f in dataclasses.fields(Record)}
+    values = {key: value for key, value in data.items() if key in known}
+    spec = {f.name for f in dataclasses.fields(MachineSpec)}
+    values['spec'] = MachineSpec(**{
+        key: tuple(value) if key == 'containers' else value
+        for key, value in values['spec'].items() if key in spec})
+    for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
+        if values.get(key) is not None:
+            values[key] = kind(**values[key])
+    return Record(**values)

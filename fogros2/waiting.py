@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time: the deadlines of a deployment, and the only polling loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import threading
+import time
+from typing import Optional, TypeVar
+
+from fogros2.errors import Cancelled, DeadlineExceeded
+
+T = TypeVar('T')
+
+
+@dataclasses.dataclass(frozen=True)
+class Timeouts:
+    """How long each part of a deployment may take, in seconds."""
+
+    boot: float = 300.0
+    ssh: float = 60.0
+    install: float = 1800.0
+    sync: float = 1800.0
+    build: float = 3600.0
+    vpn: float = 30.0
+    agent: float = 30.0
+    command: float = 60.0
+    delete: float = 300.0
+
+
+def wait_until(
+    probe: Callable[[], Optional[T]],
+    *,
+    timeout: float,
+    what: str,
+    hint: str = '',
+    cancel: Optional[threading.Event] = None,
+    interval: float = 0.02,
+    longest: float = 1.0,
+) -> T:
+    """
+    Call ``probe`` until it returns something other than None or False, and return that.
+
+    The pauses grow from ``interval`` to ``longest`` (seconds), so a fast machine is seen at once
+    and a slow one isn't flooded.
+
+    :param what: completes 'timed out after 30 s waiting for ...'.
+    :raises DeadlineExceeded: after ``timeout`` seconds.
+    :raises Cancelled: as soon as ``cancel`` is set.
+    """
+    deadline = time.monotonic() + timeout
+    cancel = cancel or threading.Event()
+    while True:
+        if cancel.is_set():
+            raise Cancelled(f'waiting for {what}')
+        value = probe()
+        if value is not None and value is not False:
+            return value
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
+        cancel.wait(min(interval, left))
+        interval = min(interval * 1.5, longest)

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A talker on a machine of its own, a container on this computer; a listener here."""
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    """Describe the demo; ``count:=20`` ends it after 20 messages."""
+    machine = ContainerInstance(name=LaunchConfiguration('name'))
+    return FogROSLaunchDescription([
+        DeclareLaunchArgument('name', default_value='talker-machine',
+                              description='what the machine is called'),
+        DeclareLaunchArgument('count', default_value='0',
+                              description='messages after which the launch ends, 0 for never'),
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen'),
+        Node(package='fogros2_examples', executable='listener', output='screen',
+             parameters=[{'count': LaunchConfiguration('count')}], on_exit=Shutdown()),
+    ])

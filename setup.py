@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One ROS package of build type ament_python, installable by pip as well.
+
+colcon looks for no package below a package, so this one also installs the index markers,
+``share/`` and ``lib/`` of ``fogros2_examples``.
+"""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+VERSION = '0.1.0'
+#: Packages whose nodes ``ros2 run`` and launch files find: package -> its executables.
+EXECUTABLES = {
+    'fogros2_examples': ['talker', 'listener'],
+}
+
+
+def data_files():
+    """Yield what ament looks for: markers, manifests, launch files, executables."""
+    for package in ['fogros2', *EXECUTABLES]:
+        yield 'share/ament_index/resource_index/packages', [f'resource/{package}']
+    yield 'share/fogros2', ['package.xml']
+    yield 'share/fogros2/launch', sorted(str(p) for p in Path('launch').glob('*.launch.*'))
+    for package, names in EXECUTABLES.items():
+        yield f'share/{package}', [f'{package}/package.xml']
+        yield f'share/{package}/launch', sorted(
+            str(p) for p in Path(package, 'launch').glob('*.launch.*'))
+        yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
+
+
+setup(
+    name='fogros2',
+    version=VERSION,
+    description='Runs nodes of a ROS 2 launch file on machines in the cloud',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    packages=find_packages(include=['fogros2*', 'fogros2_examples*', 'ros2fog_cli*']),
+    package_data={'fogros2': ['py.typed']},
+    data_files=list(data_files()),
+    install_requires=['setuptools', 'paramiko', 'PyYAML'],
+    extras_require={
+        'test': ['pytest', 'pytest-timeout', 'ruff', 'mypy', 'types-paramiko', 'types-PyYAML'],
+    },
+    zip_safe=False,
+    entry_points={
+        'fogros2.provider': [
+            'container = fogros2.provider.container:ContainerProvider',
+            'ssh = fogros2.provider.ssh:SSHProvider',
+        ],
+        'fogros2.shell': [
+            'ssh = fogros2.shell.ssh:SSHShell',
+            'local = fogros2.shell.local:LocalShell',
+        ],
+        'fogros2.vpn': [
+            'wireguard = fogros2.vpn.wireguard:WireGuard',
+        ],
+        'fogros2.dds': [
+            'rmw_cyclonedds_cpp = fogros2.dds.cyclonedds:CycloneDds',
+        ],
+        'ros2cli.command': [
+            'fog = ros2fog_cli.command.fog:FogCommand',
+        ],
+        'ros2cli.extension_point': [
+            'fogros2.verb = ros2fog_cli.verb:VerbExtension',
+        ],
+        'fogros2.verb': [
+            'connect = ros2fog_cli.verb.connect:ConnectVerb',
+            'delete = ros2fog_cli.verb.delete:DeleteVerb',
+            'doctor = ros2fog_cli.verb.doctor:DoctorVerb',
+            'env = ros2fog_cli.verb.env:EnvVerb',
+            'gc = ros2fog_cli.verb.gc:GcVerb',
+            'list = ros2fog_cli.verb.list:ListVerb',
+            'logs = ros2fog_cli.verb.logs:LogsVerb',
+            'status = ros2fog_cli.verb.status:StatusVerb',
+        ],
+    },
+)
