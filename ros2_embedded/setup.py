@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Installs the embedded default into an interpreter that has no ROS 2."""
+
+import importlib.metadata
+import os
+from pathlib import Path
+import sys
+
+from setuptools import Distribution, find_packages, setup
+
+NAME = 'ros2-embedded'
+VERSION = '0.1.0'
+HERE = Path(__file__).resolve().parent
+
+
+def ros2_found() -> str | None:
+    """Say where this interpreter gets ROS 2 from, or None if it has none but ours."""
+    for package in ('rclpy', 'launch', 'launch_ros', 'ros2cli'):
+        for distribution in importlib.metadata.distributions(name=package):
+            return f'{package} {distribution.version} in {distribution.locate_file("")}'
+    for entry in sys.path:
+        if entry.startswith('/opt/ros/'):
+            return f'{entry} on the Python path'
+    if os.environ.get('ROS_DISTRO'):
+        for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+            if prefix and Path(prefix, 'share', 'rclpy').is_dir():
+                if Path(prefix).resolve() != Path(sys.prefix).resolve():
+                    return f'ROS 2 {os.environ["ROS_DISTRO"]} in {prefix}'
+    return None
+
+
+ROS_PACKAGES = (
+    'ament_index_python', 'launch', 'launch_ros', 'launch_xml', 'launch_yaml', 'rclpy',
+    'rosidl_runtime_py', 'ros2cli', 'ros2launch', 'ros2run', 'ros2pkg', 'ros2topic', 'ros2node',
+    'ros2service', 'ros2param')
+MANIFEST = """<?xml version="1.0"?>
+<package format="3">
+  <name>{name}</name>
+  <version>{version}</version>
+  <description>Part of FogROS2's embedded default.</description>
+  <maintainer email="fogros2@example.org">FogROS2</maintainer>
+  <license>Apache-2.0</license>
+  <export><build_type>ament_python</build_type></export>
+</package>
+"""
+
+
+def index_entries() -> list[tuple[str, list[str]]]:
+    """Write the marker and the manifest of each ROS package; say where they are installed."""
+    tables = HERE / 'rosidl_embedded' / 'tables'
+    packages = {*ROS_PACKAGES, *(table.stem for table in tables.glob('*.txt'))}
+    entries: list[tuple[str, list[str]]] = []
+    markers = Path('build', 'index')
+    for name in sorted(packages):
+        manifest = markers / 'share' / name / 'package.xml'
+        (HERE / manifest).parent.mkdir(parents=True, exist_ok=True)
+        (HERE / manifest).write_text(MANIFEST.format(name=name, version=VERSION))
+        marker = markers / 'packages' / name
+        (HERE / marker).parent.mkdir(parents=True, exist_ok=True)
+        (HERE / marker).write_text('')
+        entries.append((f'share/{name}', [str(manifest)]))
+        entries.append(('share/ament_index/resource_index/packages', [str(marker)]))
+    return entries
+
+
+class Embedded(Distribution):
+    """A distribution whose data files are installed with editable wheels, too."""
+
+    has_data = Distribution.has_data_files
+
+
+def verbs(command: str, **classes: str) -> list[str]:
+    """Give the entry points of a command's verbs, all of which live in one module."""
+    return [f'{verb.rstrip("_")} = ros2cli.verb.{command}:{name}'
+            for verb, name in classes.items()]
+
+
+if (found := ros2_found()) is not None:
+    sys.exit(f'{NAME} is for interpreters without ROS 2; this one has {found}: use that')
+
+setup(
+    distclass=Embedded,
+    name=NAME,
+    version=VERSION,
+    description="FogROS2's embedded default: ROS 2's Python API where ROS 2 isn't installed",
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    package_dir={'': '.'},  # editable: one .pth line, new packages are found at once
+    packages=find_packages(str(HERE), exclude=['test', 'test.*', 'build', 'build.*']),
+    package_data={'rosidl_embedded': ['tables/*.txt'], '': ['py.typed', '*.xsd']},
+    data_files=index_entries(),
+    install_requires=['cyclonedds>=11.0,<12', 'numpy', 'PyYAML'],
+    zip_safe=False,
+    entry_points={
+        'console_scripts': ['ros2 = ros2cli.cli:main'],
+        'ros2cli.command': [
+            'launch = ros2cli.command.launch:LaunchCommand',
+            'run = ros2cli.command.run:RunCommand',
+            'pkg = ros2cli.command.pkg:PkgCommand',
+            'topic = ros2cli.command.topic:TopicCommand',
+            'node = ros2cli.command.node:NodeCommand',
+            'service = ros2cli.command.service:ServiceCommand',
+            'param = ros2cli.command.param:ParamCommand',
+        ],
+        'ros2cli.extension_point': [
+            'ros2cli.command = ros2cli.command:CommandExtension',
+            'ros2topic.verb = ros2cli.verb:VerbExtension',
+            'ros2node.verb = ros2cli.verb:VerbExtension',
+            'ros2service.verb = ros2cli.verb:VerbExtension',
+            'ros2param.verb = ros2cli.verb:VerbExtension',
+            'ros2pkg.verb = ros2cli.verb:VerbExtension',
+        ],
+        'ros2topic.verb': verbs(
+            'topic', list='ListVerb', info='InfoVerb', type='TypeVerb', find='FindVerb')
+        + ['echo = ros2cli.verb.topic_echo:EchoVerb', 'pub = ros2cli.verb.topic_pub:PubVerb',
+           'hz = ros2cli.verb.topic_rate:HzVerb', 'bw = ros2cli.verb.topic_rate:BwVerb',
+           'delay = ros2cli.verb.topic_rate:DelayVerb'],
+        'ros2node.verb': verbs('node', list='ListVerb', info='InfoVerb'),
+        'ros2service.verb': verbs(
+            'service', list='ListVerb', call='CallVerb', type='TypeVerb', find='FindVerb'),
+        'ros2param.verb': verbs(
+            'param', list='ListVerb', get='GetVerb', set='SetVerb', describe='DescribeVerb',
+            dump='DumpVerb', load='LoadVerb', delete='DeleteVerb'),
+        'ros2pkg.verb': verbs(
+            'pkg', list='ListVerb', prefix='PrefixVerb', executables='ExecutablesVerb'),
+    },
+)
