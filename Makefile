@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+# Everything below does its own set-up: see tools/setup.sh.
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench soak clean
+
+## demo   a launch file puts a talker on a container machine and takes it down again
+demo:
+	@tools/setup.sh demo
+	@tools/run.sh best -- python tools/demo.py
+
+## test   all tests, on the embedded default and, where it is installed, on ROS 2
+test:
+	@tools/setup.sh test
+	@tools/test.sh $(ARGS)
+
+## lint   ruff and mypy
+lint:
+	@tools/setup.sh lint
+	@tools/lint.sh
+
+## bench  every benchmark; figures go to benchmarks/results
+bench:
+	@tools/setup.sh demo
+	@set -e; for script in benchmarks/*.py; do \
+		echo "== $$script"; tools/run.sh best -- python "$$script"; done
+
+## soak   the long tests that 'make test' leaves out
+soak:
+	@tools/setup.sh test
+	@tools/run.sh embedded -- pytest -m soak $(ARGS)
+
+## setup  only what the others need: system packages and the virtual environment
+setup:
+	@tools/setup.sh demo
+
+## clean  take away what the targets above made in this folder
+clean:
+	rm -rf .venv .venv-ros .cache build install log *.egg-info ros2_embedded/*.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:
+	@echo 'make demo and make test are where to begin. All targets:'
+	@sed -n 's/^## /  make /p' Makefile

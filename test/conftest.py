@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all tests share: state of their own, and the reasons why this computer can't run some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import shutil
+import socket
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def state_home(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Path]:
+    """Give each test a state folder of its own, so that none sees the user's machines."""
+    path = tmp_path_factory.mktemp('state')
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(path))
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture
+def free_udp_port() -> int:
+    """Return a UDP port that was free a moment ago."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('127.0.0.1', 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+@pytest.fixture(scope='session')
+def root() -> None:
+    """Skip where commands can't run as root: neither root nor sudo without a question."""
+    if os.geteuid() != 0 and os.system('sudo -n true 2>/dev/null') != 0:
+        pytest.skip('needs root, or sudo without a password')
+
+
+@pytest.fixture(scope='session')
+def tun(root: None) -> None:
+    """Skip where no TUN device can be opened."""
+    if not os.path.exists('/dev/net/tun'):
+        pytest.skip('needs /dev/net/tun')

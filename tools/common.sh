@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+# What setup.sh, run.sh and test.sh share. POSIX sh, sourced with the project as the folder.
+
+say() { printf '%s\n' "-- $*"; }
+fail() { printf '%s\n' "** $1" >&2; shift; for line in "$@"; do printf '   %s\n' "$line" >&2; done; exit 1; }
+
+VENV=${FOGROS2_VENV:-$PWD/.venv}
+VENV_ROS=${FOGROS2_VENV_ROS:-$PWD/.venv-ros}
+
+# Prints the set-up script of ROS 2 Jazzy, or nothing where it isn't installed.
+ros_setup() {
+    if [ "${ROS_DISTRO:-}" = jazzy ] && [ -n "${AMENT_PREFIX_PATH:-}" ]; then
+        # sourced already: the prefix that has rclpy is the one to source
+        old_ifs=$IFS; IFS=:
+        for prefix in $AMENT_PREFIX_PATH; do
+            if [ -d "$prefix/share/rclpy" ] && [ -f "$prefix/setup.sh" ]; then
+                IFS=$old_ifs; printf '%s\n' "$prefix/setup.sh"; return
+            fi
+        done
+        IFS=$old_ifs
+    fi
+    if [ -f /opt/ros/jazzy/setup.sh ] && [ -d /opt/ros/jazzy/share/rclpy ]; then
+        printf '%s\n' /opt/ros/jazzy/setup.sh
+    fi
+}
+
+# Runs a command as root: as it is, or through sudo, whose password was asked before.
+as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n -- "$@"; fi; }
+
+# Whether as_root would work without a question.
+root_ready() { [ "$(id -u)" = 0 ] || { command -v sudo && sudo -n true; } >/dev/null 2>&1; }
+
+# Looks into the sbin folders too, which are not on a user's path in Debian.
+have() { PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin" command -v "$1" >/dev/null 2>&1; }

@@ -1,0 +1,48 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# Runs a command in one of the project's environments.
+#
+#   tools/run.sh embedded|ros|best -- COMMAND...
+#
+# 'best' is ROS 2 Jazzy where it is installed, else the embedded default. As a user, the sudo
+# ticket that setup.sh got is kept fresh until the command ends.
+set -eu
+folder=$(cd "$(dirname "$0")/.." && pwd)
+back=$PWD
+cd "$folder"
+. tools/common.sh
+which=$1
+[ "$2" = -- ]
+shift 2
+ros=$(ros_setup)
+if [ "$which" = best ]; then
+    if [ -n "$ros" ]; then which=ros; else which=embedded; fi
+fi
+case $which in
+    ros)
+        [ -n "$ros" ] || fail "ROS 2 Jazzy isn't installed here."
+        set +eu; . "$ros"; set -eu
+        export VIRTUAL_ENV="$VENV_ROS" AMENT_PREFIX_PATH="$VENV_ROS:$AMENT_PREFIX_PATH"
+        packages=$("$VENV_ROS/bin/python" -c \
+            "import sysconfig; print(sysconfig.get_path('purelib'))")
+        # programs of ROS start with the system's interpreter: they find ours by this
+        export PYTHONPATH="$packages:${PYTHONPATH:-}"
+        ;;
+    embedded)
+        unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION \
+            COLCON_PREFIX_PATH CMAKE_PREFIX_PATH PYTHONHOME
+        export VIRTUAL_ENV="$VENV"
+        ;;
+    *) fail "Unknown environment '$which'." ;;
+esac
+export PATH="$VIRTUAL_ENV/bin:$PATH"
+cd "$back"
+if [ "$(id -u)" != 0 ] && root_ready; then
+    # at most three hours, and not a second longer than the command
+    ( end=180; me=$$
+      while [ $end -gt 0 ] && kill -0 "$me" 2>/dev/null; do
+          sudo -n -v 2>/dev/null || exit 0
+          sleep 60; end=$((end - 1))
+      done ) </dev/null >/dev/null 2>&1 &
+fi
+exec "$@"

@@ -1,0 +1,224 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# Makes this computer ready for `make demo`, `make test` or `make lint`, and says what it does.
+#
+#   tools/setup.sh demo|test|lint
+#
+# Touches two things: system packages, through apt and only those that are missing, and a virtual
+# environment in this folder (.venv; .venv-ros on top of ROS 2 Jazzy where that is installed).
+# A second run finds everything done in a fraction of a second.
+set -eu
+cd "$(dirname "$0")/.."
+. tools/common.sh
+target=${1:-demo}
+
+# --- who is asking ------------------------------------------------------------------------------
+if [ "$(id -u)" = 0 ] && [ -n "${SUDO_UID:-}" ] && [ "$SUDO_UID" != 0 ] \
+        && [ -z "${FOGROS2_AS_ROOT:-}" ]; then
+    fail "You are root by sudo, so everything made here would belong to root." \
+         "Run 'make $target' as ${SUDO_USER:-yourself}: it asks for what it needs." \
+         "To run it as root all the same: FOGROS2_AS_ROOT=1 make $target"
+fi
+
+# --- what is missing ----------------------------------------------------------------------------
+# The container of the demo sees the system's folders, not a home: a system Python comes first.
+# cyclonedds has wheels for 3.10 to 3.13, so a newer one comes last.
+find_python() {
+    for want in '(3, 10) <= v <= (3, 13)' 'v >= (3, 10)'; do
+        for python in /usr/bin/python3 /usr/bin/python3.13 /usr/bin/python3.12 \
+                /usr/bin/python3.11 /usr/bin/python3.10 /usr/local/bin/python3 python3 \
+                python3.13 python3.12 python3.11 python3.10; do
+            if have "$python" && "$python" -c \
+                    "import sys; v = sys.version_info[:2]; sys.exit(not ($want))" 2>/dev/null; then
+                command -v "$python"; return
+            fi
+        done
+    done
+}
+
+known() { apt-cache show "$1" 2>/dev/null | grep -q .; }
+
+missing_packages() {
+    if [ -z "$python" ]; then
+        echo python3 python3-venv
+    elif ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        # /usr/bin/python3.12 of a computer whose python3 is older has a package of its own
+        version=$("$python" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
+        if [ "$(readlink -f "$python")" = "$(readlink -f /usr/bin/python3)" ]; then
+            echo python3-venv
+        else
+            echo "$version-venv"
+        fi
+    fi
+    [ -e /etc/ssl/certs/ca-certificates.crt ] || echo ca-certificates
+    [ "$target" != lint ] || return 0
+    while read -r program package; do
+        have "$program" || echo "$package"
+    done <<LIST
+podman podman
+runc runc
+wg wireguard-tools
+wireguard-go wireguard-go
+nft nftables
+iptables iptables
+ip iproute2
+ping iputils-ping
+rsync rsync
+sshd openssh-server
+ssh openssh-client
+sudo sudo
+LIST
+    # Podman's networks: netavark since 4.0, the CNI plugins before; its package may bring neither.
+    if ! [ -x /usr/lib/podman/netavark ] && ! [ -x /usr/libexec/podman/netavark ] \
+            && ! [ -x /usr/lib/cni/bridge ] && ! [ -x /usr/libexec/cni/bridge ]; then
+        if known netavark; then echo netavark aardvark-dns; else echo containernetworking-plugins; fi
+    fi
+}
+
+python=$(find_python)
+packages=$(missing_packages | tr '\n' ' ')
+packages=${packages% }
+
+# --- the password, once, before anything else ---------------------------------------------------
+if [ "$target" != lint ] || [ -n "$packages" ]; then
+    if ! root_ready; then
+        if [ "$(id -u)" != 0 ] && have sudo && [ -t 0 ]; then
+            say "Your password is for sudo, which is asked once, for:"
+            [ -z "$packages" ] || printf '     %s\n' "apt-get update" \
+                "apt-get install --no-install-recommends $packages"
+            [ "$target" = lint ] || printf '     %s\n' \
+                "podman, ip, wg, wireguard-go, nft: a container machine and a VPN interface to it"
+            sudo -v || fail "sudo refused: ask somebody who may use it, or run this as root."
+        elif [ -n "$packages" ]; then
+            fail "These system packages are missing, and installing them takes root:" "$packages" \
+                 "As root: apt-get update && apt-get install --no-install-recommends $packages" \
+                 "Then run 'make $target' again, as yourself."
+        elif [ "$target" = demo ]; then
+            fail "A container machine and a VPN interface take root: sudo or a root shell." \
+                 "As a user with sudo, run this in a terminal, or after 'sudo -v'."
+        else
+            say "No root and no sudo here: the tests that need it will be skipped."
+        fi
+    fi
+fi
+
+# --- system packages ----------------------------------------------------------------------------
+# A server that starts just because a test wants its program would open a port on this computer:
+# on systemd it is masked while the package goes in and stays disabled after.
+install_packages() {
+    quiet_sshd=
+    case " $packages " in *" openssh-server "*)
+        if [ -d /run/systemd/system ]; then
+            quiet_sshd=yes
+            say "openssh-server is wanted for its program alone: its service is not started"
+            as_root systemctl mask --runtime --quiet ssh.service ssh.socket
+        fi
+    esac
+    # RUNLEVEL=1 asks the same of computers without systemd.
+    status=0
+    { as_root apt-get update -q \
+        && as_root env DEBIAN_FRONTEND=noninteractive RUNLEVEL=1 \
+            apt-get install -q -y --no-install-recommends $packages; } \
+        >"$log" 2>&1 </dev/null || status=$?
+    if [ -n "$quiet_sshd" ]; then
+        as_root systemctl unmask --runtime --quiet ssh.service ssh.socket || status=$?
+        as_root systemctl disable --quiet ssh.service ssh.socket >>"$log" 2>&1 || status=$?
+    fi
+    if [ $status != 0 ]; then
+        tail -n 15 "$log" >&2
+        fail "apt-get could not install $packages" "Its whole output: $log"
+    fi
+}
+
+mkdir -p .cache
+log=$PWD/.cache/setup.log
+if [ -n "$packages" ]; then
+    if ! have apt-get; then
+        fail "Missing, and this computer has no apt to install it from: $packages" \
+             "Install the same by hand and run 'make $target' again."
+    fi
+    say "Installing system packages: $packages"
+    install_packages
+    python=$(find_python)
+    packages=$(missing_packages | tr '\n' ' ')
+    [ -z "${packages% }" ] || fail "apt-get installed everything, and still missing: $packages"
+fi
+[ -n "$python" ] || fail "Python 3.10 or newer is needed; none found, and apt has none." \
+    "Debian 12, Ubuntu 22.04 and newer have one."
+
+# --- the virtual environments -------------------------------------------------------------------
+# pip's cache stays in this folder as well, unless the user has chosen a place.
+export PIP_CACHE_DIR="${PIP_CACHE_DIR:-$PWD/.cache/pip}" PIP_DISABLE_PIP_VERSION_CHECK=1
+export PIP_ROOT_USER_ACTION=ignore
+
+checksum() { sha256sum | cut -c 1-16; }
+
+# Hash of the files that get installed, and of those that say what they need.
+sources_hash() {
+    find setup.py setup.cfg package.xml resource launch fogros2 fogros2_examples ros2fog_cli \
+        image_transport_h264 ros2_embedded -name __pycache__ -prune -o -name '*.egg-info' -prune \
+        -o -name '*.pyc' -o -type f -print0 2>/dev/null | sort -z | xargs -0 sha256sum | checksum
+}
+needs_hash() { { cat setup.py ros2_embedded/setup.py tools/setup.sh; echo "$1"; } | checksum; }
+
+# Built from a copy: setuptools leaves build/ in the folder, and stale files would go in from there.
+copy_sources() {
+    rm -rf .cache/source
+    mkdir -p .cache/source
+    tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=./.venv --exclude=./.venv-ros \
+        --exclude=./.git --exclude=./.cache --exclude=./build --exclude=./install --exclude=./log \
+        --exclude=./benchmarks --exclude=./test . | tar -x -C .cache/source
+}
+
+# prepare FOLDER PYTHON OPTIONS WHAT: $5... are pip's words for what goes in
+prepare() {
+    folder=$1 interpreter=$2 options=$3 what=$4
+    shift 4
+    needs=$(needs_hash "$interpreter $what")
+    sources=$(sources_hash)
+    stamp=$folder/.fogros2-stamp
+    old_needs= old_sources=
+    [ ! -f "$stamp" ] || read -r old_needs old_sources <"$stamp"
+    if [ "$old_needs $old_sources" = "$needs $sources" ] && "$folder/bin/python" -c ''; then
+        return 0
+    fi
+    rm -f "$stamp"
+    copy_sources
+    if [ "$old_needs" != "$needs" ] || ! "$folder/bin/python" -c '' 2>/dev/null; then
+        say "Making the virtual environment ${folder#"$PWD"/} ($what, $("$interpreter" -V 2>&1))"
+        [ -x "$folder/bin/python" ] && "$folder/bin/python" -c '' 2>/dev/null \
+            || "$interpreter" -m venv --clear $options "$folder"
+        "$folder/bin/python" -m pip install -q 'setuptools>=70.1' wheel
+        "$folder/bin/python" -m pip install -q --no-build-isolation "$@"
+    else
+        say "Sources changed: installing them into ${folder#"$PWD"/} again"
+    fi
+    # whatever pip believes to be there already
+    for word; do set -- "$@" "${word%\[*\]}"; shift; done
+    "$folder/bin/python" -m pip install -q --no-deps --no-build-isolation --force-reinstall "$@"
+    rm -rf .cache/source
+    echo "$needs $sources" >"$stamp"
+}
+
+ros=$(ros_setup)
+if [ -z "$ros" ] || [ "$target" != demo ]; then
+    # nothing of a sourced ROS may reach the environment that does without
+    (
+        unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME
+        prepare "$VENV" "$python" '' 'embedded default' \
+            .cache/source/ros2_embedded '.cache/source[test]'
+    )
+fi
+if [ -n "$ros" ] && [ "$target" != lint ]; then
+    (
+        set +eu; . "$ros"; set -eu
+        interpreter=/usr/bin/python3
+        "$interpreter" -c 'import rclpy' 2>/dev/null || interpreter=$(command -v python3)
+        prepare "$VENV_ROS" "$interpreter" --system-site-packages "ROS 2 $ROS_DISTRO" \
+            '.cache/source[test]'
+        # ROS's own ros2 has /usr/bin/python3 in its first line, which wouldn't see ours
+        printf '#!%s\nimport sys\nfrom ros2cli.cli import main\nsys.exit(main())\n' \
+            "$VENV_ROS/bin/python" >"$VENV_ROS/bin/ros2"
+        chmod 755 "$VENV_ROS/bin/ros2"
+    )
+fi

@@ -1,0 +1,27 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# Runs all tests on the embedded default, then on ROS 2 Jazzy where it is installed, and closes
+# with one line of counts over all. Words are passed on to pytest.
+set -u
+cd "$(dirname "$0")/.."
+. tools/common.sh
+mkdir -p .cache
+rm -f .cache/test-*.xml
+status=0
+# what the user has set for nodes of their own must not decide what a test sees
+unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE \
+    ROS_STATIC_PEERS ROS_LOCALHOST_ONLY FOGROS2_STATE_HOME
+
+suite() {
+    name=$1; shift
+    say "Tests on $name"
+    tools/run.sh "$@" || status=1
+}
+suite 'the embedded default' embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
+if [ -n "$(ros_setup)" ]; then
+    suite 'ROS 2 Jazzy' ros -- pytest --junit-xml=.cache/test-ros.xml "$@"
+else
+    say "ROS 2 Jazzy isn't installed here: tested on the embedded default alone"
+fi
+tools/run.sh embedded -- python tools/closing_line.py .cache/test-*.xml || status=1
+exit $status
