@@ -231,7 +231,10 @@ def write_private(path: Path, data: bytes) -> None:
 
 def _make_folder(path: Path) -> Path:
     try:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # mkdir's parents=True would give the ones above the usual mode
+        for folder in reversed([path, *path.parents]):
+            if not folder.exists():
+                folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
         raise StoreError(f'{path} can\'t be made: {error.strerror}',
                          'FOGROS2_STATE_HOME names another folder for it') from error

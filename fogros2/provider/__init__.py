@@ -28,6 +28,10 @@ class Provider(abc.ABC):
     """
 
     name: ClassVar[str]
+    #: Folder of the agent that ``create`` starts at boot, and its program on the machine; ''
+    #: where it starts none, and the deployment does as soon as it has a shell.
+    agent_directory: ClassVar[str] = ''
+    agent_program: ClassVar[str] = ''
 
     def check(self, spec: MachineSpec) -> None:
         """

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pure decisions of a deployment: from specs, the robot's environment and facts to values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+import difflib
+import ipaddress
+import os
+from pathlib import Path
+import sys
+from typing import Any, Optional
+
+from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
+from fogros2.model import DdsInterface, MachineSpec, Peer, VpnInterface
+
+#: Kept free below the machines' addresses: .0 is the network, .1 the robot.
+FIRST_MACHINE = 2
+#: UDP port of the agent's heartbeat, on the VPN's address alone.
+HEARTBEAT_PORT = 7399
+DEFAULT_RMW = 'rmw_cyclonedds_cpp'
+#: What a login shell has at least, without the user's own additions.
+SYSTEM_PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
+
+_PATH_VARIABLES = (
+    'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'PYTHONPATH',
+    'LD_LIBRARY_PATH', 'PATH')
+_PLAIN_VARIABLES = (
+    'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_DOMAIN_ID',
+    'ROS_AUTOMATIC_DISCOVERY_RANGE', 'RCUTILS_LOGGING_SEVERITY', 'RCUTILS_COLORIZED_OUTPUT',
+    'RCUTILS_CONSOLE_OUTPUT_FORMAT')
+
+
+def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
+    """
+    Return the RMW of all nodes of the launch: the user's, or Cyclone's.
+
+    :raises DdsError: the user's is one that there is no plugin for.
+    """
+    rmw = environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW
+    if rmw not in known:
+        raise DdsError(f'RMW_IMPLEMENTATION={rmw} is none that FogROS2 can lead over a VPN',
+                       f"use one of {', '.join(known)}, or unset it")
+    return rmw
+
+
+def robot_interface(launch_id: str, network: str, port: int, key_file: str) -> VpnInterface:
+    """Return the robot's VPN interface: the first address, and guarded."""
+    return VpnInterface(
+        name=f'fog{launch_id}', address=_host(network, 1), network=network, port=port,
+        key_file=key_file, guarded=True)
+
+
+def machine_interface(
+    launch_id: str, network: str, index: int, port: int, key_file: str,
+) -> VpnInterface:
+    """
+    Return the VPN interface of the ``index``-th machine, counted from 0.
+
+    Its name differs from the robot's, so that a machine may be the robot itself.
+
+    :raises ConfigurationError: the subnet has no address left.
+    """
+    return VpnInterface(
+        name=f'fog{launch_id}m{index}', address=_host(network, FIRST_MACHINE + index),
+        network=network, port=port, key_file=key_file)
+
+
+def _host(network: str, number: int) -> str:
+    subnet = ipaddress.ip_network(network)
+    if number >= subnet.num_addresses - 1:
+        raise ConfigurationError(
+            f'{network} has no address for another machine',
+            f'a launch takes {subnet.num_addresses - 2 - 1} machines')
+    return str(subnet[number])
+
+
+def machine_port(launch_id: str) -> int:
+    """Return the UDP port of the machines' VPN, out of the dynamic range, by the launch's id."""
+    return 49152 + int(launch_id, 16) % 16000
+
+
+def machine_peers(
+    robot: Peer, own_name: str, machines: Mapping[str, Peer],
+) -> list[Peer]:
+    """
+    Return a machine's peers: the robot, then every other machine.
+
+    The robot has no endpoint there: it dials, from behind whatever NAT it is.
+    """
+    others = [peer for name, peer in sorted(machines.items()) if name != own_name]
+    return [dataclasses.replace(robot, endpoint=None), *others]
+
+
+def robot_dds_interfaces(vpn: str) -> list[DdsInterface]:
+    """
+    Return the interfaces of the robot's nodes.
+
+    The VPN's is preferred, or nothing crosses it; it may come and go.
+    """
+    return [DdsInterface(vpn, priority=10, required=False), DdsInterface('lo')]
+
+
+def machine_dds_interfaces(vpn: str) -> list[DdsInterface]:
+    """Return the interfaces of a machine's nodes: the VPN, and itself; nothing else is open."""
+    return [DdsInterface(vpn, priority=10, required=False), DdsInterface('lo')]
+
+
+@dataclasses.dataclass(frozen=True)
+class Underlay:
+    """
+    The ROS 2 environment that the robot's launch runs in, as paths that a machine may have too.
+
+    :param prefixes: ament prefixes and the Python environment, outside the workspace.
+    :param ros2: path of the ``ros2`` program.
+    :param environment: variables that make nodes find all of it and the workspace's install
+        space; entries of other places (a user's own) are left out.
+    """
+
+    prefixes: tuple[str, ...]
+    ros2: str
+    environment: Mapping[str, str]
+
+
+def underlay(
+    environment: Mapping[str, str], workspace: Optional[str], ros2: str,
+    prefix: str = sys.prefix,
+) -> Underlay:
+    """
+    Return the underlay that ``environment`` describes.
+
+    :param ros2: path of the ``ros2`` program that the robot would run.
+    :param prefix: the interpreter's own; a virtual environment is part of the underlay.
+    """
+    ament = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    outside = [p for p in ament if not _below(p, [workspace] if workspace else [])]
+    prefixes = list(dict.fromkeys([*outside, *([prefix] if prefix != '/usr' else [])]))
+    kept = [*prefixes, *([workspace] if workspace else [])]
+    variables = {}
+    for name in _PATH_VARIABLES:
+        entries = [
+            entry for entry in environment.get(name, '').split(os.pathsep)
+            if entry and _below(entry, kept)]
+        if name == 'PATH':
+            entries = list(dict.fromkeys([*entries, os.path.dirname(ros2), SYSTEM_PATH]))
+        if entries:
+            variables[name] = os.pathsep.join(entries)
+    variables.update({
+        name: environment[name] for name in _PLAIN_VARIABLES if environment.get(name)})
+    return Underlay(tuple(prefixes), ros2, variables)
+
+
+def _below(path: str, roots: Iterable[str]) -> bool:
+    return any(path == root or path.startswith(root.rstrip('/') + '/') for root in roots)
+
+
+def check_program(
+    package: str, executable: str, prefixes: Sequence[str],
+) -> None:
+    """
+    Look a node's program up in the ament index of the robot (and so of what travels).
+
+    :param prefixes: ament prefixes.
+    :raises WorkspaceError: no such package or executable, with the nearest name there is.
+    """
+    index = 'share/ament_index/resource_index/packages'
+    for prefix in prefixes:
+        if not Path(prefix, index, package).exists():
+            continue
+        folder = Path(prefix, 'lib', package)
+        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+        if executable in names:
+            return
+        raise WorkspaceError(
+            f"package '{package}' has no executable '{executable}'",
+            _nearest(executable, names) or f'{folder} has none')
+    known = {
+        path.name for prefix in prefixes if Path(prefix, index).is_dir()
+        for path in Path(prefix, index).iterdir()}
+    raise WorkspaceError(
+        f"no package is called '{package}'",
+        _nearest(package, sorted(known)) or 'is the workspace built, and its setup.bash sourced?')
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, names, n=1)
+    if near:
+        return f"did you mean '{near[0]}'?"
+    return f"there are: {', '.join(names[:8])}" if names and len(names) <= 8 else ''
+
+
+def ament_prefixes(environment: Mapping[str, str]) -> list[str]:
+    """Return the prefixes in which the robot's packages are, in their order."""
+    paths = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    return list(dict.fromkeys([*paths, sys.prefix]))
+
+
+def agent_config(spec: MachineSpec, launch_id: str, directory: str,
+                 end_command: Sequence[str]) -> dict[str, Any]:
+    """Return what arms an agent for a machine of this launch."""
+    return {
+        'machine': spec.name, 'launch': launch_id, 'directory': directory,
+        'on_exit': spec.on_exit, 'lifetime': spec.lifetime,
+        'robot_timeout': spec.robot_timeout, 'end_command': list(end_command),
+    }

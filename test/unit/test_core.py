@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of the small modules below everything: errors, waiting, report, plugins, process."""
+
+import json
+import os
+import sys
+import threading
+import time
+
+from fogros2 import errors, model, plugin_system, process, report
+from fogros2.model import Command, NodeSpec, Result
+from fogros2.waiting import wait_until
+import pytest
+
+
+def test_an_error_says_what_and_what_to_do():
+    assert str(errors.FogError('x failed', 'do y')) == 'x failed (do y)'
+    assert str(errors.FogError('x failed')) == 'x failed'
+
+
+def test_a_failed_command_shows_the_last_lines_of_its_errors():
+    result = Result(3, 'out', '\n'.join(['one', 'two', 'three', 'four']))
+    error = errors.CommandError(Command(('tool',), what='make it'), result, 'planner')
+    assert str(error) == (
+        'make it failed on planner with exit status 3: two / three / four')
+
+
+def test_waiting_returns_what_the_probe_found():
+    answers = iter([None, False, 7])
+    assert wait_until(lambda: next(answers), timeout=10, what='x', interval=0.001) == 7
+
+
+def test_waiting_ends_at_its_deadline():
+    begin = time.monotonic()
+    with pytest.raises(errors.DeadlineExceeded, match=r'0\.05 s waiting for godot \(go home\)'):
+        wait_until(lambda: None, timeout=0.05, what='godot', hint='go home')
+    assert time.monotonic() - begin < 5
+
+
+def test_waiting_ends_when_cancelled():
+    cancel = threading.Event()
+    threading.Timer(0.05, cancel.set).start()
+    with pytest.raises(errors.Cancelled):
+        wait_until(lambda: None, timeout=60, what='x', cancel=cancel)
+
+
+def test_a_step_is_reported_with_its_detail_and_its_failure():
+    events = []
+    with report.step(events.append, 'm', 's') as detail:
+        detail.append('fine')
+    with pytest.raises(ZeroDivisionError):
+        with report.step(events.append, 'm', 't'):
+            1 / 0
+    kinds = [type(event) for event in events]
+    assert kinds == [report.StepStarted, report.StepDone, report.StepStarted, report.StepFailed]
+    assert events[1].detail == 'fine'
+    assert events[3].reason == 'division by zero'
+
+
+def test_an_unknown_plugin_is_refused_with_the_nearest_name():
+    with pytest.raises(errors.ConfigurationError, match="did you mean 'container'"):
+        plugin_system.load('fogros2.provider', 'conteiner')
+
+
+def test_json_of_the_model_is_plain():
+    node = NodeSpec('1', 'talker-1', 'p', 'e', arguments=('a', ({'share': 'p'}, '/x')))
+    data = json.loads(model.to_json(node))
+    assert data['arguments'] == ['a', [{'share': 'p'}, '/x']]
+    with pytest.raises(TypeError):
+        model.to_json({'x': object()})
+
+
+def run(*words, **arguments):
+    return process.run(Command(words), **{'timeout': 20, **arguments})
+
+
+def test_a_command_gives_back_its_streams_and_status():
+    result = run('sh', '-c', 'cat; echo err >&2; exit 3', check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (3, '', 'err\n')
+    result = process.run(Command(('cat',), input=b'x' * 200_000), timeout=20)
+    assert len(result.stdout) == 200_000
+
+
+def test_lines_arrive_while_the_command_runs():
+    lines = []
+    cancel = threading.Event()
+
+    def take(line):
+        lines.append(line)
+        cancel.set()
+
+    with pytest.raises(errors.Cancelled):
+        run('sh', '-c', 'echo one; exec tail -f /dev/null', on_output=take, cancel=cancel)
+    assert lines == ['one']
+
+
+def test_a_command_out_of_time_goes_with_its_children(tmp_path):
+    script = f'tail -f /dev/null & echo $! > {tmp_path}/pid; wait'
+    with pytest.raises(errors.DeadlineExceeded):
+        run('sh', '-c', script, timeout=0.5)
+    child = int((tmp_path / 'pid').read_text())
+    wait_until(lambda: not alive(child), timeout=10, what='the child to go')
+
+
+def alive(pid):
+    try:
+        with open(f'/proc/{pid}/stat') as stat:
+            return stat.read().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+def test_an_interrupt_of_our_group_does_not_reach_the_command():
+    result = run('sh', '-c', 'ps -o pgid= -p $$ 2>/dev/null || cut -d" " -f5 /proc/$$/stat')
+    assert int(result.stdout) != os.getpgid(0)
+
+
+def test_a_missing_program_is_named():
+    with pytest.raises(errors.PrerequisiteError, match='no-such-tool not found'):
+        run('no-such-tool')
+    with pytest.raises(errors.PrerequisiteError, match='sudo apt-get install iproute2'):
+        process.require(['no-such-tool', sys.executable], package_of={'no-such-tool': 'iproute2'})

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.plan: values in, values out."""
+
+from fogros2 import plan
+from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
+from fogros2.model import Peer
+import pytest
+
+NETWORK = '198.18.7.0/24'
+
+
+def test_rmw_is_cyclone_unless_the_user_has_one():
+    assert plan.choose_rmw({}, ['rmw_cyclonedds_cpp']) == 'rmw_cyclonedds_cpp'
+    known = ['rmw_cyclonedds_cpp', 'rmw_x']
+    assert plan.choose_rmw({'RMW_IMPLEMENTATION': 'rmw_x'}, known) == 'rmw_x'
+
+
+def test_rmw_without_a_plugin_is_refused_by_name():
+    with pytest.raises(DdsError, match='rmw_connextdds.*rmw_cyclonedds_cpp'):
+        plan.choose_rmw({'RMW_IMPLEMENTATION': 'rmw_connextdds'}, ['rmw_cyclonedds_cpp'])
+
+
+def test_addresses_are_robot_first_then_machines_in_order():
+    assert plan.robot_interface('a1b2c3', NETWORK, 4, '/k').address == '198.18.7.1'
+    assert plan.machine_interface('a1b2c3', NETWORK, 0, 4, '/k').address == '198.18.7.2'
+    assert plan.machine_interface('a1b2c3', NETWORK, 9, 4, '/k').address == '198.18.7.11'
+
+
+def test_interface_names_fit_the_kernel_and_differ_on_one_computer():
+    robot = plan.robot_interface('a1b2c3', NETWORK, 4, '/k')
+    machine = plan.machine_interface('a1b2c3', NETWORK, 250, 4, '/k')
+    assert robot.name != machine.name
+    assert len(machine.name) <= 15
+    assert robot.guarded and not machine.guarded
+
+
+def test_a_subnet_that_is_full_says_so():
+    with pytest.raises(ConfigurationError, match='no address'):
+        plan.machine_interface('a1b2c3', NETWORK, 253, 4, '/k')
+
+
+def test_a_machine_dials_its_siblings_but_not_the_robot():
+    robot = Peer('robot', 'R', '198.18.7.1', '203.0.113.9:1')
+    planner = Peer('planner', 'P', '198.18.7.2', '203.0.113.1:1')
+    slam = Peer('slam', 'S', '198.18.7.3', '203.0.113.2:1')
+    peers = plan.machine_peers(robot, 'slam', {'slam': slam, 'planner': planner})
+    assert peers == [Peer('robot', 'R', '198.18.7.1', None), planner]
+
+
+def test_vpn_is_preferred_and_may_be_absent():
+    vpn, loopback = plan.robot_dds_interfaces('fog1')
+    assert vpn.priority > loopback.priority
+    assert not vpn.required
+
+
+def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():
+    environment = {
+        'AMENT_PREFIX_PATH': '/home/me/ws/install/a:/opt/ros/jazzy',
+        'PYTHONPATH': '/home/me/ws/install/a/lib/python3:/home/me/own:/opt/ros/jazzy/lib/python3',
+        'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib:/usr/local/cuda/lib',
+        'PATH': '/home/me/bin:/opt/ros/jazzy/bin:/usr/bin',
+        'ROS_DISTRO': 'jazzy', 'ROS_DOMAIN_ID': '7', 'AWS_SECRET_ACCESS_KEY': 'x',
+    }
+    under = plan.underlay(environment, '/home/me/ws', '/opt/ros/jazzy/bin/ros2', prefix='/usr')
+    assert under.prefixes == ('/opt/ros/jazzy',)
+    assert under.environment == {
+        'AMENT_PREFIX_PATH': '/home/me/ws/install/a:/opt/ros/jazzy',
+        'PYTHONPATH': '/home/me/ws/install/a/lib/python3:/opt/ros/jazzy/lib/python3',
+        'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib',
+        'PATH': f'/opt/ros/jazzy/bin:{plan.SYSTEM_PATH}',
+        'ROS_DISTRO': 'jazzy', 'ROS_DOMAIN_ID': '7',
+    }
+
+
+def test_a_virtual_environment_is_part_of_the_underlay():
+    under = plan.underlay({'PATH': '/usr/bin'}, None, '/p/.venv/bin/ros2', prefix='/p/.venv')
+    assert under.prefixes == ('/p/.venv',)
+    assert under.environment['PATH'].startswith('/p/.venv/bin:')
+
+
+@pytest.fixture
+def prefix(tmp_path):
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    (index / 'arm_planning').touch()
+    (tmp_path / 'lib/arm_planning').mkdir(parents=True)
+    (tmp_path / 'lib/arm_planning/planner').touch()
+    return str(tmp_path)
+
+
+def test_a_program_in_the_index_is_found(prefix):
+    plan.check_program('arm_planning', 'planner', ['/nowhere', prefix])
+
+
+@pytest.mark.parametrize('package, executable, words', [
+    ('arm_planing', 'planner', "did you mean 'arm_planning'"),
+    ('arm_planning', 'plannr', "did you mean 'planner'"),
+    ('zzz', 'planner', 'there are: arm_planning'),
+])
+def test_a_program_that_is_not_there_is_refused_with_the_nearest(
+        prefix, package, executable, words):
+    with pytest.raises(WorkspaceError, match=words):
+        plan.check_program(package, executable, [prefix])

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.store: on real files, with real processes."""
+
+import os
+import stat
+import subprocess
+import sys
+
+from fogros2.errors import ConfigurationError, NameTaken, StoreError
+from fogros2.model import Endpoint, MachineSpec, VpnInterface
+from fogros2.store import process_start, Record, Store, write_private
+import pytest
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / 'state')
+
+
+def record(name='planner', **changes):
+    spec = MachineSpec(name, 'container', {'ports': ['80:80']}, containers=('docker run x',))
+    return Record(name, 'container', spec, **changes)
+
+
+def test_a_record_comes_back_as_it_was_saved(store):
+    saved = record(
+        shell=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
+        vpn=VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k'),
+        machine_id='abc', prepared={'ros': 'x'})
+    directory = store.machine('planner')
+    directory.save(saved)
+    assert directory.load() == saved
+
+
+def test_files_are_for_the_user_alone(store):
+    directory = store.machine('planner')
+    directory.save(record())
+    assert stat.S_IMODE((directory.path / 'record.json').stat().st_mode) == 0o600
+    for folder in (directory.path, directory.path.parent):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize('name', [
+    'a b', 'a;rm', '../x', 'Upper', '', '-a', 'a-', 'x' * 41, 'a.b', 'ä', '$(x)', 'a\n'])
+def test_names_that_a_shell_or_dns_would_trip_over_are_refused(store, name):
+    with pytest.raises(ConfigurationError, match='no name for a machine'):
+        store.machine(name)
+
+
+@pytest.mark.parametrize('content', ['', '{', '[]', '{"name": 1}', '{"spec": {}}', '\0'])
+def test_a_damaged_record_is_listed_as_such_and_loads_with_a_hint(store, content):
+    directory = store.machine('planner')
+    directory.save(record())
+    (directory.path / 'record.json').write_text(content)
+    with pytest.raises(StoreError, match='ros2 fog delete planner'):
+        directory.load()
+    assert 'damaged' in store.machines()[0].damage
+
+
+def test_unknown_keys_of_a_later_version_are_left_aside(store):
+    directory = store.machine('planner')
+    directory.save(record())
+    path = directory.path / 'record.json'
+    path.write_text(path.read_text().replace('{', '{"from_the_future": 1,', 1))
+    assert directory.load() == record()
+
+
+def test_a_name_is_held_by_one_at_a_time(store):
+    with store.machine('planner').lock():
+        with pytest.raises(NameTaken):
+            with store.machine('planner').lock():
+                pass
+        with store.machine('slam').lock():
+            pass
+    with store.machine('planner').lock():
+        pass
+    assert list(store.machine('planner').path.parent.iterdir()) == []
+
+
+def test_a_killed_holder_frees_the_name(store):
+    code = (
+        'import sys; from pathlib import Path; from fogros2.store import Store\n'
+        f'with Store(Path({str(store.root)!r})).machine("planner").lock():\n'
+        '    print("held", flush=True); sys.stdin.read()')
+    child = subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE)
+    assert child.stdout.readline() == b'held\n'
+    with pytest.raises(NameTaken):
+        with store.machine('planner').lock():
+            pass
+    child.kill()
+    child.communicate()
+    with store.machine('planner').lock():
+        pass
+
+
+def test_a_process_is_told_from_another_with_its_id():
+    child = subprocess.Popen([sys.executable, '-c', 'import sys; sys.stdin.read()'],
+                             stdin=subprocess.PIPE)
+    start = process_start(child.pid)
+    assert record(pid=child.pid, pid_start=start).launch_alive
+    assert not record(pid=child.pid, pid_start=start - 1).launch_alive
+    child.communicate()
+    assert not record(pid=child.pid, pid_start=start).launch_alive
+    assert not record().launch_alive
+
+
+def test_a_zombie_counts_as_gone():
+    child = subprocess.Popen([sys.executable, '-c', ''])
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    assert process_start(child.pid) is None
+    child.wait()
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(store, tmp_path):
+    path = tmp_path / 'x' / 'file'
+    write_private(path, b'old')
+    with pytest.raises(TypeError):
+        write_private(path, 'text')
+    assert path.read_bytes() == b'old'
+    assert os.listdir(path.parent) == ['file']
+
+
+def test_a_state_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
+    (tmp_path / 'file').touch()
+    with pytest.raises(StoreError, match='FOGROS2_STATE_HOME'):
+        Store(tmp_path / 'file').machine('planner').save(record())
