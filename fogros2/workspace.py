@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pure: what of a colcon workspace travels, and how it is built where it can't travel built.
+
+Reads folders, changes none. ``read`` looks at the workspace, ``plan`` decides, and the Shell's
+``sync`` takes what it decided: the install space as it is where the machine is like the robot,
+else the sources, then ``commands`` on the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+import os
+from pathlib import Path
+import shlex
+from typing import Optional
+import xml.etree.ElementTree as ElementTree
+
+from fogros2.bootstrap import DISTRO, Environment, HostFacts
+from fogros2.errors import WorkspaceError
+from fogros2.model import Command
+
+#: rsync patterns of what no machine needs, wherever it is in a workspace.
+EXCLUDES = ('.git', '.hg', '.svn', '__pycache__', '*.pyc', '.venv', '.cache', '.mypy_cache',
+            '.pytest_cache', '.ruff_cache', '.vscode', '.idea')
+#: Folders that colcon makes at the top; the install space is named apart.
+BUILT = ('build', 'install', 'log')
+_SKIPPED = {'.git', '.hg', '.svn', '__pycache__', '.venv', 'node_modules'}
+
+
+@dataclasses.dataclass(frozen=True)
+class Workspace:
+    """
+    A colcon workspace as it is on the robot.
+
+    :param installed: packages of the install space and the prefix of each.
+    :param sources: packages below ``src`` (or the top) and the folder of each.
+    :param links: what the install space reaches outside of itself, through links and through the
+        paths that ``--symlink-install`` writes; files and folders in the workspace.
+    :param outside: the same where it leads out of the workspace: it can't travel.
+    :param compiled: one of the shared libraries or compiled programs in the install space, None
+        where all is Python.
+    :param python: version in the install space's own paths (``python3.12``), '' where none.
+    """
+
+    root: Path
+    installed: Mapping[str, Path]
+    sources: Mapping[str, Path]
+    links: tuple[Path, ...] = ()
+    outside: tuple[Path, ...] = ()
+    compiled: Optional[Path] = None
+    python: str = ''
+
+    @property
+    def packages(self) -> Mapping[str, Path]:
+        """All packages: where each is installed, or else its source."""
+        return {**self.sources, **self.installed}
+
+    @property
+    def python_only(self) -> bool:
+        """Whether nothing in it is compiled, as far as can be seen."""
+        if self.installed:
+            return self.compiled is None
+        return all(_build_type(path) == 'ament_python' for path in self.sources.values())
+
+    def executable(self, package: str, name: str) -> Optional[Path]:
+        """Return where the install space has an executable of a package, None if it hasn't."""
+        prefix = self.installed.get(package)
+        path = prefix / 'lib' / package / name if prefix else None
+        return path if path and path.is_file() and os.access(path, os.X_OK) else None
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkspacePlan:
+    """
+    How a workspace gets to a machine.
+
+    :param source: folder on the robot, ``target`` the same path on the machine.
+    :param includes: rsync patterns that win over ``excludes``.
+    :param commands: build it there, after the sync; none where it travels built.
+    :param setup: script to source on the machine, after ROS's own.
+    :param reason: why it is built there, '' where it isn't.
+    """
+
+    source: Path
+    target: str
+    includes: tuple[str, ...]
+    excludes: tuple[str, ...]
+    commands: tuple[Command, ...]
+    setup: str
+    reason: str = ''
+
+
+def read(path: str | os.PathLike[str]) -> Workspace:
+    """
+    Look at a workspace; 10,000 files take about a tenth of a second.
+
+    :raises WorkspaceError: there is no such folder, or nothing in it is a ROS package.
+    """
+    root = Path(os.path.abspath(os.path.expanduser(path)))
+    if not root.is_dir():
+        raise WorkspaceError(f'{root} is no folder', 'workspace= names a colcon workspace')
+    install = root / 'install'
+    installed = dict(_installed(install))
+    below = root / 'src' if (root / 'src').is_dir() else root
+    sources = dict(_sources(below))
+    if not installed and not sources:
+        hint = 'it needs install/ (from colcon build) or src/ with packages'
+        if (root.parent / 'install').is_dir():
+            hint = f'did you mean {root.parent}?'
+        raise WorkspaceError(f'{root} is no colcon workspace: no ROS package in it', hint)
+    links, outside, compiled, python = _look_through(install, root)
+    return Workspace(root, installed, sources, links, outside, compiled, python)
+
+
+def plan(
+    workspace: Workspace, machine: HostFacts, robot: HostFacts, environment: Environment, *,
+    name: str,
+) -> WorkspacePlan:
+    """
+    Decide what travels to a machine, and what is built there.
+
+    :param environment: how things with ROS run on the machine.
+    :param name: the machine's name, for messages.
+    :raises WorkspaceError: it has to be built there, and can't be.
+    """
+    root = workspace.root
+    setup = f'{root}/install/setup.sh'
+    if not (root / 'install' / 'setup.sh').exists():
+        setup = f'{root}/install/local_setup.sh'
+    reason = _why_build(workspace, machine, robot)
+    if not reason:
+        if workspace.outside:
+            raise WorkspaceError(
+                f'{root}/install has a link to {workspace.outside[0]}, which does not travel',
+                'build without --symlink-install, or move it into the workspace')
+        includes = tuple(_include(workspace.links, root))
+        return WorkspacePlan(
+            root, str(root), includes,
+            (*EXCLUDES, '/log', *(f'/{top}/***' for top in ('build', 'src'))), (), setup)
+    if not workspace.sources:
+        raise WorkspaceError(
+            f"{root} can't go to machine '{name}' as it is ({reason}), and has no src/ to build",
+            'keep the sources in the workspace, or use a machine like this one')
+    if environment.kind != 'ros':
+        raise WorkspaceError(
+            f"{root} would have to be built on machine '{name}' ({reason}), which has no colcon",
+            'run colcon build here first')
+    return WorkspacePlan(
+        root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)),
+        tuple(_build(workspace, environment)), f'{root}/install/setup.sh', reason)
+
+
+def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
+    """Say why the install space can't be used on the machine as it is, '' if it can."""
+    if not workspace.installed:
+        return 'it is not built'
+    if workspace.compiled is not None:
+        if machine.architecture != robot.architecture:
+            return f'built for {robot.architecture}, there it is {machine.architecture}'
+        if (machine.system, machine.release) != (robot.system, robot.release):
+            return (f'built on {robot.system} {robot.release}, there it is '
+                    f'{machine.system} {machine.release}')
+        if (DISTRO in machine.ros) != (DISTRO in robot.ros):
+            return f'compiled against ROS 2 {DISTRO}, which only one of the two has'
+    here = {f'python{p.version[0]}.{p.version[1]}' for p in machine.pythons}
+    if workspace.python and workspace.python not in here:
+        return f'built for {workspace.python}, which is not there'
+    return ''
+
+
+def _build(workspace: Workspace, environment: Environment) -> Iterator[Command]:
+    """Yield rosdep's and colcon's commands, to be run on the machine as the login user."""
+    root = shlex.quote(str(workspace.root))
+    below = 'src' if (workspace.root / 'src').is_dir() else '.'
+    source = ''.join(f'. {shlex.quote(script)}\n' for script in environment.setup)
+    yield Command.script(
+        '[ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || sudo -n rosdep init\n'
+        f'rosdep update --rosdistro {DISTRO}\n'
+        f'cd {root}\n'
+        f'rosdep install --rosdistro {DISTRO} --from-paths {below} --ignore-src -y\n',
+        what="install the workspace's dependencies")
+    yield Command.script(
+        f'{source}cd {root}\n'
+        # gigabytes a compiler, and small machines have little
+        f'colcon build --base-paths {below} --parallel-workers "$(nproc)" '
+        '--event-handlers console_cohesion+ --cmake-args -DCMAKE_BUILD_TYPE=Release\n',
+        what='build the workspace')
+
+
+def _installed(install: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the packages of an isolated or merged install space, by the ament index."""
+    if not install.is_dir():
+        return
+    for prefix in (install, *sorted(p for p in install.iterdir() if p.is_dir())):
+        index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
+        if index.is_dir():
+            for marker in sorted(index.iterdir()):
+                yield marker.name, prefix
+
+
+def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield source packages as colcon finds them: none below a package or a COLCON_IGNORE."""
+    try:
+        names = set(os.listdir(folder))
+    except OSError:
+        return
+    if {'COLCON_IGNORE', 'AMENT_IGNORE', 'CATKIN_IGNORE'} & names:
+        return
+    if 'package.xml' in names:
+        name = _package_name(folder / 'package.xml')
+        if name:
+            yield name, folder
+        return
+    for entry in sorted(names - _SKIPPED - set(BUILT)):
+        path = folder / entry
+        if path.is_dir() and not entry.startswith('.'):
+            yield from _sources(path)
+
+
+def _package_name(manifest: Path) -> str:
+    try:
+        return (ElementTree.parse(manifest).getroot().findtext('name') or '').strip()
+    except (ElementTree.ParseError, OSError) as error:
+        raise WorkspaceError(f'{manifest} is no package manifest: {error}') from error
+
+
+def _build_type(folder: Path) -> str:
+    export = ElementTree.parse(folder / 'package.xml').getroot().find('export')
+    return (export.findtext('build_type') or '').strip() if export is not None else ''
+
+
+def _look_through(
+    install: Path, root: Path,
+) -> tuple[tuple[Path, ...], tuple[Path, ...], Optional[Path], str]:
+    """Walk the install space and what it reaches: links, ways out, a binary, Python's version."""
+    links: dict[Path, None] = {}
+    outside: dict[Path, None] = {}
+    compiled: Optional[Path] = None
+    python = ''
+    todo = [install]
+    while todo:
+        folder = todo.pop()
+        reached: list[Path] = []
+        for entry in _files(folder):
+            if entry.is_symlink():
+                reached.append(_target(entry.path))
+            elif entry.name.endswith(('.egg-link', '.pth')):
+                reached.extend(_written_paths(Path(entry.path)))
+            elif compiled is None and _is_compiled(entry):
+                compiled = Path(entry.path)
+            if not python and '/site-packages/' in entry.path:
+                python = entry.path.split('/site-packages/')[0].rpartition('/')[2]
+        for path in reached:
+            if not path.is_relative_to(root):
+                # ROS and the system are on the machine too
+                if not path.is_relative_to('/opt/ros') and not path.is_relative_to('/usr'):
+                    outside[path] = None
+            elif not path.is_relative_to(install) and path not in links:
+                links[path] = None
+                todo.append(path)
+    return tuple(sorted(links)), tuple(sorted(outside)), compiled, python
+
+
+def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
+    """Yield all files and links below a folder; nothing for what is a file or isn't there."""
+    try:
+        entries = list(os.scandir(folder))
+    except (NotADirectoryError, FileNotFoundError):
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            if entry.name not in _SKIPPED:
+                yield from _files(Path(entry.path))
+        else:
+            yield entry
+
+
+def _target(link: str) -> Path:
+    """Return where a link leads, one step."""
+    return Path(os.path.normpath(os.path.join(os.path.dirname(link), os.readlink(link))))
+
+
+def _written_paths(file: Path) -> Iterator[Path]:
+    """Yield the folders that a development install has written into a file instead of a link."""
+    for line in file.read_text(errors='replace').splitlines():
+        if line.startswith('/') and os.path.isdir(line):
+            yield Path(os.path.normpath(line))
+
+
+def _is_compiled(entry: os.DirEntry[str]) -> bool:
+    if '.so' in entry.name:
+        return True
+    if '/lib/' not in entry.path and '/bin/' not in entry.path:
+        return False
+    if entry.name.endswith(('.py', '.sh', '.txt', '.xml', '.yaml', '.pyc')):
+        return False
+    with open(entry.path, 'rb') as file:
+        return file.read(4) == b'\x7fELF'
+
+
+def _include(paths: Sequence[Path], root: Path) -> Iterator[str]:
+    """Yield rsync patterns that let paths through, their parents first."""
+    seen: set[Path] = set()
+    for path in paths:
+        relative = path.relative_to(root)
+        for parent in reversed(relative.parents[:-1]):
+            if parent not in seen:
+                seen.add(parent)
+                yield f'/{parent}/'
+        if path.is_dir() and not path.is_symlink():
+            yield f'/{relative}/'
+            yield f'/{relative}/***'
+        else:
+            yield f'/{relative}'
