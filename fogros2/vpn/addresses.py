@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which subnet, addresses and port a launch's VPN takes: decided by what the hosts already use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import ipaddress
+import json
+import socket
+
+from fogros2.errors import ConfigurationError, VpnError
+from fogros2.model import Command
+
+#: RFC 2544's range for benchmarks. Home and company networks (RFC 1918), carriers' NAT and
+#: Tailscale (100.64.0.0/10), clouds' VPCs and containers leave it alone, so that a launch does
+#: not collide by construction. Some proxies ("fake IP") sit in a part of it: that part is
+#: skipped, as are the subnets of other launches on the same robot.
+POOL = '198.18.0.0/15'
+#: Names another pool in CIDR form, for those who use this one otherwise.
+POOL_VARIABLE = 'FOGROS2_VPN_POOL'
+#: Bits of a launch's subnet: one robot and up to 253 machines.
+PREFIX = 24
+#: Shorter prefixes are some VPN's way to write "everything" (two halves, four quarters) and
+#: don't collide: the more specific route wins.
+EVERYTHING = 8
+
+_Network = ipaddress.IPv4Network
+
+
+def pool_from(environment: Mapping[str, str]) -> str:
+    """
+    Return the pool in CIDR form: the environment's, else :data:`POOL`.
+
+    :raises ConfigurationError: the environment's isn't an IPv4 network that holds a /24.
+    """
+    text = environment.get(POOL_VARIABLE) or POOL
+    return str(_pool(text))
+
+
+def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> str:
+    """
+    Return a /24 of the pool, in CIDR form, that overlaps nothing in use.
+
+    The same launch id and surroundings give the same subnet; different ids start looking at
+    different places, so that launches that start at the same moment keep out of each other's way.
+
+    :param used: networks and addresses in CIDR form, on the robot and on machines known so far;
+        IPv6 ones and those that mean "everything" don't count.
+    :param launch_id: hexadecimal digits.
+    :raises VpnError: the whole pool is in use.
+    :raises ConfigurationError: the pool isn't an IPv4 network that holds a /24.
+    """
+    candidates = list(_pool(pool).subnets(new_prefix=PREFIX))
+    taken = [network for network in map(_network, used) if network is not None]
+    begin = int(launch_id, 16) % len(candidates)
+    for candidate in candidates[begin:] + candidates[:begin]:
+        if not any(candidate.overlaps(network) for network in taken):
+            return str(candidate)
+    raise VpnError(
+        f'no /{PREFIX} of {pool} is free for the VPN',
+        f'{POOL_VARIABLE}=10.213.0.0/16 takes another pool')
+
+
+def addresses(subnet: str) -> Iterator[str]:
+    """Yield the addresses of a launch's subnet: the robot's (.1), then the machines' (.2, ...)."""
+    return map(str, _Network(subnet).hosts())
+
+
+def used_networks() -> Command:
+    """Return the command that shows what a host uses; :func:`parse_used` reads its output."""
+    return Command.script(
+        'ip -json -4 route show table all; ip -json -4 addr show',
+        what='look at the networks in use')
+
+
+def parse_used(output: str) -> list[str]:
+    """
+    Return the networks and addresses in CIDR form that :func:`used_networks` printed.
+
+    :raises VpnError: it isn't what ``ip`` prints.
+    """
+    found: set[str] = set()
+    decoder = json.JSONDecoder()
+    rest = output.strip()
+    try:
+        while rest:
+            entries, end = decoder.raw_decode(rest)
+            rest = rest[end:].strip()
+            for entry in entries:
+                # an interface that is down has addresses but no routes
+                for address in entry.get('addr_info', ()):
+                    found.add(f"{address['local']}/{address['prefixlen']}")
+                if 'dst' in entry and entry['dst'] != 'default':
+                    found.add(entry['dst'])
+        return sorted(
+            str(ipaddress.ip_interface(text).network) for text in found)
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        raise VpnError(f"can't read the networks in use: {error}") from error
+
+
+def choose_port() -> int:
+    """
+    Return a UDP port that is free on this computer now.
+
+    It comes out of the ephemeral range, which doesn't meet DDS's ports in ROS domains 0 to 101.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('', 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def _pool(text: str) -> _Network:
+    try:
+        network = _Network(text)
+    except ValueError as error:
+        raise ConfigurationError(
+            f"'{text}' is no IPv4 network: {error}", f'{POOL_VARIABLE} is like {POOL}') from error
+    if network.prefixlen > PREFIX:
+        raise ConfigurationError(
+            f"'{text}' holds no /{PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
+    return network
+
+
+def _network(text: str) -> _Network | None:
+    network = ipaddress.ip_interface(text).network
+    if isinstance(network, _Network) and network.prefixlen >= EVERYTHING:
+        return network
+    return None

@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+WireGuard, in the kernel where it has the module, else ``wireguard-go`` on a persistent TUN.
+
+Each host gets one short ``sh`` script per task, as each process costs milliseconds and a machine
+may be far away. A script is put together from steps, each written beside its undo; ``down`` runs
+the undos backwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import dataclasses
+import ipaddress
+import re
+import shlex
+
+from fogros2.errors import ConfigurationError, VpnError
+from fogros2.model import Command, Peer, VpnInterface
+from fogros2.vpn import Vpn
+
+#: Programs each host needs, and the Debian and Ubuntu packages they come in. ``wireguard-go`` is
+#: for kernels without the module alone, ``nft`` for guarded interfaces.
+PACKAGES = {
+    'wg': 'wireguard-tools', 'ip': 'iproute2', 'nft': 'nftables', 'wireguard-go': 'wireguard-go'}
+#: Seconds between packets that keep a NAT's mapping: routers forget one after 30 s or more.
+KEEPALIVE = 25
+#: RTPS 2.5, 9.6.2.3: ports of a domain begin at 7400 + 250 * domain and the next one's follow.
+PORT_BASE = 7400
+PORTS_PER_DOMAIN = 250
+MAX_NAME = 15
+
+_KEY = re.compile('[A-Za-z0-9+/]{43}=')
+_ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Step:
+    """Shell text that does something, idempotent, and what undoes it ('' for nothing to do)."""
+
+    do: str
+    undo: str = ''
+
+
+class WireGuard(Vpn):
+    """
+    The commands of a WireGuard interface; they need root and the programs of ``PACKAGES``.
+
+    :param domain: ROS_DOMAIN_ID, whose DDS ports a guarded interface lets in.
+    """
+
+    def __init__(self, domain: int = 0) -> None:
+        if not 0 <= domain <= (65535 - PORT_BASE) // PORTS_PER_DOMAIN:
+            raise ConfigurationError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
+        self.domain = domain
+
+    def keys(self, interface: VpnInterface) -> Command:
+        """Return the command that prints the public key; the private one is root's alone."""
+        key = shlex.quote(interface.key_file)
+        folder = shlex.quote(interface.key_file.rpartition('/')[0] or '.')
+        # written aside and moved, so that a key that is there is a whole one
+        return Command.script(
+            f'umask 077\n'
+            f'if [ ! -s {key} ]; then\n'
+            f'  mkdir -p {folder}; wg genkey >{key}.$$; mv -f {key}.$$ {key}\n'
+            f'fi\n'
+            f'wg pubkey <{key}',
+            sudo=True, what='make the VPN key')
+
+    def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """
+        Yield one script: filter, interface, keys and peers, address.
+
+        The filter is there before the interface.
+        """
+        steps = self._steps(interface, peers)
+        yield Command.script(
+            '\n'.join(step.do for step in steps), sudo=True, what=_what('set', interface, 'up'))
+
+    def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """Yield what makes these the peers, and leaves the sessions of those that stay."""
+        yield Command.script(
+            _configure(interface, peers), sudo=True, what=_what('tell', interface, 'its peers'))
+
+    def alive(self, interface: VpnInterface) -> Command:
+        """
+        Return a command of a few milliseconds, which on the robot needs no root.
+
+        A TUN has a carrier as long as a program has it open; a WireGuard interface of the kernel
+        always has. Without the interface, or where it is down, reading that fails.
+
+        A machine also notes where its peers are, for ``repair``: who is dialled from behind a NAT
+        couldn't dial, and the robot's side notices a lost session after 15 s only.
+        """
+        name = _name(interface)
+        carrier = f'/sys/class/net/{name}/carrier'
+        if interface.guarded:
+            return Command(('grep', '-q', '1', carrier), what=_what('look at', interface))
+        seen = _seen(interface)
+        return Command.script(
+            f'read -r carrier 2>/dev/null <{carrier}; [ "$carrier" = 1 ]\n'
+            f'found=$(wg show {name} endpoints) && printf "%s\\n" "$found" >{seen} || :',
+            sudo=True, what=_what('look at', interface))
+
+    def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """
+        Yield the script of ``up``, which leaves a TUN that is there in its place.
+
+        Peers without an endpoint get the one that ``alive`` saw last.
+        """
+        steps = self._steps(interface, peers, recall=True)
+        yield Command.script(
+            '\n'.join(step.do for step in steps), sudo=True, what=_what('repair', interface))
+
+    def status(self, interface: VpnInterface) -> Command:
+        """Return a command that asks for counters alone: ``dump`` would print the private key."""
+        name = _name(interface)
+        return Command.script(
+            f'wg show {name} latest-handshakes; wg show {name} transfer', sudo=True,
+            what=_what('ask', interface, 'for its counters'))
+
+    def parse_status(self, output: str) -> dict[str, dict[str, float]]:
+        """
+        Return handshake, received and sent per peer.
+
+        :raises VpnError: the text isn't what ``status`` prints.
+        """
+        found: dict[str, dict[str, float]] = {}
+        for line in output.splitlines():
+            key, *values = line.split()
+            try:
+                numbers = [float(value) for value in values]
+            except ValueError as error:
+                raise VpnError(f"can't read WireGuard's counters: {line!r}") from error
+            peer = found.setdefault(key, {'handshake': 0.0, 'received': 0.0, 'sent': 0.0})
+            if len(numbers) == 1:
+                peer['handshake'] = numbers[0]
+            elif len(numbers) == 2:
+                peer['received'], peer['sent'] = numbers
+            else:
+                raise VpnError(f"can't read WireGuard's counters: {line!r}")
+        return found
+
+    def down(self, interface: VpnInterface) -> Iterator[Command]:
+        """Yield one script that undoes ``up`` backwards and goes on where a part fails."""
+        undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
+        lines = ['failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
+        files = f'{shlex.quote(interface.key_file)} {_seen(interface)}'
+        lines += [f'rm -f {files} || failed=1', 'exit $failed']
+        yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
+
+    def _steps(
+        self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
+    ) -> list[_Step]:
+        guard = [_guard(interface, self.domain)] if interface.guarded else []
+        return [
+            *guard, _link(interface), _Step(_configure(interface, peers, recall=recall)),
+            _address(interface)]
+
+
+def dds_ports(domain: int) -> tuple[int, int]:
+    """
+    Return the first and last UDP port that DDS uses in a ROS domain.
+
+    In it are multicast discovery (+0) and data (+1), and per participant i unicast discovery
+    (+10 + 2 i) and data (+11 + 2 i), i up to 119.
+    """
+    begin = PORT_BASE + PORTS_PER_DOMAIN * domain
+    return begin, begin + PORTS_PER_DOMAIN - 1
+
+
+def _what(verb: str, interface: VpnInterface, rest: str = '') -> str:
+    return ' '.join(part for part in (verb, 'the VPN interface', interface.name, rest) if part)
+
+
+def _name(interface: VpnInterface) -> str:
+    name = interface.name
+    if not name.isalnum() or not name.isascii() or len(name) > MAX_NAME or name[0].isdigit():
+        raise ConfigurationError(
+            f"'{name}' can't name a VPN interface", f'at most {MAX_NAME} letters and digits')
+    return name
+
+
+def _guard(interface: VpnInterface, domain: int) -> _Step:
+    """
+    Return the step that keeps a hijacked machine from everything but DDS and ping.
+
+    One table, so that one delete is its undo. The table is replaced as a whole, in one
+    transaction: no moment without it. Another table's accept doesn't reach over a drop here, nor
+    an accept here over a drop there (a firewall of the user's own has to let the VPN in).
+    """
+    name = _name(interface)
+    first, last = dds_ports(domain)
+    # an address check, as a peer may send to any address of this computer, a LAN's too
+    rules = [
+        f'table inet {name}',
+        f'delete table inet {name}',
+        f'table inet {name} {{',
+        '  chain input {',
+        '    type filter hook input priority filter; policy accept;',
+        f'    iifname != "{name}" accept',
+        f'    ip daddr != {interface.address} drop',
+        '    ct state established,related accept',
+        f'    udp dport {first}-{last} accept',
+        '    icmp type echo-request accept',
+        '    drop',
+        '  }',
+        '  chain forward {',
+        '    type filter hook forward priority filter; policy accept;',
+        f'    iifname "{name}" drop',
+        f'    oifname "{name}" drop',
+        '  }',
+        '}']
+    # the first line makes the table where it is missing, so that the second can't fail
+    return _Step(
+        f'{_print(rules)} | nft -f -',
+        f'! command -v nft >/dev/null || '
+        f'{_print(rules[:2])} | nft -f -')
+
+
+def _link(interface: VpnInterface) -> _Step:
+    """
+    Return the step that makes the interface.
+
+    ``wireguard-go`` exits when its socket goes, and makes the TUN itself where there is none; made
+    by ``ip tuntap`` it stays when that process dies, and so do the sockets of the nodes. It is
+    told from others of its name, in containers say, by its network namespace.
+    """
+    name = _name(interface)
+    socket = f'/var/run/wireguard/{name}.sock'
+    do = f"""\
+if wg show {name} listen-port >/dev/null 2>&1; then :
+elif said=$(ip link add dev {name} type wireguard 2>&1); then :
+elif command -v wireguard-go >/dev/null; then
+  [ -c /dev/net/tun ] || {{ mkdir -p /dev/net; mknod -m 666 /dev/net/tun c 10 200; }}
+  [ -e /sys/class/net/{name} ] || ip tuntap add dev {name} mode tun
+  rm -f {socket}
+  said=$(setsid wireguard-go {name} 2>&1 >/dev/null) || {{ echo "$said" >&2; exit 1; }}
+else
+  echo "no WireGuard in this kernel ($said) and no wireguard-go" >&2; exit 1
+fi"""
+    undo = f"""\
+for each in $(grep -lsxz {name} /proc/[0-9]*/cmdline); do
+  each=${{each%/cmdline}}
+  read -r program 2>/dev/null <$each/comm || continue
+  [ "$program" = wireguard-go ] && [ $each/ns/net -ef /proc/self/ns/net ] || continue
+  kill -9 ${{each#/proc/}} || :
+done
+rm -f {socket}
+[ ! -e /sys/class/net/{name} ] || ip link delete dev {name}"""
+    return _Step(do, undo)
+
+
+def _configure(
+    interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
+) -> str:
+    """
+    Return the text that feeds ``wg``: the key goes through the shell's own printf alone.
+
+    ``syncconf`` replaces the peers as ``setconf`` does, but sessions of those that stay go on.
+
+    :param recall: fill in endpoints that aren't known from what ``alive`` noted.
+    """
+    key = shlex.quote(interface.key_file)
+    lines = [f'read -r key <{key}']
+    if recall:
+        # in the first configuration: a handshake that finds no endpoint is retried after 5 s
+        lines.append(
+            f'seen() {{ while read -r peer at; do case "$peer $at" in "$1 ("*) ;; "$1 "*) '
+            f'echo "Endpoint = $at";; esac; done 2>/dev/null <{_seen(interface)} || :; }}')
+    lines += ['{', "printf '[Interface]\\nPrivateKey = %s\\n' \"$key\""]
+    config = [f'ListenPort = {interface.port}']
+    for peer in peers:
+        _check(peer)
+        config += [
+            '[Peer]', f'PublicKey = {peer.public_key}', f'AllowedIPs = {peer.address}/32',
+            f'PersistentKeepalive = {KEEPALIVE}']
+        if peer.endpoint is not None:
+            config.append(f'Endpoint = {peer.endpoint}')
+        elif recall:
+            lines.append(_print(config))
+            lines.append(f'seen {shlex.quote(peer.public_key)}')
+            config = []
+    lines += [_print(config)] if config else []
+    return '\n'.join([*lines, f'}} | wg syncconf {_name(interface)} /dev/stdin'])
+
+
+def _check(peer: Peer) -> None:
+    """Keep what another host said about itself from saying more than its place in the VPN."""
+    try:
+        ipaddress.IPv4Address(peer.address)
+    except ValueError as error:
+        raise VpnError(f'{peer.name} has no VPN address: {error}') from error
+    if not _KEY.fullmatch(peer.public_key):
+        raise VpnError(f'{peer.name} has no WireGuard key, but {peer.public_key[:50]!r}')
+    if peer.endpoint is not None and not _ENDPOINT.fullmatch(peer.endpoint):
+        raise VpnError(f'{peer.name} has no endpoint host:port, but {peer.endpoint[:50]!r}')
+
+
+def _seen(interface: VpnInterface) -> str:
+    return shlex.quote(f'{interface.key_file}.endpoints')
+
+
+def _print(lines: Sequence[str]) -> str:
+    return ' '.join(["printf '%s\\n'", *(shlex.quote(line) for line in lines)])
+
+
+def _address(interface: VpnInterface) -> _Step:
+    name = _name(interface)
+    prefix = interface.network.rpartition('/')[2]
+    lines = [
+        f'address replace {interface.address}/{prefix} dev {name}',
+        f'link set dev {name} mtu {interface.mtu} up']
+    return _Step(f'{_print(lines)} | ip -batch -')

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The choice of a subnet and of a port."""
+
+from __future__ import annotations
+
+import ipaddress
+import itertools
+import json
+import socket
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import ConfigurationError, VpnError
+from fogros2.vpn import addresses
+
+
+def test_the_subnet_is_the_same_for_the_same_launch() -> None:
+    first = addresses.choose_subnet([], launch_id='a1b2c3')
+    assert first == addresses.choose_subnet([], launch_id='a1b2c3')
+    assert ipaddress.IPv4Network(first).subnet_of(ipaddress.IPv4Network('198.18.0.0/15'))
+    assert first != addresses.choose_subnet([], launch_id='a1b2c4')
+
+
+def test_what_is_in_use_is_skipped() -> None:
+    first = addresses.choose_subnet([], launch_id='a1b2c3')
+    second = addresses.choose_subnet([first], launch_id='a1b2c3')
+    assert second != first
+    assert addresses.choose_subnet(
+        [first, str(ipaddress.ip_network(second)[9])], launch_id='a1b2c3') not in (first, second)
+
+
+def test_a_proxy_in_half_of_the_pool_leaves_the_other() -> None:
+    for launch_id in ('000000', '0000ff', '000100', 'ffffff'):
+        subnet = addresses.choose_subnet(['198.18.0.1/16'], launch_id=launch_id)
+        assert subnet.startswith('198.19.')
+
+
+@pytest.mark.parametrize('everything', ['0.0.0.0/0', '0.0.0.0/1', '128.0.0.0/1', '192.0.0.0/2',
+                                        'fe80::1/64', '::/0'])
+def test_a_default_route_is_no_collision(everything: str) -> None:
+    assert addresses.choose_subnet([everything], launch_id='1') == '198.18.1.0/24'
+
+
+def test_a_full_pool_is_an_error_with_a_way_out() -> None:
+    with pytest.raises(VpnError, match='FOGROS2_VPN_POOL'):
+        addresses.choose_subnet(['198.18.0.0/15'], launch_id='1')
+
+
+def test_the_pool_can_be_another() -> None:
+    pool = addresses.pool_from({'FOGROS2_VPN_POOL': '10.213.0.0/16'})
+    assert addresses.choose_subnet([], launch_id='2', pool=pool) == '10.213.2.0/24'
+    assert addresses.pool_from({}) == addresses.pool_from({'FOGROS2_VPN_POOL': ''})
+
+
+@pytest.mark.parametrize('text', ['10.0.0.0/25', '10.0.0.1/8', 'fd00::/16', 'lan'])
+def test_a_pool_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match='FOGROS2_VPN_POOL'):
+        addresses.pool_from({'FOGROS2_VPN_POOL': text})
+
+
+def test_the_robot_comes_first() -> None:
+    assert list(itertools.islice(addresses.addresses('198.18.7.0/24'), 2)) == [
+        '198.18.7.1', '198.18.7.2']
+
+
+def test_routes_and_addresses_are_read() -> None:
+    routes = [{'dst': 'default', 'gateway': '192.0.2.1'}, {'dst': '10.0.0.0/8', 'dev': 'tun0'},
+              {'type': 'local', 'dst': '192.0.2.2'}]
+    links = [{}, {'ifname': 'down0', 'addr_info': [{'local': '172.17.0.1', 'prefixlen': 16}]}]
+    assert addresses.parse_used(f'{json.dumps(routes)}\n{json.dumps(links)}\n') == [
+        '10.0.0.0/8', '172.17.0.0/16', '192.0.2.2/32']
+    assert addresses.parse_used('') == []
+
+
+@pytest.mark.parametrize('text', ['nonsense', '[1]', '[{"dst": "everywhere"}]', '{"a": 1}'])
+def test_anything_else_is_an_error(text: str) -> None:
+    with pytest.raises(VpnError, match='networks in use'):
+        addresses.parse_used(text)
+
+
+def test_this_computers_own_are_read() -> None:
+    output = process.run(addresses.used_networks(), timeout=10.0).stdout
+    assert '127.0.0.0/8' in addresses.parse_used(output)
+
+
+def test_the_port_is_free() -> None:
+    port = addresses.choose_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('', port))
+    assert not 7400 <= port < 7650

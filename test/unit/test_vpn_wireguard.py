@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of WireGuard, by value: no interface is made here."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+
+import pytest
+
+from fogros2.errors import ConfigurationError, VpnError
+from fogros2.model import Command, Peer, VpnInterface
+from fogros2.vpn.wireguard import dds_ports, WireGuard
+
+KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
+OTHER = 'Kg7ZbFqs9cU1UuPHc9zzQUoyo+MdSEgx7xQ7iDqIexk='
+ROBOT = VpnInterface(
+    'foga1b2c3', '198.18.7.1', '198.18.7.0/24', 40000, '/state/vpn.key', guarded=True)
+MACHINE = dataclasses.replace(
+    ROBOT, name='foga1b2c3m0', address='198.18.7.2', guarded=False, key_file="/run/it's/vpn.key")
+TO_MACHINE = Peer('planner', KEY, '198.18.7.2', '203.0.113.9:50000')
+TO_ROBOT = Peer('robot', OTHER, '198.18.7.1')
+
+
+def every_command(interface: VpnInterface, peer: Peer) -> list[Command]:
+    wireguard = WireGuard()
+    return [
+        wireguard.keys(interface), *wireguard.up(interface, [peer]),
+        *wireguard.peers(interface, [peer]), wireguard.alive(interface),
+        *wireguard.repair(interface, [peer]), wireguard.status(interface),
+        *wireguard.down(interface)]
+
+
+def script(*commands: Command) -> str:
+    return '\n'.join(command.argv[-1] for command in commands)
+
+
+@pytest.mark.parametrize('interface, peer', [(ROBOT, TO_MACHINE), (MACHINE, TO_ROBOT)])
+def test_every_script_is_one_that_sh_reads(interface: VpnInterface, peer: Peer) -> None:
+    for command in every_command(interface, peer):
+        if command.argv[0] == 'sh':
+            subprocess.run(['sh', '-n', '-c', command.argv[-1]], check=True)
+        assert interface.name in command.what or command.what == 'make the VPN key'
+
+
+def test_one_process_is_started_per_task() -> None:
+    wireguard = WireGuard()
+    for commands in (wireguard.up(ROBOT, [TO_MACHINE]), wireguard.peers(ROBOT, [TO_MACHINE]),
+                     wireguard.repair(ROBOT, [TO_MACHINE]), wireguard.down(ROBOT)):
+        assert len(list(commands)) == 1
+
+
+def test_all_but_looking_needs_root() -> None:
+    looks = WireGuard().alive(ROBOT)
+    assert not looks.sudo and looks.argv[0] == 'grep'
+    assert all(c.sudo for c in every_command(ROBOT, TO_MACHINE) if c != looks)
+
+
+def test_the_private_key_is_made_where_it_stays() -> None:
+    text = script(WireGuard().keys(ROBOT))
+    assert text.splitlines()[0] == 'umask 077'
+    assert 'wg genkey >/state/vpn.key' in text
+    assert text.splitlines()[-1] == 'wg pubkey </state/vpn.key'
+
+
+def test_the_filter_is_there_before_the_interface_and_goes_after_it() -> None:
+    up, down = script(*WireGuard().up(ROBOT, [])), script(*WireGuard().down(ROBOT))
+    assert up.index('nft -f') < up.index('ip link add') < up.index('wg syncconf')
+    assert down.index('ip link delete') < down.index('nft -f') < down.index('rm -f /state/vpn.key')
+
+
+def test_a_machine_is_not_filtered() -> None:
+    assert 'nft' not in script(*every_command(MACHINE, TO_ROBOT))
+
+
+@pytest.mark.parametrize('domain, ports', [(0, '7400-7649'), (5, '8650-8899')])
+def test_the_filter_lets_in_the_ports_of_the_ros_domain(domain: int, ports: str) -> None:
+    text = script(*WireGuard(domain).up(ROBOT, []))
+    assert f'udp dport {ports} accept' in text
+    assert '-'.join(map(str, dds_ports(domain))) == ports
+
+
+def test_a_domain_without_ports_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match='ROS_DOMAIN_ID 233'):
+        WireGuard(233)
+
+
+def test_peers_get_their_own_address_alone() -> None:
+    text = script(*WireGuard().peers(ROBOT, [TO_MACHINE]))
+    assert f"'PublicKey = {KEY}' 'AllowedIPs = 198.18.7.2/32'" in text
+    assert "'Endpoint = 203.0.113.9:50000'" in text
+    assert "'PersistentKeepalive = 25'" in text
+
+
+def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
+    wireguard = WireGuard()
+    text = script(*wireguard.repair(MACHINE, [TO_ROBOT]))
+    assert f'seen {OTHER}' in text and 'seen()' not in script(*wireguard.up(MACHINE, [TO_ROBOT]))
+    assert "/run/it'\"'\"'s/vpn.key.endpoints" in text
+    assert "/run/it'\"'\"'s/vpn.key.endpoints" in script(wireguard.alive(MACHINE))
+    assert "/run/it'\"'\"'s/vpn.key.endpoints" in script(*wireguard.down(MACHINE))
+
+
+@pytest.mark.parametrize('change', [
+    {'public_key': f'{KEY}\nAllowedIPs = 0.0.0.0/0'}, {'public_key': ''},
+    {'address': '0.0.0.0/0'}, {'address': '198.18.7.2\n'},
+    {'endpoint': '203.0.113.9:1\nAllowedIPs = 0.0.0.0/0'}, {'endpoint': 'nowhere'}])
+def test_what_a_machine_says_of_itself_cant_say_more(change: dict[str, str]) -> None:
+    with pytest.raises(VpnError, match='planner has no'):
+        list(WireGuard().peers(ROBOT, [dataclasses.replace(TO_MACHINE, **change)]))
+
+
+@pytest.mark.parametrize('endpoint', ['host.example.org:1', '[2001:db8::1]:51820'])
+def test_endpoints_may_be_names_and_ipv6(endpoint: str) -> None:
+    peer = dataclasses.replace(TO_MACHINE, endpoint=endpoint)
+    assert f"'Endpoint = {endpoint}'" in script(*WireGuard().peers(ROBOT, [peer]))
+
+
+@pytest.mark.parametrize('name', ['', 'fog a', 'fog;id', 'fogaaaaaaaaaaaaa', '0fog'])
+def test_interfaces_without_a_proper_name_are_refused(name: str) -> None:
+    with pytest.raises(ConfigurationError, match='name a VPN interface'):
+        list(WireGuard().up(dataclasses.replace(ROBOT, name=name), []))
+
+
+def test_status_asks_for_nothing_secret_and_is_understood() -> None:
+    wireguard = WireGuard()
+    assert 'dump' not in script(wireguard.status(ROBOT))
+    text = f'{KEY}\t1700000000\n{OTHER}\t0\n{KEY}\t100\t200\n{OTHER}\t0\t148\n'
+    assert wireguard.parse_status(text) == {
+        KEY: {'handshake': 1700000000.0, 'received': 100.0, 'sent': 200.0},
+        OTHER: {'handshake': 0.0, 'received': 0.0, 'sent': 148.0}}
+    assert wireguard.parse_status('') == {}
+
+
+@pytest.mark.parametrize('text', [f'{KEY}\tnever\n', f'{KEY}\t1\t2\t3\n', f'{KEY}\n'])
+def test_status_that_isnt_wireguards_is_an_error(text: str) -> None:
+    with pytest.raises(VpnError, match='counters'):
+        WireGuard().parse_status(text)
