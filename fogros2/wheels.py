@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot's wheel cache: what it has installed, packed as wheels that can travel to a machine.
+
+Nothing is downloaded: an installed distribution lists its own files, and with them a wheel can be
+put together again. One installed for development is built from its sources instead.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Iterator
+import hashlib
+from importlib import metadata
+import json
+import os
+from pathlib import Path
+import platform
+import re
+import shutil
+import sys
+import tempfile
+from typing import Optional
+import urllib.parse
+import zipfile
+
+from fogros2 import process
+from fogros2.bootstrap import Wheels
+from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.model import Command
+
+OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
+#: What only the robot uses: a machine dials nobody.
+_ROBOT_ONLY = frozenset({'paramiko', 'setuptools'})
+#: A wheel's fixed date: the same files always give the same wheel.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def cache_folder() -> Path:
+    """Return where wheels are kept: below XDG_CACHE_HOME."""
+    base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    return Path(base) / 'fogros2' / 'wheels'
+
+
+def collect(folder: Optional[Path] = None) -> Wheels:
+    """
+    Return the wheels of this interpreter's FogROS2, packed now if their contents have changed.
+
+    The first call takes a few seconds, later ones some milliseconds.
+
+    :param folder: the cache, ``cache_folder()`` unless given.
+    :raises ConfigurationError: fogros2 isn't installed, it only lies on the path.
+    :raises PrerequisiteError: one of the distributions can't be packed.
+    """
+    folder = folder or cache_folder()
+    found = list(_closure())
+    names = [_normal(d.name) for d in found]
+    key = _key(found)
+    target = folder / key
+    if not (target / 'wheels.json').exists():
+        # aside, then moved: two launches may do this at once
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix='.new-') as aside:
+            files = {name: _wheel(d, Path(aside)) for name, d in zip(names, found)}
+            Path(aside, 'wheels.json').write_text(json.dumps(files))
+            try:
+                os.rename(aside, target)
+            except OSError:
+                if not (target / 'wheels.json').exists():
+                    raise
+            else:
+                os.mkdir(aside)
+        _forget_old(folder, keep=target)
+    os.utime(target)
+    files = json.loads((target / 'wheels.json').read_text())
+    return Wheels(
+        str(target), key, (sys.version_info.major, sys.version_info.minor), platform.machine(),
+        _libc(files.values()), files[OWN], files.get(PIP, ''), EMBEDDED in files)
+
+
+def _libc(files: Iterable[str]) -> str:
+    """Return the oldest C library that takes all of these wheels."""
+    newest = (0, 0)
+    for file in files:
+        platforms = file.removesuffix('.whl').rpartition('-')[2]
+        versions = re.findall(r'manylinux_(\d+)_(\d+)', platforms)
+        if versions:
+            newest = max(newest, min((int(a), int(b)) for a, b in versions))
+        elif platforms != 'any':
+            # built here, for here
+            return ' '.join(platform.libc_ver())
+    return f'glibc {newest[0]}.{newest[1]}'
+
+
+def _normal(name: str) -> str:
+    return re.sub('[-_.]+', '-', name).lower()
+
+
+def _closure() -> Iterator[metadata.Distribution]:
+    """Yield what has to travel: ours, the embedded default, pip, and all they require."""
+    todo, seen = [OWN, EMBEDDED, PIP], set(_ROBOT_ONLY)
+    while todo:
+        name = todo.pop(0)
+        if name in seen:
+            continue
+        seen.add(name)
+        try:
+            distribution = metadata.distribution(name)
+        except metadata.PackageNotFoundError:
+            if name == OWN:
+                raise ConfigurationError(
+                    'fogros2 is not installed in this interpreter, so it has no wheel to send',
+                    'pip install it, or use `make setup`') from None
+            continue  # an extra's, or another platform's
+        yield distribution
+        for requirement in distribution.requires or []:
+            words, _, marker = requirement.partition(';')
+            if 'extra' not in marker:
+                todo.append(_normal(re.split(r'[^A-Za-z0-9._-]', words.strip())[0]))
+
+
+def _sources(distribution: metadata.Distribution) -> Optional[Path]:
+    """Return the folder of a distribution installed for development, None for others."""
+    text = distribution.read_text('direct_url.json')
+    url = json.loads(text) if text else {}
+    if not url.get('dir_info', {}).get('editable'):
+        return None
+    return Path(urllib.parse.unquote(urllib.parse.urlsplit(url['url']).path))
+
+
+def _key(found: list[metadata.Distribution]) -> str:
+    """Return a hash over the contents of all distributions and over the interpreter."""
+    digest = hashlib.sha256(repr(sys.version_info[:2]).encode() + platform.machine().encode())
+    for distribution in found:
+        digest.update(f'{distribution.name} {distribution.version}\n'.encode())
+        sources = _sources(distribution)
+        if sources is None:
+            # has the hash of each file in it
+            digest.update((distribution.read_text('RECORD') or '').encode())
+            continue
+        for path in sorted(sources.rglob('*.py')):
+            if not {'.venv', 'build', '.cache', 'test'} & set(path.relative_to(sources).parts):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _wheel(distribution: metadata.Distribution, target: Path) -> str:
+    """Write the wheel of an installed distribution into a folder and return its file name."""
+    sources = _sources(distribution)
+    if sources is not None:
+        return _build(sources, target)
+    if not distribution.files or distribution.read_text('WHEEL') is None:
+        raise PrerequisiteError(
+            f'{distribution.name} {distribution.version} was not installed by pip and has no list '
+            'of its files', f'pip install --force-reinstall {distribution.name}')
+    stem = f'{distribution.name.replace("-", "_")}-{distribution.version}'
+    tags = re.findall(r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)
+    pythons, abis, platforms = ('.'.join(dict.fromkeys(t.split('-')[i] for t in tags))
+                                for i in range(3))
+    path = target / f'{stem}-{pythons}-{abis}-{platforms}.whl'
+    # the folder's own spelling wins over the one we would choose
+    info = next(f.parts[0] for f in distribution.files if f.parts[0].endswith('.dist-info'))
+    record = []
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, source in _contents(distribution, f'{stem}.data', info):
+            data = source.read_bytes()
+            entry = zipfile.ZipInfo(name, _DATE)
+            entry.external_attr = (0o100000 | source.stat().st_mode & 0o777) << 16
+            archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
+            digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b'=')
+            record.append(f'{name},sha256={digest.decode()},{len(data)}')
+        record.append(f'{info}/RECORD,,')
+        archive.writestr(zipfile.ZipInfo(f'{info}/RECORD', _DATE), '\n'.join(record) + '\n')
+    return path.name
+
+
+def _contents(
+    distribution: metadata.Distribution, data: str, info: str,
+) -> Iterator[tuple[str, Path]]:
+    """Yield the files of a wheel: name in it, place on this disk."""
+    scripts = {point.name for point in distribution.entry_points
+               if point.group in ('console_scripts', 'gui_scripts')}
+    left_out = {f'{info}/{name}' for name in
+                ('RECORD', 'INSTALLER', 'REQUESTED', 'direct_url.json')}
+    for file in distribution.files or []:
+        source = Path(os.path.normpath(str(distribution.locate_file(file))))
+        if str(file) in left_out or file.suffix == '.pyc' or not source.is_file():
+            continue
+        if file.parts[0] != '..':
+            yield str(file), source
+            continue
+        relative = source.relative_to(sys.prefix)
+        if relative.parts[0] != 'bin':
+            yield f'{data}/data/{relative}', source
+        elif source.name not in scripts:
+            # those of entry points are made anew by whoever installs
+            yield f'{data}/scripts/{source.name}', source
+
+
+def _build(sources: Path, target: Path) -> str:
+    """Build a wheel from a checkout, in a copy: setuptools leaves its files behind."""
+    with tempfile.TemporaryDirectory(dir=target, prefix='.build-') as aside:
+        copy, out = Path(aside, 'copy'), Path(aside, 'out')
+        shutil.copytree(sources, copy, symlinks=True, ignore=shutil.ignore_patterns(
+            '.git', '.venv', '.venv-ros', '.cache', 'build', '*.egg-info', '__pycache__', 'test',
+            'benchmarks', 'install', 'log'))
+        process.run(Command(
+            (sys.executable, '-m', 'pip', 'wheel', '-q', '--no-deps', '--no-build-isolation',
+             '--disable-pip-version-check', '-w', str(out), str(copy)),
+            what=f'build the wheel of {sources}'), timeout=300)
+        wheel = next(out.glob('*.whl'))
+        os.rename(wheel, target / wheel.name)
+    return wheel.name
+
+
+def _forget_old(folder: Path, *, keep: Path, number: int = 3) -> None:
+    """Delete all but the last used sets of wheels."""
+    sets = [p for p in folder.iterdir() if p.is_dir() and not p.name.startswith('.') and p != keep]
+    for path in sorted(sets, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
+        shutil.rmtree(path, ignore_errors=True)
