@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a container machine runs: an SSH server, then the guard; as files for its root."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+from fogros2.provider.container_root import Archive
+
+#: Where the machine finds what FogROS2 brought, without the leading slash.
+FOLDER = 'opt/fogros2'
+HOST_KEY = 'etc/ssh/fogros2_host_ed25519_key'
+#: The first process takes this for its end, and with it the container's.
+END_COMMAND = ('kill', '-TERM', '1')
+#: What the first process prints before the public host key, and before what went wrong.
+HOST_KEY_MARK = 'fogros2-host-key: '
+ERROR_MARK = 'fogros2-error: '
+
+_ENTRY = """\
+#!/bin/sh
+# The first process of the machine: its end ends the machine.
+trap 'exit 0' TERM INT
+export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+user='{user}'
+key=/{host_key}
+fail() {{ echo "{error_mark}$*"; exit 1; }}
+missing=
+for program in sshd sudo rsync python3; do
+    command -v $program >/dev/null || missing="$missing $program"
+done
+if [ -n "$missing" ]; then
+    # an image without them: a package manager brings them, once
+    command -v apt-get >/dev/null || fail "the image lacks$missing, and has no apt-get"
+    export DEBIAN_FRONTEND=noninteractive
+    apt-get update -q >&2 && apt-get install -q -y --no-install-recommends \\
+        openssh-server sudo rsync python3 iproute2 >&2 \\
+        || fail "the image lacks$missing, and apt-get could not install them"
+fi
+id "$user" >/dev/null 2>&1 || useradd -m -s /bin/bash "$user" \\
+    || fail "no user $user can be made in the image"
+if [ "$user" != root ] && ! grep -q "^$user .*NOPASSWD: ALL" /etc/sudoers; then
+    mkdir -p /etc/sudoers.d
+    echo "$user ALL=(ALL:ALL) NOPASSWD: ALL" > /etc/sudoers.d/fogros2
+    chmod 440 /etc/sudoers.d/fogros2
+fi
+mkdir -p /run/sshd /etc/ssh
+grep -qw "$(hostname)" /etc/hosts 2>/dev/null \\
+    || printf '127.0.0.1 localhost\\n127.0.1.1 %s\\n' "$(hostname)" >> /etc/hosts
+[ -s $key.pub ] || {{
+    rm -f $key $key.new $key.new.pub
+    ssh-keygen -q -t ed25519 -N '' -C fogros2 -f $key.new || fail 'no SSH host key can be made'
+    mv $key.new $key
+}}
+"$(command -v sshd)" -f /{folder}/sshd_config || fail 'the SSH server does not start'
+[ -s $key.pub ] || mv $key.new.pub $key.pub
+echo "{host_key_mark}$(cat $key.pub)"
+{guard}
+"""
+
+_GUARD = """\
+while :; do
+    python3 /{folder}/agent.py serve --config /{folder}/agent.json &
+    guard=$!
+    wait $guard
+    code=$?
+    [ $code -eq 0 ] && break
+    # a guard that died must not leave the machine unguarded
+    sleep 1 & wait $!
+done
+"""
+
+#: ``wait`` takes in the children that others leave to the first process.
+_IDLE = """\
+sleep infinity &
+wait $!
+"""
+
+_SSHD = """\
+Port 22
+HostKey /{host_key}
+AuthorizedKeysFile /{folder}/authorized_keys .ssh/authorized_keys
+AllowUsers {user}
+PermitRootLogin {root}
+PubkeyAuthentication yes
+PasswordAuthentication no
+KbdInteractiveAuthentication no
+UsePAM no
+UseDNS no
+PrintMotd no
+PrintLastLog no
+X11Forwarding no
+LoginGraceTime 20
+MaxSessions 100
+MaxStartups 100:30:200
+ClientAliveInterval 15
+ClientAliveCountMax 8
+PidFile none
+LogLevel ERROR
+AcceptEnv LANG LC_*
+Subsystem sftp internal-sftp
+SetEnv {environment}
+"""
+
+
+def agent_file() -> Path | None:
+    """Return where this installation keeps the agent, without importing it."""
+    spec = importlib.util.find_spec('fogros2')
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        path = Path(folder, 'agent.py')
+        if path.is_file():
+            return path
+    return None
+
+
+def add(
+    archive: Archive, *, user: str, authorized_key: str, environment: Mapping[str, str],
+    agent_config: Mapping[str, Any],
+) -> None:
+    """Add the first process's script and what it needs to a machine's root."""
+    agent = agent_file() if agent_config else None
+    names = {
+        'user': user, 'folder': FOLDER, 'host_key': HOST_KEY, 'error_mark': ERROR_MARK,
+        'host_key_mark': HOST_KEY_MARK, 'root': 'prohibit-password' if user == 'root' else 'no',
+    }
+    guard = _IDLE if agent is None else _GUARD.format(**names) + _IDLE
+    archive.folder(FOLDER)
+    archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(guard=guard, **names).encode(), 0o755)
+    variables = {
+        'LANG': 'C.UTF-8',
+        'PATH': '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin',
+        **environment,
+    }
+    words = ' '.join(f'"{name}={value}"' for name, value in variables.items())
+    archive.file(f'{FOLDER}/sshd_config', _SSHD.format(environment=words, **names).encode())
+    archive.file(f'{FOLDER}/authorized_keys', f'{authorized_key.strip()}\n'.encode())
+    if agent is not None:
+        config = {'user': user, **agent_config}
+        config['end_command'] = config.get('end_command') or list(END_COMMAND)
+        archive.file(f'{FOLDER}/agent.py', agent.read_bytes())
+        archive.file(f'{FOLDER}/agent.json', json.dumps(config).encode(), 0o600)

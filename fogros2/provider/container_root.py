@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a container without an image sees of this computer: an allow-list, never the whole root.
+
+The system's programs come by mounts, its settings by a copy of what an image of the same system
+would hold and every user may read. Nothing else of the computer is there: no home, no workspace,
+no service's data, no key.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import functools
+import io
+import os
+from pathlib import Path
+import re
+import stat
+import sys
+import tarfile
+
+#: Folders whose content is the system's own; links (merged /usr) are copied as links.
+SYSTEM = ('usr', 'bin', 'sbin', 'lib', 'lib32', 'lib64', 'libx32', 'libexec')
+
+#: The package database belongs to /usr: without it apt would know nothing of what is there.
+PACKAGES = '/var/lib/dpkg'
+
+#: What of /etc a fresh image would have. What can hold a token (environment, pip.conf, npmrc,
+#: gitconfig, fstab) or belongs to a service isn't here.
+ETC = (
+    'X11', 'OpenCL', 'adduser.conf', 'alternatives', 'apt', 'bash.bashrc', 'bash_completion.d',
+    'bindresvport.blacklist', 'ca-certificates', 'ca-certificates.conf', 'crypto-policies',
+    'debconf.conf', 'debian_version', 'default/locale', 'default/useradd', 'deluser.conf',
+    'dpkg', 'ethertypes', 'fonts', 'gai.conf', 'glvnd', 'groff', 'gss', 'host.conf', 'init.d',
+    'inputrc', 'iproute2', 'issue', 'issue.net', 'java-*', 'ld.so.cache', 'ld.so.conf',
+    'ld.so.conf.d', 'libaudit.conf', 'libnl-3', 'locale.alias', 'locale.conf', 'locale.gen',
+    'localtime', 'login.defs', 'lsb-release', 'magic', 'magic.mime', 'manpath.config',
+    'mime.types', 'mke2fs.conf', 'netconfig', 'networks', 'nsswitch.conf', 'os-release',
+    'pam.conf', 'pam.d', 'perl', 'pki/tls/certs', 'pki/ca-trust', 'profile', 'profile.d',
+    'protocols', 'python3', 'python3.*', 'rc?.d', 'rmt', 'ros', 'rpc', 'security', 'selinux',
+    'services', 'sgml', 'shells', 'skel', 'ssl/certs', 'ssl/openssl.cnf', 'terminfo',
+    'timezone', 'ucf.conf', 'update-motd.d', 'vim', 'vulkan', 'xattr.conf', 'xdg', 'xml',
+)
+
+#: Never copied, wherever it lies and whoever may read it.
+_SECRET = re.compile(
+    r'/auth\.conf|/opasswd|/private(/|$)|_key$|\.key$|/id_(rsa|ecdsa|ed25519)'
+    r'|credential|secret|htpasswd|(\.bak|\.old|\.orig|-)$', re.IGNORECASE)
+
+#: A user and a password in an address, as apt's sources may have them.
+_URL_LOGIN = re.compile(rb'://[^/\s:@]+:[^/\s@]+@')
+
+_FOLDERS: Mapping[str, int] = {
+    'dev': 0o755, 'home': 0o755, 'media': 0o755, 'mnt': 0o755, 'opt': 0o755, 'proc': 0o555,
+    'root': 0o711, 'run': 0o755, 'run/lock': 0o1777, 'run/sshd': 0o755, 'srv': 0o755,
+    'sys': 0o555, 'tmp': 0o1777, 'etc': 0o755, 'usr': 0o755, 'var': 0o755,
+    'var/cache/apt/archives/partial': 0o755, 'var/cache/debconf': 0o755, 'var/lib': 0o755,
+    'var/lib/apt/lists/partial': 0o755, 'var/lib/dpkg': 0o755, 'var/lib/misc': 0o755,
+    'var/log/apt': 0o755, 'var/mail': 0o2775, 'var/opt': 0o755, 'var/spool': 0o755,
+    'var/tmp': 0o1777,
+}
+
+
+class Archive:
+    """A tar archive in memory; everything in it belongs to root unless said otherwise."""
+
+    def __init__(self) -> None:
+        self._buffer = io.BytesIO()
+        self._tar = tarfile.open(fileobj=self._buffer, mode='w', format=tarfile.GNU_FORMAT)
+        self._folders: set[str] = {''}
+
+    def _info(self, path: str, mode: int, owner: int) -> tarfile.TarInfo:
+        info = tarfile.TarInfo(path)
+        info.mode = mode
+        info.uid = info.gid = owner
+        info.mtime = 0
+        return info
+
+    def folder(self, path: str, mode: int = 0o755, owner: int = 0) -> None:
+        """Add a folder (relative path) and, as root's with mode 755, those above it."""
+        if path in self._folders:
+            return
+        self.folder(os.path.dirname(path))
+        self._folders.add(path)
+        info = self._info(path, mode, owner)
+        info.type = tarfile.DIRTYPE
+        self._tar.addfile(info)
+
+    def file(self, path: str, data: bytes, mode: int = 0o644, owner: int = 0) -> None:
+        """Add a file (relative path) and the folders above it."""
+        self.folder(os.path.dirname(path))
+        info = self._info(path, mode, owner)
+        info.size = len(data)
+        self._tar.addfile(info, io.BytesIO(data))
+
+    def link(self, path: str, target: str) -> None:
+        """Add a symbolic link (relative path)."""
+        self.folder(os.path.dirname(path))
+        info = self._info(path, 0o777, 0)
+        info.type = tarfile.SYMTYPE
+        info.linkname = target
+        self._tar.addfile(info)
+
+    def data(self, *, last: bool = True) -> bytes:
+        """Return the archive; without its end mark when another one follows."""
+        end = self._tar.offset
+        if last:
+            self._tar.close()
+            return self._buffer.getvalue()
+        return self._buffer.getvalue()[:end]
+
+
+def system_mounts(root: Path = Path('/')) -> list[str]:
+    """Return the system's folders to be laid under throw-away layers, shortest first."""
+    found = [f'/{name}' for name in SYSTEM
+             if (root / name).is_dir() and not (root / name).is_symlink()]
+    if (root / PACKAGES[1:]).is_dir():
+        found.append(PACKAGES)
+    # an overlay doesn't look below another file system that is mounted inside it
+    below = [point for point in mount_points() if point.startswith('/usr/')]
+    return found + (below if root == Path('/') else [])
+
+
+def mount_points(table: Path = Path('/proc/self/mountinfo')) -> list[str]:
+    """Return where file systems are mounted here, in the order of mounting."""
+    return [point for point, _ in _mounts(table)]
+
+
+def file_system(path: Path, table: Path = Path('/proc/self/mountinfo')) -> str:
+    """Return the type of the file system that ``path`` is on, or would be on."""
+    name = os.path.realpath(path)
+    kind, longest = '', -1
+    for point, type_ in _mounts(table):
+        inside = name == point or name.startswith(point.rstrip('/') + '/')
+        if inside and len(point) >= longest:
+            kind, longest = type_, len(point)
+    return kind
+
+
+def _mounts(table: Path) -> Iterator[tuple[str, str]]:
+    for line in table.read_text().splitlines():
+        words = line.split()
+        yield re.sub(r'\\([0-7]{3})', lambda m: chr(int(m[1], 8)), words[4]), \
+            words[words.index('-') + 1]
+
+
+def readable(path: Path) -> bool:
+    """Return whether every user of this computer may read a file or folder."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        return mode & 0o5 == 0o5
+    return stat.S_ISREG(mode) and bool(mode & 0o4)
+
+
+def settings(archive: Archive, etc: Path = Path('/etc')) -> None:
+    """Add what of ``etc`` is on the allow-list, readable for all, and no secret by its name."""
+    for pattern in ETC:
+        for path in sorted(etc.glob(pattern)):
+            _add(archive, path, etc)
+
+
+def _add(archive: Archive, path: Path, etc: Path) -> None:
+    name = f'etc/{path.relative_to(etc)}'
+    if _SECRET.search(name):
+        return
+    try:
+        if path.is_symlink():
+            archive.link(name, os.readlink(path))
+        elif not readable(path):
+            return
+        elif path.is_dir():
+            archive.folder(name)
+            for child in sorted(path.iterdir()):
+                _add(archive, child, etc)
+        else:
+            data = path.read_bytes()
+            if not _URL_LOGIN.search(data):
+                archive.file(name, data, 0o755 if path.stat().st_mode & 0o111 else 0o644)
+    except FileNotFoundError:
+        return  # removed while we looked, by a package manager
+
+
+def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
+    """Add the system's accounts and the login ``user`` (uid 1000), none with a password."""
+    people, groups = [], []
+    for line in (etc / 'passwd').read_text().splitlines():
+        words = line.split(':')
+        if len(words) == 7 and _system(words[2]) and words[0] != user:
+            people.append(words)
+    for line in (etc / 'group').read_text().splitlines():
+        words = line.split(':')
+        if len(words) == 4 and _system(words[2]) and words[0] != user:
+            groups.append([*words[:3], ''])
+    if user != 'root':
+        people.append([user, 'x', '1000', '1000', '', f'/home/{user}', '/bin/bash'])
+        groups.append([user, 'x', '1000', ''])
+    else:
+        people.append(['root', 'x', '0', '0', 'root', '/root', '/bin/bash'])
+        groups.append(['root', 'x', '0', ''])
+
+    def text(rows: Iterable[Sequence[str]]) -> bytes:
+        return ''.join(':'.join(row) + '\n' for row in rows).encode()
+
+    archive.file('etc/passwd', text(people))
+    archive.file('etc/group', text(groups))
+    archive.file('etc/shadow', text([p[0], '*', '', '', '', '', '', '', ''] for p in people),
+                 0o600)
+    archive.file('etc/gshadow', text([g[0], '*', '', ''] for g in groups), 0o600)
+    archive.file('etc/sudoers', (
+        'Defaults env_reset\n'
+        'Defaults secure_path="/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"\n'
+        'root ALL=(ALL:ALL) ALL\n'
+        f'{user} ALL=(ALL:ALL) NOPASSWD: ALL\n').encode(), 0o440)
+    if user != 'root':
+        archive.folder(f'home/{user}', 0o750, 1000)
+        for name in ('.bashrc', '.profile'):
+            path = etc / 'skel' / name
+            if path.is_file() and readable(path):
+                archive.file(f'home/{user}/{name}', path.read_bytes(), 0o644, 1000)
+
+
+def _system(number: str) -> bool:
+    return number.isdigit() and (int(number) < 1000 or int(number) == 65534)
+
+
+@functools.lru_cache(maxsize=4)
+def skeleton(user: str) -> bytes:
+    """
+    Return the part of the root that all machines share, as an archive that another follows.
+
+    Read once per process: a launch of many machines doesn't read /etc for each.
+    """
+    archive = Archive()
+    for name, mode in _FOLDERS.items():
+        archive.folder(name, mode)
+    for name in SYSTEM:
+        path = Path('/', name)
+        if path.is_symlink():
+            archive.link(name, os.readlink(path))
+        elif path.is_dir():
+            archive.folder(name)
+    archive.link('var/run', '/run')
+    archive.link('var/lock', '/run/lock')
+    archive.link('etc/mtab', '../proc/self/mounts')
+    settings(archive)
+    accounts(archive, user)
+    return archive.data(last=False)
+
+
+def environment_mounts(workspace: str | None) -> list[str]:
+    """
+    Return the folders that hold this Python environment and ROS 2's underlays.
+
+    That is what a custom image would carry: the environment this process runs in, the packages
+    it takes from elsewhere (editable installs), and what AMENT_PREFIX_PATH names, but for
+    ``workspace``, which travels.
+    """
+    found = [sys.prefix, sys.base_prefix]
+    for prefix in {sys.prefix, sys.base_prefix}:
+        for site in Path(prefix).glob('lib/python3*/site-packages'):
+            found += editable(site)
+    for entry in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        if entry and os.path.isdir(entry) and not _inside(entry, workspace):
+            found.append(entry)
+    return outermost(found)
+
+
+def editable(site: Path) -> list[str]:
+    """Return the packages that ``site`` takes from folders elsewhere (editable installs)."""
+    found: list[str] = []
+    for path in site.glob('*.pth'):
+        for line in path.read_text(errors='replace').splitlines():
+            if line.startswith('/') and os.path.isdir(line):
+                found += [str(child) for child in Path(line).iterdir()
+                          if (child / '__init__.py').is_file()
+                          or child.suffix == '.py' and child.name != 'setup.py']
+    for path in site.glob('__editable__*_finder.py'):
+        match = re.search(r'^MAPPING[^=]*= *(\{.*\})', path.read_text(), re.MULTILINE)
+        if match:
+            found += [str(target) for target in ast.literal_eval(match[1]).values()]
+    return [path for path in found if os.path.exists(path)]
+
+
+def outermost(paths: Iterable[str]) -> list[str]:
+    """Return the paths without those below another, or below the system's folders."""
+    kept: list[str] = []
+    for path in sorted({os.path.abspath(path) for path in paths}):
+        top = path.split('/')[1]
+        if path != '/' and top not in SYSTEM and not any(_inside(path, other) for other in kept):
+            kept.append(path)
+    return kept
+
+
+def _inside(path: str, folder: str | None) -> bool:
+    return bool(folder) and (path == folder or path.startswith(str(folder).rstrip('/') + '/'))
