@@ -126,9 +126,8 @@ def plan(
     :raises WorkspaceError: it has to be built there, and can't be.
     """
     root = workspace.root
-    setup = f'{root}/install/setup.sh'
-    if not (root / 'install' / 'setup.sh').exists():
-        setup = f'{root}/install/local_setup.sh'
+    # setup.sh would chain to the robot's own prefixes, which the machine may have elsewhere
+    setup = f'{root}/install/local_setup.sh'
     reason = _why_build(workspace, machine, robot)
     if not reason:
         if workspace.outside:
@@ -149,7 +148,7 @@ def plan(
             'run colcon build here first')
     return WorkspacePlan(
         root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)),
-        tuple(_build(workspace, environment)), f'{root}/install/setup.sh', reason)
+        tuple(_build(workspace, environment)), setup, reason)
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
