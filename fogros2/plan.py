@@ -26,7 +26,8 @@ SYSTEM_PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
 _PATH_VARIABLES = (
     'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'PYTHONPATH',
     'LD_LIBRARY_PATH', 'PATH')
-_PLAIN_VARIABLES = (
+#: Variables of the robot's that hold on any machine.
+PLAIN_VARIABLES = (
     'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_DOMAIN_ID',
     'ROS_AUTOMATIC_DISCOVERY_RANGE', 'RCUTILS_LOGGING_SEVERITY', 'RCUTILS_COLORIZED_OUTPUT',
     'RCUTILS_CONSOLE_OUTPUT_FORMAT')
@@ -147,7 +148,7 @@ def underlay(
         if entries:
             variables[name] = os.pathsep.join(entries)
     variables.update({
-        name: environment[name] for name in _PLAIN_VARIABLES if environment.get(name)})
+        name: environment[name] for name in PLAIN_VARIABLES if environment.get(name)})
     return Underlay(tuple(prefixes), ros2, variables)
 
 

@@ -225,7 +225,7 @@ def write_private(path: Path, data: bytes) -> None:
             os.unlink(aside)
             raise
     except OSError as error:
-        raise StoreError(f'{path} can\'t be written: {error.strerror}',
+        raise StoreError(f"{path} can't be written: {error.strerror}",
                          'FOGROS2_STATE_HOME names another folder for it') from error
 
 
@@ -236,7 +236,7 @@ def _make_folder(path: Path) -> Path:
             if not folder.exists():
                 folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
-        raise StoreError(f'{path} can\'t be made: {error.strerror}',
+        raise StoreError(f"{path} can't be made: {error.strerror}",
                          'FOGROS2_STATE_HOME names another folder for it') from error
     return path
 

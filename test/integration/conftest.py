@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A network that leads nowhere for simulated clouds, and a look at what a test leaves behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import subprocess
+import uuid
+
+from fogros2.model import Command
+from fogros2.process import run, which
+from fogros2.waiting import wait_until
+import pytest
+
+#: TEST-NET-2: nobody's, and no route leads out of an internal network.
+SUBNET = '198.51.100.0/24'
+
+
+def traces(state: Path) -> set[str]:
+    """Return everything on this computer now that a launch may leave behind, one line each."""
+    found = {f'interface {name}' for name in os.listdir('/sys/class/net') if name[:3] == 'fog'}
+    for process in Path('/proc').glob('[0-9]*'):
+        try:
+            words = (process / 'cmdline').read_bytes().split(b'\0')
+            comm = (process / 'comm').read_text().strip()
+        except OSError:
+            continue
+        if comm == 'wireguard-go' or any(w.endswith(b'agent.py') for w in words[:3]):
+            found.add(f'process {process.name} {comm}')
+    for words, what in (
+        (('podman', 'ps', '-a', '--format', '{{.Names}}'), 'container'),
+        (('nft', 'list', 'tables'), 'nftables'),
+        (('ip', 'route', 'show', 'table', 'all'), 'route'),
+    ):
+        if which(words[0]):
+            output = run(Command(words, sudo=True), timeout=30, check=False).stdout
+            found |= {f'{what} {line}' for line in output.splitlines() if 'fog' in line}
+    found |= {f'mount {line.split()[1]}' for line in Path('/proc/mounts').read_text().splitlines()
+              if 'fogros2' in line.split()[1]}
+    for folder in (Path('/run'), Path('/tmp'), Path('/var/tmp')):
+        found |= {f'file {p}' for p in folder.glob('fogros2*')}
+    found |= {f'state {p.relative_to(state)}' for p in state.rglob('*') if not p.is_dir()}
+    return found
+
+
+@pytest.fixture
+def nothing_left(state_home: Path, root: None) -> Iterator[None]:
+    """Fail a test after which something is there that wasn't before."""
+    before = traces(state_home)
+    yield
+    left: set[str] = set()
+
+    def gone() -> bool:
+        left.clear()
+        left.update(traces(state_home) - before)
+        return not left
+
+    try:
+        wait_until(gone, timeout=10.0, what='everything to be gone')
+    except RuntimeError:
+        pytest.fail(f'left behind: {sorted(left)}')
+
+
+@pytest.fixture(scope='session')
+def engine(tun: None) -> str:
+    """Skip where no podman runs containers."""
+    if which('podman') is None:
+        pytest.skip('needs podman')
+    return 'podman'
+
+
+@pytest.fixture(scope='session')
+def cloud_network(engine: str) -> Iterator[str]:
+    """Return a container network without a way out, for the time of the tests."""
+    name = f'fogt{uuid.uuid4().hex[:8]}'
+    run(Command((engine, 'network', 'create', '--internal', '--subnet', SUBNET, name),
+                sudo=True), timeout=60)
+    yield name
+    run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
+
+
+@pytest.fixture
+def children() -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Return a list; the processes put there are gone after the test."""
+    started: list[subprocess.Popen[bytes]] = []
+    yield started
+    for child in started:
+        if child.poll() is None:
+            child.kill()
+        child.wait(10)

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.deploy against real containers, SSH, WireGuard and agents."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import threading
+
+from fogros2.deploy import Launch
+from fogros2.errors import FogError, NameTaken, WorkspaceError
+from fogros2.model import MachineSpec, NodeSpec
+from fogros2.report import StepDone, StepFailed, StepStarted
+from fogros2.store import Store
+from fogros2.waiting import wait_until
+import pytest
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+
+class Injected(FogError):
+    """The fault of these tests."""
+
+
+@pytest.fixture
+def spec(cloud_network):
+    def make(name='planner', **changes):
+        return MachineSpec(name, 'container', {'network': cloud_network}, **changes)
+    return make
+
+
+def one_node(launch_id, words=(sys.executable, '-c', 'print("hello", flush=True)')):
+    return NodeSpec(f'{launch_id}-1', 'node-1', arguments=tuple(words))
+
+
+def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
+    events = []
+    launch = Launch(report=events.append)
+    try:
+        launch.prepare([spec()])
+        machine = launch.up(spec())
+        heard = []
+        machine.subscribe(heard.append)
+        code = 'import os, socket; print(socket.gethostname(), os.getuid(), flush=True)'
+        machine.start([one_node('a', ('python3', '-c', code))])
+        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=30,
+                   what='the node to end')
+        text = [e['text'].strip() for e in heard if e['event'] == 'output']
+        assert text[0].split()[0] == 'planner'
+        assert text[0].split()[1] != '0', 'nodes must not run as root'
+    finally:
+        assert launch.down() == []
+    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
+    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
+    assert sorted(started) == sorted(done)
+
+
+STEPS = ['machine', 'connect', 'ROS 2', 'guard', 'VPN', 'agent']
+
+
+@pytest.mark.parametrize('step', ['VPN interface', *STEPS])
+def test_a_fault_in_any_step_leaves_nothing(spec, step):
+    def fault(event):
+        if isinstance(event, StepStarted) and event.step == step:
+            raise Injected(f'fault in {step}')
+
+    launch = Launch(report=fault)
+    with pytest.raises(Injected):
+        launch.up(spec())
+    assert launch.down() == []
+
+
+@pytest.mark.parametrize('step', ['VPN interface', *STEPS])
+def test_a_cancel_in_any_step_leaves_nothing(spec, step):
+    launch = Launch(report=lambda event: cancel.set() if (
+        isinstance(event, StepStarted) and event.step == step) else None)
+    cancel = launch.cancel
+    # a step that only starts the last command may still succeed: down() then ends the machine
+    try:
+        launch.up(spec())
+    except FogError:
+        pass
+    assert launch.down() == []
+
+
+def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
+    events = []
+    launch = Launch(report=events.append)
+    machine = launch.up(spec())
+    undo = machine._launch._robot_vpn()._take_down
+
+    def failing():
+        undo()
+        raise Injected('the undo failed')
+
+    launch._undo.callback(launch.attempt, '', 'VPN interface', failing)
+    failures = launch.down()
+    assert [str(failure) for failure in failures] == ['the undo failed']
+    assert any(isinstance(e, StepFailed) and e.reason == 'the undo failed' for e in events)
+
+
+def test_several_machines_come_up_in_parallel_and_reach_each_other(spec):
+    launch = Launch()
+    names = ['one', 'two', 'three']
+    launch.expect(names)
+    machines = {}
+    try:
+        threads = [
+            threading.Thread(target=lambda n=n: machines.update({n: launch.up(spec(n))}))
+            for n in names]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(machines) == sorted(names)
+        from fogros2.model import Command
+        for machine in machines.values():
+            for other in machines.values():
+                machine.shell.run(
+                    Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=20)
+    finally:
+        assert launch.down() == []
+
+
+def test_two_launches_at_once_do_not_meet(spec):
+    first, second = Launch(), Launch()
+    try:
+        one, two = first.up(spec('one')), second.up(spec('two'))
+        assert one.vpn_address != two.vpn_address
+        with pytest.raises(NameTaken, match='another launch on this robot'):
+            second.up(spec('one'))
+        assert first.down() == []
+        assert two.agent.request('status')['machine'] == 'two'
+    finally:
+        assert first.down() == []
+        assert second.down() == []
+
+
+def test_a_kept_machine_is_reused_by_the_next_launch(spec):
+    store = Store()
+    kept = spec(on_exit='keep')
+    first = Launch(store=store)
+    machine_id = first.up(kept).machine.id
+    assert first.down() == []
+    events = []
+    second = Launch(store=store, report=events.append)
+    try:
+        assert second.up(spec()).machine.id == machine_id
+    finally:
+        assert second.down() == []
+
+
+def test_a_stopped_machine_is_started_by_the_next_launch(spec):
+    store = Store()
+    first = Launch(store=store)
+    machine = first.up(spec(on_exit='stop'))
+    machine_id = machine.machine.id
+    assert first.down() == []
+    second = Launch(store=store)
+    try:
+        assert second.up(spec()).machine.id == machine_id
+    finally:
+        assert second.down() == []
+
+
+def test_a_killed_wireguard_comes_back(spec):
+    launch = Launch()
+    try:
+        machine = launch.up(spec())
+        for pid in wireguard_processes():
+            os.kill(pid, 9)
+        wait_until(lambda: machine.heartbeat.age < 1.0 and wireguard_processes(), timeout=20,
+                   what='the VPN to come back')
+    finally:
+        assert launch.down() == []
+
+
+def wireguard_processes():
+    found = []
+    for pid in filter(str.isdigit, os.listdir('/proc')):
+        try:
+            with open(f'/proc/{pid}/comm') as comm:
+                if comm.read().strip() == 'wireguard-go':
+                    found.append(int(pid))
+        except OSError:
+            continue
+    return found
+
+
+def test_an_unknown_executable_is_found_before_anything_is_created(spec):
+    launch = Launch()
+    with pytest.raises(WorkspaceError, match="did you mean 'talker'"):
+        launch.prepare([spec()], {'planner': [('fogros2_examples', 'talkr')]})
+    assert launch.down() == []
