@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CloudGroup: all processes of some part of the launch, on a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Optional, Union
+
+from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.machines import CloudInstance
+from fogros2.actions.remote import RemoteProcess, send
+from fogros2.actions.wrapping import wrap
+from fogros2.errors import ConfigurationError
+from launch import LaunchContext, LaunchDescriptionEntity
+from launch.actions import ExecuteLocal, GroupAction
+
+
+class CloudGroup(GroupAction):
+    """
+    A :class:`launch.actions.GroupAction` whose processes are on a machine.
+
+    Nodes, lifecycle nodes, component containers and ExecuteProcess of its content run there, at
+    any depth and whenever they come: from an included file, a timer, an OpaqueFunction, an event
+    handler. All other actions run here, so configurations, namespaces, parameters and service
+    calls work as in any group. A CloudNode, or another CloudGroup, keeps its own machine.
+
+    :param machine: the machine, or the name of one that the launch mentions elsewhere.
+    :param actions: the content.
+    """
+
+    def __init__(
+        self, machine: Union[CloudInstance, str],
+        actions: Iterable[LaunchDescriptionEntity], **kwargs: Any,
+    ) -> None:
+        super().__init__(list(actions), **kwargs)
+        if not isinstance(machine, (CloudInstance, str)):
+            raise ConfigurationError(
+                f'machine={machine!r} is no machine',
+                'pass one such as ContainerInstance(), or the name of one')
+        self.machine = machine
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Execute the action: yields the content, its processes turned into remote ones."""
+        if context.is_shutdown:
+            return None
+        Coordinator.of(context).know(self.machine)
+        return wrap(super().execute(context), self._send)
+
+    def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+        if isinstance(entity, ExecuteLocal) and not isinstance(entity, RemoteProcess):
+            # before the action's own execution, which may make a ROS node in this process
+            Coordinator.of(context).engage()
+            send(entity, self.machine)

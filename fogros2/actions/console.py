@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps of a deployment in the terminal: a line each, a table at the end."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from typing import Optional, TextIO
+
+from fogros2.report import Event, OutputLine, Progress, StepDone, StepFailed, StepStarted
+import launch.logging
+
+_WIDTH = 24
+
+
+class Console:
+    """
+    Takes events from any thread and shows them through launch's logger ``fogros2``.
+
+    :param stream: where progress is drawn if it is a terminal.
+    """
+
+    def __init__(self, stream: Optional[TextIO] = None) -> None:
+        self._logger = launch.logging.get_logger('fogros2')
+        self._stream = stream or sys.stdout
+        self._lock = threading.RLock()
+        self._done: list[StepDone] = []
+        self._running: dict[tuple[str, str], str] = {}
+        self._drawn = False
+        self._live = self._stream.isatty()
+        if self._live:
+            # a log line takes the place of the progress line instead of following it
+            launch.logging.launch_config.get_screen_handler().addFilter(self._before_line)
+
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        with self._lock:
+            if isinstance(event, StepStarted):
+                self._running[event.machine, event.step] = ''
+                self._logger.debug(f'{_where(event.machine)}: {event.step} ...')
+            elif isinstance(event, StepDone):
+                self._running.pop((event.machine, event.step), None)
+                self._done.append(event)
+                detail = f' ({event.detail})' if event.detail else ''
+                self._logger.info(
+                    f'{_where(event.machine)}: {event.step} {event.seconds:.2f} s{detail}')
+            elif isinstance(event, StepFailed):
+                self._running.pop((event.machine, event.step), None)
+                self._logger.error(
+                    f'{_where(event.machine)}: {event.step} failed after {event.seconds:.2f} s: '
+                    f'{event.reason}')
+            elif isinstance(event, Progress):
+                self._running[event.machine, event.step] = _bar(event)
+            elif isinstance(event, OutputLine):
+                self._logger.debug(f'{_where(event.machine)}: {event.line}')
+            self._draw()
+
+    def table(self) -> None:
+        """Log the steps done since the last table, with their times."""
+        with self._lock:
+            done, self._done = self._done, []
+            if not done:
+                return
+            rows = [('machine', 'step', 'seconds')] + [
+                (_where(step.machine), step.step, f'{step.seconds:.2f}') for step in done]
+            widths = [max(len(row[column]) for row in rows) for column in range(3)]
+            lines = [
+                f'  {machine:{widths[0]}}  {step:{widths[1]}}  {seconds:>{widths[2]}}'
+                for machine, step, seconds in rows]
+            self._logger.info('\n'.join(['steps', *lines]))
+
+    def close(self) -> None:
+        """Take the progress line away."""
+        with self._lock:
+            self._running.clear()
+            self._erase()
+            if self._live:
+                launch.logging.launch_config.get_screen_handler().removeFilter(
+                    self._before_line)
+
+    def _before_line(self, record: logging.LogRecord) -> bool:
+        with self._lock:
+            self._erase()
+        return True
+
+    def _erase(self) -> None:
+        if self._drawn:
+            self._stream.write('\r\x1b[K')
+            self._stream.flush()
+            self._drawn = False
+
+    def _draw(self) -> None:
+        if not self._live or not self._logger.isEnabledFor(logging.INFO):
+            return
+        self._erase()
+        if self._running:
+            parts = [
+                f'{_where(machine)}: {step}{bar}'
+                for (machine, step), bar in self._running.items()]
+            self._stream.write('   '.join(parts)[:_columns(self._stream)])
+            self._stream.flush()
+            self._drawn = True
+
+
+def _columns(stream: TextIO) -> int:
+    import shutil
+    return shutil.get_terminal_size().columns - 1
+
+
+def _where(machine: str) -> str:
+    return machine or 'robot'
+
+
+def _bar(progress: Progress) -> str:
+    done = _bytes(progress.done)
+    if not progress.total:
+        return f' {done}'
+    full = min(_WIDTH, _WIDTH * progress.done // progress.total)
+    return f" [{'#' * full}{'.' * (_WIDTH - full)}] {done} of {_bytes(progress.total)}"
+
+
+def _bytes(count: float) -> str:
+    for unit in ('B', 'kB', 'MB'):
+        if count < 1000:
+            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
+        count /= 1000
+    return f'{count:.1f} GB'

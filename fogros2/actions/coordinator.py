@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What ties a launch to its machines: one coordinator in each launch context.
+
+Cloud processes register here as launch executes them. When launch has gone through everything that
+is there to execute at that moment, the machines that are new are checked together, before any of
+them is made, then brought up in parallel, in threads. When launch shuts down, by whatever cause, it
+is kept alive until all processes have ended and everything is taken down again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+import difflib
+import threading
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from fogros2.actions import signals
+from fogros2.actions.console import Console
+from fogros2.actions.session import Session
+from fogros2.errors import Cancelled, ConfigurationError, FogError
+from launch import Event, EventHandler, LaunchContext
+from launch.actions import (
+    ExecuteLocal, OpaqueFunction, PopEnvironment, PushEnvironment, ResetEnvironment,
+)
+from launch.event_handlers import OnShutdown
+from launch.events.process import ShutdownProcess
+import launch.logging
+
+if TYPE_CHECKING:
+    from fogros2.actions.machines import CloudInstance
+    from fogros2.deploy import Launch
+
+#: Name under which ``context.locals`` has the coordinator.
+_LOCAL = 'fogros2'
+#: More than any launch has machines: each may wait in a thread of its own.
+_THREADS = 128
+
+
+class Begin(Event):
+    """Everything that was there to execute has been: machines asked for meanwhile may come up."""
+
+    name = 'fogros2.Begin'
+
+
+class Failed(Event):
+    """
+    The deployment failed.
+
+    Its handler raises the error, which is how a launch ends with a status other than zero.
+    """
+
+    name = 'fogros2.Failed'
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__()
+        self.error = error
+
+
+class _Census(ShutdownProcess):
+    """Asks every process action for itself; shuts none of them down."""
+
+    def __init__(self, found: list[ExecuteLocal]) -> None:
+        super().__init__(process_matcher=found.append)  # returns None: no match
+
+
+class Coordinator:
+    """
+    The robot's side of a launch, on launch's event loop.
+
+    :param make_launch: makes the deployment (a :class:`fogros2.deploy.Launch`) when the first
+        machine is asked for.
+    """
+
+    def __init__(
+        self, context: LaunchContext,
+        make_launch: Optional[Callable[..., Launch]] = None,
+    ) -> None:
+        self.base_environment: dict[str, str] = {}
+        #: Opens when the cloud is up: True to go on, False to give up.
+        self.gate: Optional[asyncio.Future[bool]] = None
+        self._context = context
+        self._make_launch = make_launch or _make_launch
+        self._launch: Optional[Launch] = None
+        self._cancel = threading.Event()
+        self._console: Optional[Console] = None
+        self._instances: dict[str, CloudInstance] = {}
+        self._sessions: dict[str, Session] = {}
+        self._new: list[Session] = []
+        self._begun = True
+        self._down: Optional[asyncio.Task[None]] = None
+        self._restore_signals: Callable[[], None] = _nothing
+        self._logger = launch.logging.get_logger('fogros2')
+        context.extend_globals({_LOCAL: self})
+        for handler in (
+            EventHandler(
+                matcher=lambda event: isinstance(event, Begin),
+                entities=OpaqueFunction(function=self._on_begin)),
+            EventHandler(
+                matcher=lambda event: isinstance(event, Failed),
+                entities=OpaqueFunction(function=self._on_failed)),
+            OnShutdown(on_shutdown=self._on_shutdown),
+        ):
+            context.register_event_handler(handler)
+
+    @classmethod
+    def of(cls, context: LaunchContext) -> Coordinator:
+        """Return the context's coordinator, made if there is none yet."""
+        known: Optional[Coordinator] = context.get_locals_as_dict().get(_LOCAL)
+        return cls(context) if known is None else known
+
+    # -- what actions call ----------------------------------------------------------------------
+
+    @property
+    def launch(self) -> Launch:
+        """The deployment; :meth:`engage` made it."""
+        assert self._launch is not None
+        return self._launch
+
+    def engage(self) -> None:
+        """
+        Take it that this launch uses the cloud: from now on its nodes get the DDS environment.
+
+        :raises FogError: the environment can't be had, such as for an unknown RMW_IMPLEMENTATION.
+        """
+        if self._launch is not None:
+            return
+        context = self._context
+        self.base_environment = start = _environment_at_start(context)
+        self._console = Console()
+        self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
+        self._restore_signals = signals.take_over(context)
+        self._launch = self._make_launch(
+            report=self._console, environment=start, cancel=self._cancel)
+        self._set_dds_environment()
+
+    def know(self, machine: Union[CloudInstance, str]) -> None:
+        """Remember a machine that the launch mentions, so that its name may stand for it."""
+        if not isinstance(machine, str):
+            self._instances[machine.name] = machine
+
+    def session(self, machine: Union[CloudInstance, str]) -> Session:
+        """
+        Return the session of a machine, which comes up soon if this is the first to ask for it.
+
+        :raises ConfigurationError: a wrong value, an unknown name, or a name used twice.
+        """
+        self.engage()
+        if isinstance(machine, str):
+            machine = self._by_name(machine)
+        spec = machine.spec(self._context)
+        self._instances[spec.name] = machine
+        session = self._sessions.get(spec.name)
+        if session is None:
+            session = Session(
+                spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
+                changed=self._open_gate)
+            self._sessions[spec.name] = session
+            self._new.append(session)
+            self.launch.expect([spec.name])
+            self._set_dds_environment()
+            self.begin()
+        elif session.spec != spec:
+            raise ConfigurationError(f"two machines of this launch are called '{spec.name}'",
+                                     'give each a name= of its own')
+        return session
+
+    def begin(self) -> None:
+        """Go on once launch has executed all that is there to execute now."""
+        if self._begun:
+            self._begun = False
+            # events are handled after what launch is visiting, and not after its failure
+            self._context.emit_event_sync(Begin())
+
+    def hold(self) -> asyncio.Future[bool]:
+        """Return the gate, closed from now on until the cloud is up."""
+        if self.gate is None:
+            self.gate = self._context.asyncio_loop.create_future()
+            self.begin()
+        return self.gate
+
+    # -- coming up ------------------------------------------------------------------------------
+
+    def _by_name(self, name: str) -> CloudInstance:
+        for known, instance in list(self._instances.items()):
+            # a name that was a substitution reads otherwise once it is resolved
+            if name in (known, instance.name):
+                return instance
+        near = difflib.get_close_matches(name, self._instances, n=1)
+        raise ConfigurationError(
+            f"no machine of this launch is called '{name}'",
+            f"did you mean '{near[0]}'?" if near else
+            'name one that is used before, or pass the machine itself')
+
+    def _set_dds_environment(self) -> None:
+        environment = self.launch.robot_environment()
+        self._context.environment.update(environment)
+        # what the launch sets for the robot isn't the launch file's change, and doesn't travel
+        self.base_environment.update(environment)
+        late = []
+        for action in self._processes():
+            details = action.process_details
+            if details is None or details.get('env') is None:
+                continue
+            if details['env'].items() >= environment.items():
+                continue
+            if details.get('pid') is None:
+                # executed, but not started before launch gets back to its event loop
+                details['env'].update(environment)
+            else:
+                late.append(details['name'])
+        if late:
+            self._logger.warning(
+                f"{', '.join(late)} runs already and so without the cloud's DDS settings: it may "
+                'not see the cloud; use a FogROSLaunchDescription')
+
+    def _on_begin(self, context: LaunchContext) -> None:
+        self._begun = True
+        if context.is_shutdown:
+            return
+        new, self._new = self._new, []
+        if new:
+            task = context.asyncio_loop.create_task(self._bring_up(new))
+            context.add_completion_future(task)
+            task.add_done_callback(self._raise_in_launch)
+            for session in new:
+                session.deployment = task
+        self._open_gate()
+
+    async def _bring_up(self, sessions: list[Session]) -> None:
+        try:
+            await self._in_thread(
+                self.launch.prepare, [session.spec for session in sessions],
+                {session.spec.name: session.programs for session in sessions})
+        except FogError as error:
+            self._fail(error)
+            return
+        await asyncio.gather(*(self._up(session) for session in sessions))
+        if self._console is not None and not self._context.is_shutdown:
+            self._console.table()
+
+    async def _up(self, session: Session) -> None:
+        try:
+            running = await self._in_thread(self.launch.up, session.spec)
+        except FogError as error:
+            # at once, though other machines are still on their way
+            self._fail(error)
+            return
+        self._instances[session.spec.name].is_up(running)
+        session.up(running)
+
+    def _raise_in_launch(self, task: asyncio.Task[None]) -> None:
+        error = task.exception()
+        if error is not None:
+            self._fail(error)
+
+    def _open_gate(self) -> None:
+        if self.gate is None or self.gate.done() or not self._begun:
+            return
+        if not self._new and all(session.ready for session in self._sessions.values()):
+            self.gate.set_result(True)
+
+    # -- going down -----------------------------------------------------------------------------
+
+    def _fail(self, error: BaseException) -> None:
+        if isinstance(error, Cancelled):
+            return  # the launch is ending; that is what cancelled it
+        self._context.emit_event_sync(Failed(error))
+
+    def _on_failed(self, context: LaunchContext) -> None:
+        raise context.locals.event.error
+
+    def _on_shutdown(self, event: Event, context: LaunchContext) -> None:
+        if self._down is not None:
+            return
+        self._cancel.set()
+        if self.gate is not None and not self.gate.done():
+            self.gate.set_result(False)
+        if self._launch is None:
+            return
+        self._down = context.asyncio_loop.create_task(self._take_down())
+        self._down.add_done_callback(self._taken_down)
+        context.add_completion_future(self._down)
+
+    async def _take_down(self) -> None:
+        # the VPN's interface must not go from under a node that runs
+        futures = [action.get_asyncio_future() for action in self._processes()]
+        waits = {future for future in futures if future is not None}
+        waits |= {s.deployment for s in self._sessions.values() if s.deployment is not None}
+        if waits:
+            await asyncio.wait(waits)
+        for error in await self._in_thread(self.launch.down):
+            self._fail(error)
+
+    def _taken_down(self, task: asyncio.Task[None]) -> None:
+        self._raise_in_launch(task)
+        if self._console is not None:
+            self._console.close()
+        self._pool.shutdown(wait=False)
+        self._restore_signals()
+
+    def _processes(self) -> list[ExecuteLocal]:
+        """
+        Return every process action that was executed, the robot's own too.
+
+        launch keeps no list of them, but each has a handler that asks an event's matcher about
+        the action; this one notes it and says no. Handled here and not by the event queue, so
+        that the answer is there at once.
+        """
+        found: list[ExecuteLocal] = []
+        census = _Census(found)
+        context = self._context
+        for handler in tuple(context._event_handlers):
+            if handler.matches(census):
+                context._push_locals()
+                entities = handler.handle(census, context)
+                for entity in entities if isinstance(entities, Iterable) else (entities,):
+                    if entity is not None:
+                        entity.visit(context)
+                context._pop_locals()
+        return found
+
+    def _in_thread(self, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
+        future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(
+            self._pool, function, *args)
+        return future
+
+
+def _nothing() -> None:
+    """Undo nothing."""
+
+
+def _make_launch(**arguments: Any) -> Launch:
+    # not before a machine is asked for: it brings SSH along
+    from fogros2.deploy import Launch
+    return Launch(**arguments)
+
+
+def _environment_at_start(context: LaunchContext) -> dict[str, str]:
+    """Return the environment that the launch was started in, by the actions that reset to it."""
+    PushEnvironment().execute(context)
+    ResetEnvironment().execute(context)
+    environment = dict(context.environment)
+    PopEnvironment().execute(context)
+    return environment

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FogROSLaunchDescription: a launch description that has the whole picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import functools
+from typing import get_args, Optional, Union
+
+from fogros2.actions import private
+from fogros2.actions.cloud_group import CloudGroup
+from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.remote import RemoteProcess
+from fogros2.actions.wrapping import wrap
+from fogros2.errors import ConfigurationError
+from fogros2.model import RobotNodes
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import ExecuteLocal, IncludeLaunchDescription, TimerAction
+
+
+class FogROSLaunchDescription(LaunchDescription):
+    """
+    A :class:`launch.LaunchDescription` whose robot nodes wait for its cloud.
+
+    :param robot_nodes: 'after_cloud' starts the processes and timers of the robot when the
+        machines are up and their nodes run; 'immediately' starts them at once. Everything is
+        executed in its order either way: only the start of a process waits.
+    """
+
+    def __init__(
+        self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
+        deprecated_reason: Optional[str] = None, robot_nodes: RobotNodes = 'after_cloud',
+    ) -> None:
+        super().__init__(initial_entities, deprecated_reason=deprecated_reason)
+        if robot_nodes not in get_args(RobotNodes):
+            raise ConfigurationError(
+                f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')
+        self.robot_nodes = robot_nodes
+
+    def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Visit the content; its robot processes wait for the cloud."""
+        entities = super().visit(context)
+        if context.is_shutdown:
+            return entities
+        coordinator = Coordinator.of(context)
+        for entity, certain in cloud_entities(self.entities):
+            coordinator.know(entity.machine)
+            if certain:
+                # its first process may come late, from a timer; robot nodes need to know now
+                coordinator.engage()
+        if self.robot_nodes == 'immediately':
+            return entities
+        coordinator.hold()
+        return wrap(entities, functools.partial(_hold, coordinator))
+
+
+def cloud_entities(
+    entities: Iterable[LaunchDescriptionEntity], certain: bool = True,
+) -> Iterator[tuple[Union[RemoteProcess, CloudGroup], bool]]:
+    """
+    Yield what of these entities, at any depth, is for a machine; no file is read for it.
+
+    The flag tells that no condition stands before it: it will be executed, or can be by an event.
+    """
+    for entity in entities:
+        sure = certain and getattr(entity, 'condition', None) is None
+        if isinstance(entity, (RemoteProcess, CloudGroup)):
+            yield entity, sure
+        if not isinstance(entity, IncludeLaunchDescription):
+            below = [entity.describe_sub_entities(), *(
+                some for _, some in entity.describe_conditional_sub_entities())]
+            for some in below:
+                yield from cloud_entities(some, sure)
+
+
+def _hold(
+    coordinator: Coordinator, entity: LaunchDescriptionEntity, context: LaunchContext,
+) -> None:
+    """Have a robot process, or a timer, start only when the cloud is up."""
+    if isinstance(entity, RemoteProcess):
+        return
+    if isinstance(entity, ExecuteLocal):
+        start = private.execute_process(entity)
+
+        async def start_later(context: LaunchContext) -> None:
+            if await coordinator.hold() and not context.is_shutdown:
+                await start(context)
+                return
+            future = entity.get_asyncio_future()
+            if future is not None and not future.done():
+                future.set_result(None)
+
+        private.replace(entity, private.EXECUTE_PROCESS, start_later)
+    elif isinstance(entity, TimerAction):
+        wait = private.wait_to_fire(entity)
+
+        async def wait_later(context: LaunchContext) -> None:
+            await coordinator.hold()
+            await wait(context)
+
+        private.replace(entity, private.WAIT_TO_FIRE, wait_later)

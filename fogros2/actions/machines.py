@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What launch files call machines: thin constructors of a MachineSpec that ask nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import difflib
+import inspect
+import os
+from pathlib import Path
+import re
+import secrets
+from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
+
+from fogros2.actions import words
+from fogros2.errors import ConfigurationError
+from fogros2.model import (
+    Bootstrap, DEFAULT_LIFETIME, DEFAULT_ROBOT_TIMEOUT, MachineSpec, OnExit,
+)
+from fogros2.store import check_name
+
+if TYPE_CHECKING:
+    from launch import LaunchContext, SomeSubstitutionsType
+
+    from fogros2.deploy import RunningMachine
+
+    Value = Union[SomeSubstitutionsType, int, float]
+
+_UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
+_DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
+
+
+class CloudInstance:
+    """
+    A machine that a launch asks for; base of one class per provider.
+
+    Building one asks nobody and costs nothing: the machine is made when the first of its nodes
+    is executed. Values may be launch substitutions, resolved at that time.
+
+    :param ros_workspace: colcon workspace that travels; None for the one whose install space
+        comes first in COLCON_PREFIX_PATH (or AMENT_PREFIX_PATH), '' for none.
+    :param working_dir_base: taken for FogROS2's launch files; only :meth:`info` shows it. What is
+        known of machines is kept below FOGROS2_STATE_HOME.
+    :param launch_foxglove: serve the machine's topics to Foxglove.
+    :param name: up to 40 lower-case letters, digits and hyphens, unique on this robot; without
+        one each launch makes up its own.
+    :param on_exit: what becomes of the machine when the launch ends: 'delete', 'stop' or 'keep'.
+        One that stays needs a name, or nobody would find it again.
+    :param lifetime: when the machine ends by itself, in seconds or as '8h', '1d12h'.
+    :param robot_timeout: how long the launch may be silent before the machine stops its nodes;
+        seconds or as above.
+    :param bootstrap: how ROS 2 gets there: 'auto', 'apt', 'embedded', 'none'.
+    :param environment: variables for every node on the machine.
+    :param options: the provider's own settings, for subclasses to give.
+    :raises ConfigurationError: an unknown keyword (with the nearest one), or a wrong value.
+    """
+
+    #: Name of the entry point in the group ``fogros2.provider``.
+    provider: ClassVar[str] = ''
+
+    def __init__(
+        self, ros_workspace: Optional[SomeSubstitutionsType] = None,
+        working_dir_base: Optional[str] = None, launch_foxglove: bool = False, *,
+        name: Optional[SomeSubstitutionsType] = None,
+        on_exit: SomeSubstitutionsType = 'delete',
+        lifetime: Value = DEFAULT_LIFETIME,
+        robot_timeout: Value = DEFAULT_ROBOT_TIMEOUT,
+        bootstrap: SomeSubstitutionsType = 'auto',
+        environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        options: Optional[Mapping[str, Any]] = None,
+        **unknown: object,
+    ) -> None:
+        if unknown:
+            raise self._unknown(next(iter(unknown)))
+        if not self.provider:
+            raise ConfigurationError(
+                f'{type(self).__name__} is no machine yet',
+                'use one of its kinds, such as ContainerInstance or SSHInstance')
+        if name is None and isinstance(on_exit, str) and on_exit != 'delete':
+            raise ConfigurationError(
+                f"a machine with on_exit='{on_exit}' needs a name",
+                'give it a name=, so that the next launch finds it')
+        self._name = _two_words() if name is None else name
+        self._workspace = ros_workspace
+        self._working_dir_base = working_dir_base
+        self._values: dict[str, Any] = {
+            'on_exit': on_exit, 'lifetime': lifetime, 'robot_timeout': robot_timeout,
+            'bootstrap': bootstrap,
+        }
+        self._environment = dict(environment or {})
+        self._options = {k: v for k, v in (options or {}).items() if v is not None}
+        self._foxglove = launch_foxglove
+        self._containers: list[str] = []
+        self._spec: Optional[MachineSpec] = None
+        self._running: Optional[RunningMachine] = None
+        # what is plain is checked where it is written
+        if isinstance(self._name, str):
+            check_name(self._name)
+        for key, value in self._values.items():
+            if isinstance(value, (str, int, float)):
+                _CHECKS[key](key, value)
+
+    def _unknown(self, name: str) -> ConfigurationError:
+        known = sorted({
+            parameter for cls in type(self).__mro__[:-1]
+            for parameter in inspect.signature(cls.__init__).parameters
+        } - {'self', 'options', 'unknown', 'common'})
+        near = difflib.get_close_matches(name, known, n=1)
+        return ConfigurationError(
+            f"{type(self).__name__} has no attribute '{name}'",
+            f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known)}")
+
+    @property
+    def name(self) -> str:
+        """The machine's name; described only, while it is a substitution not yet resolved."""
+        if self._spec is not None:
+            return self._spec.name
+        return words.describe(self._name)
+
+    @property
+    def ip(self) -> Optional[str]:
+        """The address the robot reaches the machine at, None while it isn't up."""
+        return self._running.machine.vpn_host if self._running else None
+
+    @property
+    def vpn_ip(self) -> Optional[str]:
+        """The machine's address in the VPN, None while it isn't up."""
+        return self._running.vpn_address if self._running else None
+
+    @property
+    def is_created(self) -> bool:
+        """Whether the machine is up."""
+        return self._running is not None
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """
+        Return what is known of the machine, with FogROS2's keys.
+
+        :param flush_to_disk: taken for FogROS2's launch files; the store has it on disk already.
+        """
+        shell = self._running.machine.shell if self._running else None
+        return {
+            'name': self.name,
+            'cloud_service_provider': self.provider,
+            'ros_workspace': self._spec.workspace if self._spec else words.describe(
+                self._workspace),
+            'working_dir': self._working_dir_base,
+            'ssh_key_path': shell.key_file if shell else None,
+            'public_ip': self.ip,
+            'vpn_ip': self.vpn_ip,
+        }
+
+    def add_docker_container(self, cmd: str) -> None:
+        """Have a ``docker run`` command line executed on the machine before its nodes start."""
+        self._containers.append(cmd)
+
+    def is_up(self, running: RunningMachine) -> None:
+        """Take it that the machine is up; for the launch to call."""
+        self._running = running
+
+    def spec(self, context: LaunchContext) -> MachineSpec:
+        """
+        Resolve everything, once, and return the description that the core works with.
+
+        :raises ConfigurationError: a value is wrong.
+        """
+        if self._spec is None:
+            values = {
+                key: _CHECKS[key](key, words.resolve(context, value))
+                for key, value in self._values.items()}
+            workspace = words.resolve(context, self._workspace)
+            if workspace is None:
+                workspace = find_workspace(context.environment)
+            elif workspace:
+                workspace = os.path.abspath(os.path.expanduser(workspace))
+            name = words.resolve(context, self._name)
+            self._spec = MachineSpec(
+                name=check_name(name),
+                provider=self.provider,
+                options={
+                    key: words.resolve(context, value) for key, value in self._options.items()},
+                workspace=workspace or None,
+                environment={
+                    key: words.resolve(context, value)
+                    for key, value in self._environment.items()},
+                containers=tuple(self._containers),
+                launch_foxglove=self._foxglove,
+                **values)
+        return self._spec
+
+
+class ContainerInstance(CloudInstance):
+    """
+    A container on this computer that behaves like a cloud machine of its own.
+
+    :param image: what it is made of; None for this computer's own root, seen through an
+        allow-list (podman alone).
+    :param engine: 'podman' or 'docker'; None for the one that works.
+    :param network: name of an existing container network; None for the engine's own.
+    :param ip: fixed address in that network.
+    :param cpus: limit, such as 1.5.
+    :param memory: limit, such as '2g'.
+    :param ports: what is published on the robot, in the engine's form.
+    :param mounts: folders of this computer that the container sees, in the engine's form
+        ``source:target[:options]``.
+    :param user: login user, made if needed.
+    """
+
+    provider = 'container'
+
+    def __init__(
+        self, *, image: Optional[SomeSubstitutionsType] = None,
+        engine: Optional[SomeSubstitutionsType] = None,
+        network: Optional[SomeSubstitutionsType] = None,
+        ip: Optional[SomeSubstitutionsType] = None,
+        cpus: Optional[Value] = None,
+        memory: Optional[SomeSubstitutionsType] = None,
+        ports: Optional[Sequence[SomeSubstitutionsType]] = None,
+        mounts: Optional[Sequence[SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        **common: Any,
+    ) -> None:
+        super().__init__(options={
+            'image': image, 'engine': engine, 'network': network, 'ip': ip, 'cpus': cpus,
+            'memory': memory, 'ports': words.items(ports), 'mounts': words.items(mounts),
+            'user': user,
+        }, **common)
+
+
+class SSHInstance(CloudInstance):
+    """
+    Any computer that exists already and takes our SSH key; it outlives the launch.
+
+    :param host: name or address.
+    :param user: login user; None for what ``ssh`` would use.
+    :param port: TCP port of its SSH server.
+    :param key: private key file to log in with; None for the user's own keys and agent.
+    :param host_key: its public host key (``ssh-ed25519 AAAA...``); None lets known_hosts decide.
+    :param vpn_host: address at which the robot reaches its VPN port (UDP); None for ``host``.
+    """
+
+    provider = 'ssh'
+
+    def __init__(
+        self, host: SomeSubstitutionsType, user: Optional[SomeSubstitutionsType] = None,
+        port: Value = 22, key: Optional[SomeSubstitutionsType] = None,
+        host_key: Optional[SomeSubstitutionsType] = None, *,
+        vpn_host: Optional[SomeSubstitutionsType] = None, **common: Any,
+    ) -> None:
+        super().__init__(options={
+            'host': host, 'user': user, 'port': port, 'key': key, 'host_key': host_key,
+            'vpn_host': vpn_host,
+        }, **common)
+
+
+def parse_duration(what: str, value: Union[str, int, float]) -> float:
+    """
+    Return seconds for a number, or for text such as '90', '8h', '1h30m', '2d'.
+
+    :raises ConfigurationError: not a duration, or not above zero.
+    """
+    seconds = 0.0
+    if isinstance(value, str):
+        text = value.replace(' ', '')
+        try:
+            seconds = float(text)
+        except ValueError:
+            if _DURATION.fullmatch(text):
+                seconds = sum(
+                    float(number) * _UNITS[unit]
+                    for number, unit in re.findall(r'([\d.]+)([smhd])', text))
+    else:
+        seconds = float(value)
+    if not 0 < seconds < float('inf'):
+        raise ConfigurationError(
+            f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
+    return seconds
+
+
+def find_workspace(environment: Mapping[str, str]) -> Optional[str]:
+    """
+    Return the workspace whose install space comes first in the environment, None without one.
+
+    An install space is a folder that colcon marked as one, beside a ``src`` folder: an installed
+    distribution has the marker too, or none.
+    """
+    for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
+        for entry in environment.get(variable, '').split(os.pathsep):
+            # an isolated install space has one prefix a package below it
+            for folder in (Path(entry), Path(entry).parent) if entry else ():
+                marked = (folder / '.colcon_install_layout').is_file()
+                if marked and (folder.parent / 'src').is_dir():
+                    return str(folder.parent)
+    return None
+
+
+def _choice(kind: Any) -> Any:
+    def check(what: str, value: object) -> str:
+        if value not in get_args(kind):
+            near = difflib.get_close_matches(str(value), get_args(kind), n=1)
+            raise ConfigurationError(
+                f'{what}={value!r} is unknown',
+                f"did you mean '{near[0]}'?" if near else f"use one of {get_args(kind)}")
+        return cast(str, value)
+    return check
+
+
+_CHECKS: dict[str, Any] = {
+    'on_exit': _choice(OnExit),
+    'bootstrap': _choice(Bootstrap),
+    'lifetime': parse_duration,
+    'robot_timeout': parse_duration,
+}
+
+_ADJECTIVES = (
+    'amber', 'bold', 'brisk', 'calm', 'clear', 'cloudy', 'crisp', 'dewy', 'early', 'fresh',
+    'gentle', 'golden', 'hazy', 'keen', 'light', 'lofty', 'lucid', 'mellow', 'misty', 'nimble',
+    'quiet', 'rapid', 'rosy', 'silver', 'steady', 'still', 'sunny', 'swift', 'tidy', 'vivid',
+    'warm', 'windy')
+_NOUNS = (
+    'badger', 'beaver', 'bison', 'crane', 'curlew', 'dipper', 'eagle', 'egret', 'falcon',
+    'finch', 'gannet', 'heron', 'ibex', 'kestrel', 'lark', 'lynx', 'marten', 'merlin', 'osprey',
+    'otter', 'petrel', 'plover', 'puffin', 'raven', 'robin', 'sable', 'seal', 'skylark', 'swift',
+    'tern', 'walrus', 'wren')
+
+
+def _two_words() -> str:
+    number = secrets.token_hex(2)
+    return f'{secrets.choice(_ADJECTIVES)}-{secrets.choice(_NOUNS)}-{number}'

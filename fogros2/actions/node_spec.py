@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a process action, resolved on the robot, to the NodeSpec that travels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import os
+from pathlib import Path
+import re
+from typing import Optional
+
+from fogros2 import plan
+from fogros2.actions import private
+from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
+from launch import LaunchContext, Substitution
+from launch.actions import ExecuteLocal
+from launch.conditions import evaluate_condition_expression
+from launch.substitutions import FindExecutable
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from launch_ros.substitutions import ExecutableInPackage
+
+#: ROS arguments whose next word is a file, which travels.
+_FILE_ARGUMENTS = ('--params-file', '--log-config-file')
+
+#: Variables that describe the robot's own system: a launch file's change of them stays here.
+LOCAL_VARIABLES = frozenset({
+    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
+    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
+    'ROS_HOME', 'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
+})
+
+
+class ProgramName(Substitution):
+    """Stands for a program that is looked up where it will run, so here it is just a name."""
+
+    def __init__(self, name: list[Substitution], package: list[Substitution]) -> None:
+        super().__init__()
+        self.name = name
+        self.package = package
+
+    def describe(self) -> str:
+        """Return the name's own description."""
+        return ' + '.join(part.describe() for part in self.name)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the name."""
+        return perform_substitutions(context, self.name)
+
+
+def use_names_of_programs(action: ExecuteLocal) -> None:
+    """Replace what would look programs up on the robot by their names, in place."""
+    for word in action.process_description.cmd:
+        for index, part in enumerate(word):
+            if isinstance(part, ExecutableInPackage):
+                word[index] = ProgramName(part.executable, part.package)
+            elif isinstance(part, FindExecutable):
+                word[index] = ProgramName(normalize_to_list_of_substitutions(part.name), [])
+
+
+def from_action(
+    action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str], spec: MachineSpec,
+    launch_id: str,
+) -> NodeSpec:
+    """
+    Return what a prepared action asks for.
+
+    :param base: the environment before the launch changed it; changes travel.
+    :raises ConfigurationError: a package, an executable or a parameter file is missing.
+    """
+    description = action.process_description
+    texts = Texts(plan.ament_prefixes(base), spec.workspace)
+    final = list(description.final_cmd)
+    # launch puts the prefix's words before the command's
+    count = len(final) - len(description.cmd)
+    prefix, final = final[:count], final[count:]
+    package = executable = ''
+    first = description.cmd[0]
+    if len(first) == 1 and isinstance(first[0], ProgramName) and first[0].package:
+        package = perform_substitutions(context, first[0].package)
+        executable = final.pop(0)
+        if not spec.options.get('image'):
+            plan.check_program(package, executable, texts.prefixes)
+    files: dict[str, Text] = {}
+    arguments = [texts.text(word) for word in final]
+    for index in range(1, len(final)):
+        if final[index - 1] in _FILE_ARGUMENTS:
+            key = f'{len(files)}-{os.path.basename(final[index])}'
+            files[key] = texts.text(_read(final[index]))
+            arguments[index] = ({'file': key},)
+    options = private.options(action)
+    name = description.final_name
+    return NodeSpec(
+        id=f'{name}.{launch_id}',
+        name=name,
+        package=package,
+        executable=executable,
+        arguments=tuple(arguments),
+        prefix=tuple(prefix),
+        files=files,
+        environment={
+            key: texts.text(value)
+            for key, value in _environment(action, context, base).items()},
+        cwd=description.final_cwd,
+        shell=action.shell,
+        emulate_tty=_emulate_tty(action, context),
+        respawn=options.respawn,
+        respawn_delay=options.respawn_delay,
+        respawn_max_retries=options.respawn_max_retries,
+        sigterm_timeout=float(perform_substitutions(context, action.sigterm_timeout)),
+        sigkill_timeout=float(perform_substitutions(context, action.sigkill_timeout)),
+    )
+
+
+def _environment(
+    action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str],
+) -> dict[str, str]:
+    """Return the variables that the launch file set, for this process or for all."""
+    description = action.process_description
+    final: Mapping[str, str] = description.final_env
+    if description.env is not None:
+        # an environment of its own: on a machine it comes on top of what ROS needs there
+        return dict(final)
+    changed = {
+        key: value for key, value in final.items()
+        if base.get(key) != value and key not in LOCAL_VARIABLES}
+    for key, _ in description.additional_env or ():
+        name = perform_substitutions(context, key)
+        changed[name] = final[name]
+    return changed
+
+
+def _emulate_tty(action: ExecuteLocal, context: LaunchContext) -> bool:
+    configured: Optional[str] = context.launch_configurations.get('emulate_tty')
+    if configured is None:
+        return bool(action.emulate_tty)
+    return bool(evaluate_condition_expression(
+        context, normalize_to_list_of_substitutions(configured)))
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the file '{path}' of a cloud node can't be read: {error}",
+            'it is read here and travels to the machine') from error
+
+
+class Texts:
+    """
+    Puts markers into texts for what lies elsewhere on a machine.
+
+    ``/opt/ros/jazzy/share/demo/rviz.yaml`` is ``({'share': 'demo'}, '/rviz.yaml')`` then, and a
+    path below ``lib/demo`` begins with ``{'prefix': 'demo'}``. The workspace that travels has the
+    same path there, so its paths stay as they are.
+
+    :param prefixes: the robot's ament prefixes.
+    """
+
+    def __init__(self, prefixes: Sequence[str], workspace: Optional[str]) -> None:
+        self.prefixes = list(prefixes)
+        roots = sorted(
+            {prefix.rstrip('/') for prefix in prefixes if not _below(prefix, workspace)},
+            key=len, reverse=True)
+        self._pattern = re.compile(
+            r'(?<![\w.-])(?P<prefix>{})/(?P<kind>share|lib)/(?P<package>\w+)(?![\w.-])'.format(
+                '|'.join(re.escape(root) for root in roots) or r'(?!)'))
+
+    def text(self, text: str) -> Text:
+        """Return the text with markers, or as it is where it needs none."""
+        parts: list[TextPart] = []
+        end = 0
+        for match in self._pattern.finditer(text):
+            prefix, kind, package = match.group('prefix', 'kind', 'package')
+            marker = Path(prefix, 'share/ament_index/resource_index/packages', package)
+            if not marker.exists():
+                continue
+            parts.append(text[end:match.start()])
+            if kind == 'share':
+                parts.append({'share': package})
+            else:
+                parts.extend([{'prefix': package}, f'/lib/{package}'])
+            end = match.end()
+        parts.append(text[end:])
+        parts = [part for part in parts if part]
+        if all(isinstance(part, str) for part in parts):
+            return text
+        return tuple(parts)
+
+
+def _below(path: str, folder: Optional[str]) -> bool:
+    return folder is not None and (path == folder or path.startswith(f'{folder}/'))
+

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is used of launch's private parts, all in this module, and why.
+
+launch has no seam for "start the process elsewhere": ``ExecuteLocal.execute`` resolves the
+action, registers its handlers and then creates a task from its private method ``__execute_process``.
+That method is the seam here. A cloud process overrides it and sets ``_subprocess_transport`` and
+``_subprocess_protocol``; a robot process that waits for the cloud runs it later. All the rest
+(substitutions, handlers, output, ``on_exit``, signals) stays launch's own code. The options that
+the method reads have no getters.
+
+The names are those of Jazzy (launch 3.4) and the same in its embedded default;
+``test/unit/test_actions_private.py`` looks for each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+import dataclasses
+from typing import Any, Optional
+
+from launch import LaunchContext
+from launch.actions import ExecuteLocal, TimerAction
+from launch.utilities import AsyncSafeSignalManager
+
+#: The method of ExecuteLocal that starts the process and awaits its end.
+EXECUTE_PROCESS = '_ExecuteLocal__execute_process'
+#: The coroutine method of TimerAction that waits, then fires.
+WAIT_TO_FIRE = '_wait_to_fire_event'
+
+Waiting = Callable[[LaunchContext], Coroutine[Any, Any, None]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What an ExecuteLocal was told and keeps to itself."""
+
+    respawn: bool
+    respawn_delay: float
+    respawn_max_retries: int
+    log_cmd: bool
+
+
+def options(action: ExecuteLocal) -> Options:
+    """Return a prepared action's options (``prepare`` resolves ``respawn`` to a bool)."""
+    return Options(
+        respawn=bool(getattr(action, '_ExecuteLocal__respawn')),
+        respawn_delay=getattr(action, '_ExecuteLocal__respawn_delay') or 0.0,
+        respawn_max_retries=getattr(action, '_ExecuteLocal__respawn_max_retries'),
+        log_cmd=getattr(action, '_ExecuteLocal__log_cmd'))
+
+
+def prefix_output(action: ExecuteLocal, machine: str) -> None:
+    """Put the machine's name before the process's where the output format names the process."""
+    name = '{this.process_description.final_name}'
+    before = getattr(action, '_ExecuteLocal__output_format')
+    # a name has no braces, so it is safe in a format
+    setattr(action, '_ExecuteLocal__output_format', before.replace(name, f'{machine}.{name}'))
+
+
+def execute_process(action: ExecuteLocal) -> Waiting:
+    """Return the bound method that starts the process and awaits its end."""
+    bound: Waiting = getattr(action, EXECUTE_PROCESS)
+    return bound
+
+
+def set_transport(action: ExecuteLocal, transport: object) -> None:
+    """
+    Make ``transport`` what the action takes for its subprocess.
+
+    launch calls ``send_signal``, ``kill``, ``get_returncode`` and looks at ``complete``.
+    """
+    action._subprocess_transport = transport
+    action._subprocess_protocol = transport
+
+
+def replace(entity: Any, method: str, replacement: Waiting) -> None:
+    """Replace a method of one object, not of its class."""
+    if not hasattr(type(entity), method):
+        raise AttributeError(f'{type(entity).__name__} of this launch has no {method}')
+    setattr(entity, method, replacement)
+
+
+def wait_to_fire(timer: TimerAction) -> Waiting:
+    """Return the bound method that waits for the timer's period."""
+    bound: Waiting = getattr(timer, WAIT_TO_FIRE)
+    return bound
+
+
+def signal_manager() -> Optional[AsyncSafeSignalManager]:
+    """
+    Return the manager in which the running LaunchService handles signals.
+
+    Its handler for SIGTERM cancels the service on the spot; there is no public way to replace it.
+    """
+    manager: Optional[AsyncSafeSignalManager] = getattr(
+        AsyncSafeSignalManager, '_AsyncSafeSignalManager__current')
+    return manager

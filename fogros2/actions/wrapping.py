@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A look at every entity that some content yields, now or later, before launch visits it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable, Iterator
+import contextlib
+from typing import Any, Optional
+
+from launch import LaunchContext, LaunchDescriptionEntity
+from launch.actions import TimerAction
+
+#: What is done with an entity before it is visited.
+Apply = Callable[[LaunchDescriptionEntity, LaunchContext], None]
+
+
+class Wrapped(LaunchDescriptionEntity):
+    """
+    Another entity, looked at first; what its visit yields is wrapped likewise.
+
+    That holds for what comes later too: actions of a timer, and of every event handler that the
+    visit registers (``RegisterEventHandler``, ``on_exit=``).
+    """
+
+    def __init__(self, entity: LaunchDescriptionEntity, apply: Apply) -> None:
+        self._entity = entity
+        self._apply = apply
+
+    def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Look at the entity, visit it, and wrap what it yields."""
+        entity = self._entity
+        self._apply(entity, context)
+        if isinstance(entity, TimerAction):
+            # the handler it registers is one for all timers of the launch, others' as well
+            _wrap_result(entity, self._apply)
+            return wrap(entity.visit(context), self._apply)
+        with _handlers_wrapped(context, self._apply):
+            return wrap(entity.visit(context), self._apply)
+
+    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
+        """Return the entity's own."""
+        future: Optional[asyncio.Future[Any]] = self._entity.get_asyncio_future()
+        return future
+
+    def describe(self) -> str:
+        """Return the entity's own description."""
+        return str(self._entity.describe())
+
+    def describe_sub_entities(self) -> list[LaunchDescriptionEntity]:
+        """Return the entity's own."""
+        return list(self._entity.describe_sub_entities())
+
+    def describe_conditional_sub_entities(
+        self,
+    ) -> list[tuple[str, Iterable[LaunchDescriptionEntity]]]:
+        """Return the entity's own."""
+        return list(self._entity.describe_conditional_sub_entities())
+
+
+def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]:
+    """Wrap what a visit or a handler returned: nothing, an entity, or several."""
+    if entities is None:
+        return None
+    several = entities if isinstance(entities, Iterable) else (entities,)
+    return [Wrapped(entity, apply) for entity in several if entity is not None]
+
+
+def _wrap_result(handles: Any, apply: Apply) -> None:
+    """Have the ``handle`` method of a timer or an event handler return wrapped entities."""
+    handle = handles.handle
+
+    def wrapped(*args: Any) -> Optional[list[LaunchDescriptionEntity]]:
+        return wrap(handle(*args), apply)
+
+    handles.handle = wrapped
+
+
+@contextlib.contextmanager
+def _handlers_wrapped(context: LaunchContext, apply: Apply) -> Iterator[None]:
+    """Wrap what the event handlers will yield that are registered meanwhile."""
+    outer = context.__dict__.get('register_event_handler')
+    register = context.register_event_handler
+
+    def wrapping(event_handler: Any, append: bool = False) -> None:
+        _wrap_result(event_handler, apply)
+        register(event_handler, append=append)
+
+    context.register_event_handler = wrapping
+    try:
+        yield
+    finally:
+        if outer is None:
+            del context.register_event_handler
+        else:
+            context.register_event_handler = outer

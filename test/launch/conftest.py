@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A deployment that starts nothing, for launches run in the test's own process."""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from types import SimpleNamespace
+import pytest
+
+from fogros2.errors import Cancelled
+from fogros2.report import step
+
+
+class FakeMachine:
+    """A RunningMachine that notes what is asked of it and says what a test wants said."""
+
+    def __init__(self, launch, spec):
+        self.launch = launch
+        self.spec = spec
+        self.machine = SimpleNamespace(vpn_host='192.0.2.7', shell=None)
+        self.vpn_address = '10.99.0.2'
+        self.callback = None
+        self.nodes = {}
+        self.stops = []
+        self.signals = []
+        self.answers = True
+        self.exits_on_stop = True
+        self.pids = iter(range(4001, 5000))
+
+    def start(self, nodes):
+        for node in nodes:
+            self.launch.note('start', self.spec.name, node.name)
+            self.nodes[node.executable or node.arguments[0]] = node
+            if self.answers:
+                self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
+            on_start = self.launch.on_start
+            if on_start is not None:
+                on_start(self, node)
+
+    def stop(self, ids=None):
+        self.stops.append(list(ids))
+        self.launch.note('stop', self.spec.name, *ids)
+        if self.exits_on_stop:
+            for node in self.nodes.values():
+                if node.id in ids:
+                    self.say('exited', node, returncode=-2, respawns=False)
+
+    def signal(self, node, name):
+        self.signals.append((node, name))
+
+    def subscribe(self, callback):
+        self.callback = callback
+
+    def say(self, what, node=None, **fields):
+        """Send an event, from another thread as the agent's connection does."""
+        event = {'event': what, **fields}
+        if node is not None:
+            event.update(node=node.id, name=node.name)
+        thread = threading.Thread(target=self.callback, args=(event,))
+        thread.start()
+        thread.join()
+
+
+class FakeLaunch:
+    """A fogros2.deploy.Launch without machines."""
+
+    id = 'abcdef'
+
+    def __init__(self):
+        self.notes = []
+        self.machines = {}
+        self.lock = threading.Lock()
+        self.report = None
+        self.cancel = None
+        self.environment = {}
+        #: Called with the machine and the node when a node was started.
+        self.on_start = None
+        #: Names of machines whose ``up`` waits until the event is set, or the launch ends.
+        self.waits = {}
+        self.errors = {}
+        self.prepare_error = None
+        self.down_errors = []
+
+    def __call__(self, *, report, environment, cancel):
+        self.report = report
+        self.environment = environment
+        self.cancel = cancel
+        return self
+
+    def note(self, *what):
+        with self.lock:
+            self.notes.append(what)
+
+    def noted(self, what):
+        with self.lock:
+            return [note[1:] for note in self.notes if note[0] == what]
+
+    def expect(self, names):
+        self.note('expect', *names)
+
+    def robot_environment(self):
+        return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': 'file:///dds.xml'}
+
+    def prepare(self, specs, programs):
+        self.note('prepare', [spec.name for spec in specs], programs)
+        if self.prepare_error is not None:
+            raise self.prepare_error
+
+    def up(self, spec):
+        self.note('up', spec.name)
+        with step(self.report, spec.name, 'machine') as detail:
+            wait = self.waits.get(spec.name)
+            while wait is not None and not wait.wait(0.01):
+                if self.cancel.is_set():
+                    raise Cancelled(spec.name)
+            if spec.name in self.errors:
+                raise self.errors[spec.name]
+            detail.append('made of air')
+        machine = self.machines[spec.name] = FakeMachine(self, spec)
+        self.note('is up', spec.name)
+        return machine
+
+    def down(self):
+        self.note('down')
+        return self.down_errors
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Return the prefix of an ament package ``demo`` with a program ``talker``."""
+    prefix = tmp_path / 'prefix'
+    marker = prefix / 'share/ament_index/resource_index/packages/demo'
+    marker.parent.mkdir(parents=True)
+    marker.touch()
+    (prefix / 'share/demo').mkdir()
+    program = prefix / 'lib/demo/talker'
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\necho here; exec sleep 60\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    before = os.environ.get('AMENT_PREFIX_PATH')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{prefix}:{before}' if before else str(prefix))
+    return prefix
+
+
+@pytest.fixture
+def fake():
+    """Return a FakeLaunch."""
+    return FakeLaunch()
+
+
+@pytest.fixture
+def run(fake, package, monkeypatch, tmp_path):
+    """Return a function that runs a launch description on the fake and returns its status."""
+    from fogros2.actions.coordinator import Coordinator
+    from launch import LaunchService
+    import launch.logging
+
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    before = dict(os.environ)
+
+    def run(description, **arguments):
+        service = LaunchService(noninteractive=True, **arguments)
+        Coordinator(service.context, make_launch=fake)
+        service.include_launch_description(description)
+        run.context = service.context
+        run.service = service
+        return service.run()
+
+    yield run
+    launch.logging.reset()
+    os.environ.clear()
+    os.environ.update(before)
