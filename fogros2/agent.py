@@ -1,0 +1,1487 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+The guard on a cloud machine: starts the nodes, keeps their log, ends the machine in time.
+
+One file, standard library only, Python 3.10 or newer, so that it runs before anything else is
+there. One thread around a selector; nothing in it waits for a client, a node or a command.
+
+    agent.py serve --config FILE [--detach]    the guard itself
+    agent.py connect --directory DIR           stdin and stdout to a running guard
+
+Where it runs as root it does so with the login user's effective identity, so that no file the
+user could have swapped is ever touched as root, and takes root back for the commands that need
+it: the VPN's, and the one that ends the machine.
+
+**Protocol**, JSON objects, one a line. Request ``{"id": 1, "command": ..., ...}``, reply
+``{"id": 1, "ok": true, ...}`` or ``{"id": 1, "ok": false, "error", "hint", "kind"}``:
+
+``configure``  any key of ``CONFIG``; re-arms lifetime and, with ``heartbeat``, the watch over it.
+               Another ``launch`` than before: its nodes stop first; refused (kind ``busy``) while
+               the earlier one still sends heartbeats, unless ``force`` is true.
+``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s)
+``launch``     start the process that will run the nodes, ahead of time
+``start``      ``nodes``: list of NodeSpec; an id that is known already is left alone
+``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
+``signal``     ``node``, ``signal``: 'SIGINT'
+``status``     see ``Agent.do_status``
+``log``        ``from`` seq, ``follow``: replies ``first`` and ``next`` (seqs that exist), then
+               sends the events' lines; ``lost`` counts events that rotation took away
+``release``    stop the nodes, disarm the heartbeat, reply when done; ``exit`` true: leave then
+
+Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
+``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``launch_exited``,
+``vpn_repaired``, ``end_failed``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import fcntl
+import json
+import os
+import pwd
+import selectors
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+
+TYPE_CHECKING = False  # typing itself costs a megabyte
+if TYPE_CHECKING:
+    from typing import Any, Optional
+
+    Json = dict[str, Any]
+
+MAX_LINE = 16 << 20
+#: Bytes of one generation of the log; two are kept.
+LOG_BYTES = 64 << 20
+LAUNCH_LOG_BYTES = 8 << 20
+BLOCK = 1 << 18
+CLIENTS = 64
+#: Seconds after SIGINT at which what the launch process left behind gets the next signal.
+SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
+SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
+#: Seconds that a keep's command may take, and between attempts to end the machine.
+COMMAND_TIMEOUT = 30.0
+RETRY_END = 30.0
+MARK = 'FOGROS2_AGENT_MARK'
+#: Linux: bind to an address that isn't there yet.
+IP_FREEBIND = 15
+
+#: Keys of the configuration: accepted types and default.
+CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
+    'machine': ((str,), ''),
+    'launch': ((str,), ''),
+    'directory': ((str,), ''),
+    'user': ((str,), ''),
+    'on_exit': ((str,), 'delete'),
+    'lifetime': ((int, float), 8 * 3600.0),
+    'robot_timeout': ((int, float), 120.0),
+    'boot_timeout': ((int, float), 1800.0),
+    'end_command': ((list,), []),
+    'heartbeat': ((dict, type(None)), None),
+    'environment': ((dict,), {}),
+    'setup': ((list,), []),
+    'ros_command': ((list,), []),
+    'log_bytes': ((int,), LOG_BYTES),
+}
+
+
+class Refused(Exception):
+    """A request that can't be met: message, hint, kind."""
+
+    def __init__(self, message: str, hint: str = '', kind: str = '') -> None:
+        super().__init__(message)
+        self.hint = hint
+        self.kind = kind
+
+
+def boot_clock() -> float:
+    """Return seconds since boot, time asleep included."""
+    return time.clock_gettime(getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC))
+
+
+def dump(data: Json) -> bytes:
+    """Return one line of JSON."""
+    return json.dumps(data, separators=(',', ':')).encode() + b'\n'
+
+
+def say(text: str) -> None:
+    """Write a line to the agent's own log (standard error)."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f'{time.strftime("%Y-%m-%dT%H:%M:%S")} {text}\n')
+        sys.stderr.flush()
+
+
+def checked(new: Json) -> Json:
+    """
+    Return the keys of a configuration that exist, their types looked at.
+
+    :raises Refused: a value has the wrong type or makes no sense.
+    """
+    known: Json = {}
+    for key, value in new.items():
+        if key not in CONFIG:
+            continue
+        types, _ = CONFIG[key]
+        if not isinstance(value, types) or isinstance(value, bool):
+            raise Refused(f"'{key}' can't be {json.dumps(value)[:80]}")
+        if isinstance(value, (int, float)) and not 0 < value < 1e10:
+            raise Refused(f"'{key}' has to be above 0, not {value}")
+        if isinstance(value, list) and not all(isinstance(word, str) for word in value):
+            raise Refused(f"'{key}' has to be a list of words")
+        known[key] = value
+    if known.get('on_exit', 'delete') not in ('delete', 'stop', 'keep'):
+        raise Refused(f"'on_exit' can't be '{known['on_exit']}'", 'delete, stop or keep')
+    for key, value in known.get('environment', {}).items():
+        if not isinstance(value, str) or '=' in key or '\0' in key + value or not key:
+            raise Refused(f"'environment' can't set {key!r}")
+    heartbeat = known.get('heartbeat')
+    if heartbeat:
+        try:
+            socket.inet_aton(heartbeat['bind'])
+            socket.inet_aton(heartbeat['peer'])
+            if not 0 < heartbeat['port'] < 65536:
+                raise ValueError('port')
+        except (KeyError, OSError, TypeError, ValueError) as error:
+            raise Refused("'heartbeat' needs bind and peer, addresses, and a port") from error
+    return known
+
+
+class Watchdog:
+    """
+    When a machine has to let go of its nodes; knows seconds alone, so a test brings its own.
+
+    Until a heartbeat has been configured ``boot_timeout`` counts, then ``robot_timeout``.
+    """
+
+    def __init__(self, config: Json, now: float) -> None:
+        self.config = config
+        self.lifetime_from = now
+        self.boot_from: Optional[float] = now
+        self.beat_at: Optional[float] = None
+
+    def configured(self, now: float, *, heartbeat: bool) -> None:
+        """A launch has spoken: the lifetime begins again, and the watch over its heartbeat."""
+        self.lifetime_from = now
+        if heartbeat:
+            self.boot_from, self.beat_at = None, now
+        elif self.boot_from is not None:
+            self.boot_from = now
+
+    def beat(self, now: float) -> None:
+        """A heartbeat came; after ``disarm`` it means nothing."""
+        if self.beat_at is not None:
+            self.beat_at = now
+
+    def disarm(self) -> None:
+        """The launch said goodbye, or is known to be gone; the lifetime goes on."""
+        self.boot_from = self.beat_at = None
+
+    def deadlines(self) -> list[tuple[float, str]]:
+        """Return when what runs out, reason as in the event, soonest first."""
+        found = [(self.lifetime_from + self.config['lifetime'], 'lifetime')]
+        if self.boot_from is not None:
+            found.append((self.boot_from + self.config['boot_timeout'], 'no launch came'))
+        if self.beat_at is not None:
+            found.append((self.beat_at + self.config['robot_timeout'], 'robot gone'))
+        return sorted(found)
+
+    def due(self, now: float) -> Optional[str]:
+        """Return the reason to act now, or None."""
+        at, reason = self.deadlines()[0]
+        return reason if now >= at else None
+
+
+class LogFile:
+    """One generation of the log: whole lines, each beginning ``{"seq":N,``."""
+
+    def __init__(self, path: str, flags: int) -> None:
+        self.fd = os.open(
+            path, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC | flags, 0o600)
+        self.size = os.fstat(self.fd).st_size
+        self.first = self.seq_at(0) if self.size else 0
+
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError, OSError):
+            os.close(self.fd)
+
+    def read(self, offset: int, end: Optional[int] = None) -> bytes:
+        """Return whole lines from ``offset`` on, at least one where there is one."""
+        end = self.size if end is None else min(end, self.size)
+        count = BLOCK
+        while offset < end:
+            data = os.pread(self.fd, min(count, end - offset), offset)
+            cut = data.rfind(b'\n') + 1
+            if cut:
+                return data[:cut]
+            if len(data) < count:
+                break  # somebody cut the file short
+            count *= 4
+        return b''
+
+    def seq_at(self, offset: int) -> int:
+        """Return the seq of the line that begins at ``offset``; 0 if that is no line of ours."""
+        head = os.pread(self.fd, 40, offset)
+        number = head[7:].split(b',')[0]
+        return int(number) if head.startswith(b'{"seq":') and number.isdigit() else 0
+
+    def find(self, seq: int) -> int:
+        """Return the offset of the first line whose seq isn't below ``seq``."""
+        low, high = 0, self.size  # a line begins at low, and it isn't beyond the one sought
+        while high - low > 1:
+            middle = (low + high) // 2
+            line = self.next_line(middle)
+            if line < high and self.seq_at(line) < seq:
+                low = line
+            else:
+                high = middle
+        while low < self.size and self.seq_at(low) < seq:
+            low = self.next_line(low)
+        return low
+
+    def next_line(self, offset: int) -> int:
+        """Return where the first line after ``offset`` begins, or the file's size."""
+        while offset < self.size:
+            data = os.pread(self.fd, 4096, offset)
+            at = data.find(b'\n')
+            if at >= 0:
+                return offset + at + 1
+            if not data:
+                break
+            offset += len(data)
+        return self.size
+
+
+class Log:
+    """
+    The events, on disk in two generations, so that neither memory nor disk fill.
+
+    :param limit: bytes of a generation.
+    """
+
+    def __init__(self, directory: str, limit: int) -> None:
+        self.path = os.path.join(directory, 'events.jsonl')
+        self.old = os.path.join(directory, 'events.1.jsonl')
+        self.limit = limit
+        self.full = False
+        current = LogFile(self.path, os.O_CREAT)
+        self._cut_torn_line(current)
+        self.files = [current]
+        if os.path.exists(self.old):
+            self.files.insert(0, LogFile(self.old, 0))
+        last = current if current.size else self.files[0]
+        self.next = last.seq_at(self._last_line(last)) + 1 if last.size else 1
+        if not current.size:
+            current.first = self.next
+
+    @staticmethod
+    def _last_line(file: LogFile) -> int:
+        step = 4096
+        while True:
+            begin = max(0, file.size - step)
+            at = os.pread(file.fd, file.size - begin - 1, begin).rfind(b'\n')
+            if at >= 0:
+                return begin + at + 1
+            if begin == 0:
+                return 0
+            step *= 8
+
+    def _cut_torn_line(self, file: LogFile) -> None:
+        """Drop what a crash left of a line in the middle of writing it."""
+        if file.size and os.pread(file.fd, 1, file.size - 1) != b'\n':
+            file.size = self._last_line(file)
+            os.ftruncate(file.fd, file.size)
+
+    @property
+    def first(self) -> int:
+        """The oldest seq that there is, or would be."""
+        return self.files[0].first
+
+    def append(self, lines: list[bytes]) -> None:
+        """Number and write events: each the inside of a JSON object, ``"event":...}``."""
+        stamp = b'"time":%.6f,' % time.time()
+        numbered = []
+        for line in lines:
+            numbered.append(b'{"seq":%d,' % self.next + stamp + line)
+            self.next += 1
+        data = b''.join(numbered)
+        file = self.files[-1]
+        if file.size and file.size + len(data) > self.limit:
+            try:
+                file = self._rotate(self.next - len(lines))
+            except OSError as error:
+                say(f"the log can't be rotated: {error}")
+        try:
+            written = os.write(file.fd, data)
+            if written < len(data):
+                os.ftruncate(file.fd, file.size)
+                raise OSError(28, 'disk full')
+            file.size += written
+            self.full = False
+        except OSError as error:
+            # a guard without a log still guards; the gap shows in the seqs
+            if not self.full:
+                say(f'events are being lost: {error}')
+            self.full = True
+
+    def _rotate(self, first: int) -> LogFile:
+        os.rename(self.path, self.old)
+        file = LogFile(self.path, os.O_CREAT | os.O_EXCL)
+        file.first = first
+        self.files = [self.files[-1], file]
+        return file
+
+    def locate(self, seq: int) -> tuple[LogFile, int]:
+        """Return the file and offset at which events from ``seq`` on begin."""
+        chosen = self.files[0]
+        for file in self.files[1:]:
+            if file.first <= seq:
+                chosen = file
+        return chosen, chosen.find(seq)
+
+
+class Client:
+    """A connection: requests in, replies and log lines out."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.socket = connection
+        self.received = bytearray()
+        self.out = bytearray()
+        self.cursor: Optional[tuple[LogFile, int]] = None
+        #: where a log request without follow ends
+        self.until: Optional[tuple[LogFile, int]] = None
+        self.behind = False
+        self.awaiting = 0
+        self.finished = False
+        self.active = 0.0
+
+
+class Kept:
+    """Something the agent keeps going: a command that looks, and commands that repair."""
+
+    def __init__(self, request: Json) -> None:
+        self.what = str(request['what'])
+        self.alive = words(request.get('alive', []))
+        self.repair = [words(argv) for argv in request.get('repair', [])]
+        self.down = [words(argv) for argv in request.get('down', [])]
+        self.interval = max(0.05, float(request.get('interval', 1.0)))
+        self.repairs = 0
+        self.failures = 0
+        self.ok = True
+        self.since = 0.0
+        self.timer: Optional[Timer] = None
+
+
+def words(argv: Any) -> list[str]:
+    """
+    Return a command line as it came.
+
+    :raises Refused: it isn't one.
+    """
+    if not isinstance(argv, list) or not all(isinstance(w, str) and '\0' not in w for w in argv):
+        raise Refused(f'{json.dumps(argv)[:80]} is no list of words')
+    return argv
+
+
+class Timer:
+    """A callback for later; ``cancel`` by setting ``at`` to None."""
+
+    def __init__(self, at: float, call: Callable[[], None]) -> None:
+        self.at: Optional[float] = at
+        self.call = call
+
+
+class CloudLaunch:
+    """The process that runs the nodes, and the socket to it."""
+
+    def __init__(self, pid: int, connection: socket.socket) -> None:
+        self.pid = pid
+        self.socket = connection
+        self.received = bytearray()
+        self.out = bytearray()
+        self.stopping = False
+        self.silent = False
+
+
+class Agent:
+    """
+    The guard: clients, the nodes' launch process, kept things and the watchdog in one loop.
+
+    :param config: see ``CONFIG``.
+    :param clock: monotonic seconds.
+    """
+
+    def __init__(self, config: Json, clock: Callable[[], float] = boot_clock) -> None:
+        self.clock = clock
+        self.config = {key: default for key, (_, default) in CONFIG.items()}
+        self.config.update(checked(config))
+        self.account = account(self.config['user'])
+        self.config['user'] = self.account.pw_name
+        self.privileged = os.getuid() == 0
+        self.directory = self.config['directory']
+        if self.directory.startswith('~/'):
+            self.directory = os.path.join(self.account.pw_dir, self.directory[2:])
+        self.directory = os.path.normpath(self.directory)
+        if not os.path.isabs(self.directory) or self.directory in ('/', self.account.pw_dir):
+            # it is emptied in the end: it has to be the agent's own
+            raise Refused(f"the agent can't have the directory '{self.directory}'")
+        self.config['directory'] = self.directory
+        self.selector = selectors.DefaultSelector()
+        self.timers: list[Timer] = []
+        self.children: dict[int, Callable[[int], None]] = {}
+        self.clients: list[Client] = []
+        self.nodes: dict[str, Json] = {}
+        self.kept: dict[str, Kept] = {}
+        self.launch: Optional[CloudLaunch] = None
+        self.after_launch: list[Callable[[], None]] = []
+        self.stopping = self.ending = self.done = False
+        self.heart: Optional[socket.socket] = None
+        self.since = time.time()
+        self.mark = f'{os.getpid()}-{time.time_ns()}'
+        self.watchdog = Watchdog(self.config, clock())
+
+    # -- the directory and who we are ---------------------------------------------------------
+
+    @contextlib.contextmanager
+    def root(self) -> Iterator[None]:
+        """Take root back, where the agent has it, for the block."""
+        if not self.privileged:
+            yield
+            return
+        os.seteuid(0)
+        os.setegid(0)
+        try:
+            yield
+        finally:
+            os.setegid(self.account.pw_gid)
+            os.seteuid(self.account.pw_uid)
+
+    def open(self) -> None:
+        """
+        Take the directory: made, locked, the socket in it.
+
+        :raises Refused: it can't be written, or another agent has it.
+        """
+        try:
+            if self.privileged:
+                os.setegid(self.account.pw_gid)
+                os.seteuid(self.account.pw_uid)
+            try:
+                self._make_directory()
+            except PermissionError:
+                with self.root():
+                    self._make_directory()
+            folder = os.stat(self.directory, follow_symlinks=False)
+            if not stat.S_ISDIR(folder.st_mode) or folder.st_uid != self.account.pw_uid:
+                raise Refused(f'{self.directory} belongs to somebody else')
+            os.chmod(self.directory, 0o700)
+            self.lock = os.open(
+                self.path('agent.pid'),
+                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                other = os.pread(self.lock, 20, 0).decode().strip()
+                raise Refused(
+                    f'another agent (process {other}) serves {self.directory}',
+                    'connect to it', 'running') from None
+            self.log = Log(self.directory, self.config['log_bytes'])
+            self.listener = self._listen()
+        except OSError as error:
+            raise Refused(f"{self.directory} can't be used: {error.strerror or error}") from error
+
+    def _make_directory(self) -> None:
+        os.makedirs(os.path.dirname(self.directory), mode=0o755, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(self.directory, 0o700)
+            # only what was just made is given away, and not through a symbolic link
+            folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            os.fchown(folder, self.account.pw_uid, self.account.pw_gid)
+            os.close(folder)
+
+    def _listen(self) -> socket.socket:
+        path = self.path('agent.sock')
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)  # a former agent's: we hold the lock
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        mask = os.umask(0o177)
+        # a Unix address has room for 107 bytes; a directory may be deeper
+        folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            listener.bind(path if len(path) < 100 else f'/proc/self/fd/{folder}/agent.sock')
+        finally:
+            os.umask(mask)
+            os.close(folder)
+        listener.listen(16)
+        return listener
+
+    def path(self, name: str) -> str:
+        """Return the path of a file in the agent's directory."""
+        return os.path.join(self.directory, name)
+
+    def save(self) -> None:
+        """Keep the pid for people and the configuration for an agent that starts anew."""
+        try:
+            os.ftruncate(self.lock, 0)
+            os.pwrite(self.lock, f'{os.getpid()}\n'.encode(), 0)
+            aside = self.path('config.json.new')
+            fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
+            with os.fdopen(fd, 'w') as stream:
+                json.dump(self.config, stream)
+            os.replace(aside, self.path('config.json'))
+        except OSError as error:
+            say(f"the configuration can't be kept: {error}")
+
+    # -- the loop -----------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Serve until the agent leaves."""
+        alarm, wake = socket.socketpair()
+        alarm.setblocking(False)
+        wake.setblocking(False)
+        signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+        # SIGHUP has a handler and isn't ignored: a child would inherit that
+        for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda number, frame: None)
+        register = self.selector.register
+        register(alarm, selectors.EVENT_READ, lambda mask: self._on_signals(alarm.recv(4096)))
+        register(self.listener, selectors.EVENT_READ, lambda mask: self._accept())
+        self.save()
+        try:
+            self.open_heart()
+        except Refused as error:
+            say(str(error))
+        self.every(10.0, self._trim_launch_log)
+        while not self.done:
+            now = self.clock()
+            if not self.ending:
+                self._guard(now)
+            soonest = [timer.at for timer in self.timers if timer.at is not None]
+            if not self.ending:
+                soonest.append(self.watchdog.deadlines()[0][0])
+            pause = min(soonest, default=now + 60.0) - now
+            for key, mask in self.selector.select(min(60.0, max(0.0, pause))):
+                key.data(mask)
+            self._run_timers()
+        for client in list(self.clients):
+            self._drop(client)
+
+    def at(self, delay: float, call: Callable[[], None]) -> Timer:
+        """Call in ``delay`` seconds."""
+        timer = Timer(self.clock() + delay, call)
+        self.timers.append(timer)
+        return timer
+
+    def every(self, interval: float, call: Callable[[], None]) -> None:
+        """Call each ``interval`` seconds."""
+        def again() -> None:
+            call()
+            self.at(interval, again)
+        self.at(interval, again)
+
+    def _run_timers(self) -> None:
+        now = self.clock()
+        due = [timer for timer in self.timers if timer.at is not None and timer.at <= now]
+        self.timers = [t for t in self.timers if t.at is not None and t.at > now]
+        for timer in due:
+            if timer.at is not None:
+                timer.call()
+
+    def _on_signals(self, numbers: bytes) -> None:
+        if signal.SIGCHLD in numbers:
+            self._reap()
+        if signal.SIGTERM in numbers or signal.SIGINT in numbers:
+            if self.ending and self.stopping:
+                self.done = True  # asked twice
+            say('asked to end')
+            self.ending = True
+            self.at(1.8, self._leave_now)
+            self.stop_nodes(lambda: self.take_down(self._leave_now), quickly=True)
+
+    def _leave_now(self) -> None:
+        self.done = True
+        for name in ('agent.sock', 'agent.pid'):
+            with contextlib.suppress(OSError):
+                os.unlink(self.path(name))
+
+    def _reap(self) -> None:
+        # as process 1 of a container the agent inherits every orphan there
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            call = self.children.pop(pid, None)
+            if call is not None:
+                call(os.waitstatus_to_exitcode(status))
+
+    def spawn(
+        self, argv: list[str], then: Callable[[int], None], *, timeout: float = COMMAND_TIMEOUT,
+    ) -> None:
+        """Run a command as root where possible; ``then`` gets its exit status, 127: none such."""
+        own_log = sys.stderr.fileno()
+        environment = {**os.environ, 'PATH': search_path()}
+        try:
+            with self.root():
+                child = subprocess.Popen(
+                    argv, stdin=subprocess.DEVNULL, stdout=own_log, stderr=own_log, cwd='/',
+                    env=environment, start_new_session=True)
+        except (OSError, ValueError) as error:
+            say(f'{argv[0] if argv else "an empty command"}: {error}')
+            self.at(0.0, lambda: then(127))
+            return
+        pid = child.pid
+        child.returncode = 0  # the status is ours to collect: see _reap
+
+        def expire() -> None:
+            say(f'{argv[0]} took longer than {timeout:g} s')
+            with self.root(), contextlib.suppress(ProcessLookupError):
+                os.killpg(pid, signal.SIGKILL)
+
+        timer = self.at(timeout, expire)
+
+        def exited(status: int) -> None:
+            timer.at = None
+            then(status)
+
+        self.children[pid] = exited
+
+    def spawn_all(self, commands: list[list[str]], then: Callable[[bool], None]) -> None:
+        """Run commands as root, one after the other, all of them; ``then``: did all succeed."""
+        def step(index: int, good: bool) -> None:
+            if index == len(commands):
+                then(good)
+                return
+            self.spawn(commands[index], lambda status: step(index + 1, good and status == 0))
+        step(0, True)
+
+    # -- events -------------------------------------------------------------------------------
+
+    def emit(self, event: str, **data: Any) -> None:
+        """Append an event to the log and send it to those who follow."""
+        self.write([dump({'event': event, **data})[1:]])
+
+    def write(self, lines: list[bytes]) -> None:
+        """Append events, given as in ``Log.append``, and send them to those who follow."""
+        self.log.append(lines)
+        for client in list(self.clients):
+            if client.cursor is not None and not client.out:
+                self._pump(client)
+
+    def _pump(self, client: Client) -> None:
+        """Copy log lines to a client until it is full; the file is its queue."""
+        client.behind = False
+        while client.cursor is not None:
+            if len(client.out) >= BLOCK:
+                client.behind = True
+                break
+            file, offset = client.cursor
+            if file not in self.log.files:
+                client.cursor = (self.log.files[0], 0)
+                continue
+            end = client.until[1] if client.until and client.until[0] is file else None
+            data = file.read(offset, end)
+            client.out += data
+            if data:
+                client.cursor = (file, offset + len(data))
+            elif end is not None or (client.until and client.until[0] not in self.log.files):
+                client.cursor = client.until = None
+            elif file is not self.log.files[-1]:
+                client.cursor = (self.log.files[self.log.files.index(file) + 1], 0)
+            else:
+                break
+        self._flush(client)
+
+    # -- clients ------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self.listener.accept()
+        except OSError:
+            return
+        connection.setblocking(False)
+        if len(self.clients) >= CLIENTS:
+            # connections whose other end the network lost pile up here
+            self._drop(min(self.clients, key=lambda client: client.active))
+        client = Client(connection)
+        client.active = self.clock()
+        self.clients.append(client)
+        self.selector.register(
+            connection, selectors.EVENT_READ, lambda mask: self._serve(client, mask))
+
+    def _drop(self, client: Client) -> None:
+        if client in self.clients:
+            self.clients.remove(client)
+            with contextlib.suppress(KeyError):
+                self.selector.unregister(client.socket)
+            client.socket.close()
+
+    def _serve(self, client: Client, mask: int) -> None:
+        if mask & selectors.EVENT_READ:
+            try:
+                data = client.socket.recv(BLOCK)
+            except BlockingIOError:
+                data = None
+            except OSError:
+                self._drop(client)
+                return
+            if data:
+                client.active = self.clock()
+                client.received += data
+                self._requests(client)
+            elif data == b'':
+                # what it asked for is answered still, what it was saying is lost
+                client.finished = True
+                client.cursor = client.cursor if client.until else None
+        if client in self.clients:
+            if mask & selectors.EVENT_WRITE or client.finished:
+                self._pump(client)
+
+    def _requests(self, client: Client) -> None:
+        *lines, rest = client.received.split(b'\n')
+        client.received = rest
+        if len(rest) > MAX_LINE:
+            client.received = bytearray()
+            client.finished = True
+            self.reply(client, None, {'error': f'a request is longer than {MAX_LINE} bytes'})
+        for line in lines:
+            if client in self.clients and line.strip():
+                self._request(client, bytes(line))
+
+    def _request(self, client: Client, line: bytes) -> None:
+        number = None
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise Refused('a request is a JSON object')
+            number = request.get('id')
+            command = request.get('command')
+            handler = HANDLERS.get(command) if isinstance(command, str) else None
+            if handler is None:
+                raise Refused(f'no such command: {json.dumps(command)[:80]}',
+                              f"there are: {', '.join(sorted(HANDLERS))}", 'unknown')
+            answer = handler(self, client, request)
+        except Refused as error:
+            answer = {'error': str(error), 'hint': error.hint, 'kind': error.kind}
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            what = f'{error} is missing' if isinstance(error, KeyError) else str(error)
+            answer = {'error': f'malformed request: {what[:200]}', 'kind': 'malformed'}
+        except OSError as error:
+            answer = {'error': f'{error.filename or "the machine"}: {error.strerror or error}'}
+        if answer is not None:
+            self.reply(client, number, answer)
+
+    def reply(self, client: Client, number: Any, answer: Json) -> None:
+        """Send an answer: with ``error`` in it a refusal, else a success."""
+        if client in self.clients:
+            client.out += dump({'id': number, 'ok': 'error' not in answer, **answer})
+            self._pump(client)
+
+    def reply_later(self, client: Client, request: Json) -> Callable[[Json], None]:
+        """Return what sends the answer when it is there."""
+        client.awaiting += 1
+
+        def reply(answer: Json) -> None:
+            client.awaiting -= 1
+            self.reply(client, request.get('id'), answer)
+        return reply
+
+    def _flush(self, client: Client) -> None:
+        try:
+            while client.out:
+                del client.out[:client.socket.send(client.out[:BLOCK])]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(client)
+            return
+        if client.finished and not client.out and not client.awaiting and not client.cursor:
+            self._drop(client)
+            return
+        # one that has nothing more to say would wake the selector for ever
+        wanted = 0 if client.finished else selectors.EVENT_READ
+        if client.out or client.behind:
+            wanted |= selectors.EVENT_WRITE
+        self._select(client.socket, wanted, lambda mask: self._serve(client, mask))
+
+    def _select(self, connection: socket.socket, wanted: int, call: Callable[[int], None]) -> None:
+        """Make the selector look at a socket for exactly these events."""
+        key = self.selector.get_map().get(connection)
+        if not wanted:
+            if key is not None:
+                self.selector.unregister(connection)
+        elif key is None:
+            self.selector.register(connection, wanted, call)
+        elif key.events != wanted:
+            self.selector.modify(connection, wanted, call)
+
+    # -- requests -----------------------------------------------------------------------------
+
+    def do_configure(self, client: Client, request: Json) -> Optional[Json]:
+        """Take new settings; another launch than before takes the machine over."""
+        new = checked(request)
+        for fixed in ('directory', 'user', 'log_bytes'):
+            new.pop(fixed, None)
+        if self.ending:
+            raise Refused('this machine is ending', 'launch again', 'ending')
+        taken_over = new.get('launch', self.config['launch']) != self.config['launch']
+        age = self.heartbeat_age()
+        if taken_over and age is not None and not request.get('force'):
+            raise Refused(
+                f"this machine belongs to launch '{self.config['launch']}', whose last sign of "
+                f'life is {age:.0f} s old', 'end that launch, or choose another name', 'busy')
+        stale = self.launch is not None and any(
+            key in new and new[key] != self.config[key] for key in ('setup', 'ros_command'))
+        running = any(node['state'] in ('starting', 'running') for node in self.nodes.values())
+
+        def apply() -> Json:
+            if taken_over:
+                self.nodes.clear()
+                new.setdefault('heartbeat', None)
+            self.config.update(new)
+            self.watchdog.config = self.config
+            if taken_over:
+                self.watchdog.disarm()
+                self.watchdog.boot_from = self.clock()
+            self.watchdog.configured(self.clock(), heartbeat=bool(self.config['heartbeat']))
+            self.save()
+            try:
+                self.open_heart()
+            except Refused as error:
+                return {'error': str(error), 'hint': error.hint}
+            return {'machine': self.config['machine'], 'next': self.log.next}
+
+        if self.stopping or (self.launch and (taken_over or (stale and not running))):
+            reply = self.reply_later(client, request)
+            self.stop_nodes(lambda: reply(apply()))
+            return None
+        return apply()
+
+    def do_keep(self, client: Client, request: Json) -> Json:
+        """Keep something going; ``what`` again replaces it."""
+        kept = Kept(request)
+        former = self.kept.get(kept.what)
+        if former is not None and former.timer is not None:
+            former.timer.at = None
+        self.kept[kept.what] = kept
+        if kept.alive:
+            self._look(kept)
+        return {}
+
+    def do_launch(self, client: Client, request: Json) -> Json:
+        """Start the launch process where it isn't running."""
+        return {'pid': self.start_launch().pid}
+
+    def do_start(self, client: Client, request: Json) -> Json:
+        """Start nodes."""
+        specs = request['nodes']
+        if not isinstance(specs, list) or not all(
+                isinstance(spec, dict) and isinstance(spec.get('id'), str)
+                and isinstance(spec.get('name'), str) for spec in specs):
+            raise Refused("'nodes' is a list of objects with id and name")
+        known = [spec['id'] for spec in specs if spec['id'] in self.nodes]
+        specs = [spec for spec in specs if spec['id'] not in self.nodes]
+        graces = []
+        for spec in specs:
+            grace = float(spec.get('sigterm_timeout', 5.0)) + float(
+                spec.get('sigkill_timeout', 5.0))
+            if not 0 <= grace < 1e6:
+                raise Refused(f"node '{spec['id']}' can't be given {grace} s to end")
+            graces.append(grace)
+        launch = self.start_launch()
+        for spec, grace in zip(specs, graces):
+            self.nodes[spec['id']] = {
+                'id': spec['id'], 'name': spec['name'], 'state': 'starting', 'pid': None,
+                'returncode': None, 'restarts': 0, 'grace': grace}
+        if specs:
+            self._tell(launch, {
+                'command': 'start', 'nodes': specs, 'environment': self.config['environment']})
+        return {'known': known}
+
+    def do_stop(self, client: Client, request: Json) -> Json:
+        """Stop nodes as launch does: SIGINT, SIGTERM, SIGKILL."""
+        ids = request.get('nodes')
+        ids = list(self.nodes) if ids is None else [str(number) for number in ids]
+        for number in ids:
+            if number not in self.nodes:
+                raise Refused(f"there is no node '{number}'", kind='not running')
+        if self.launch is not None and not self.launch.stopping:
+            self._tell(self.launch, {'command': 'stop', 'nodes': ids})
+        return {}
+
+    def do_signal(self, client: Client, request: Json) -> Json:
+        """Send a node a signal."""
+        name = str(request['signal'])
+        node = self.nodes.get(str(request['node']))
+        if name not in signal.Signals.__members__:
+            raise Refused(f"there is no signal '{name}'")
+        if node is None or node['state'] not in ('starting', 'running') or self.launch is None:
+            raise Refused(f"node '{request['node']}' isn't running", kind='not running')
+        self._tell(self.launch, {'command': 'signal', 'node': node['id'], 'signal': name})
+        return {}
+
+    def do_status(self, client: Client, request: Json) -> Json:
+        """Tell how things are; ages and times left in seconds, memory in kB."""
+        with open('/proc/self/statm') as stream:
+            rss = int(stream.read().split()[1]) * os.sysconf('SC_PAGE_SIZE') // 1024
+        config = self.config
+        return {
+            'machine': config['machine'], 'launch': config['launch'], 'pid': os.getpid(),
+            'user': config['user'], 'directory': self.directory, 'since': self.since,
+            'on_exit': config['on_exit'], 'robot_timeout': config['robot_timeout'],
+            'lifetime_left': self.watchdog.lifetime_from + config['lifetime'] - self.clock(),
+            'heartbeat_age': self.heartbeat_age(), 'ending': self.ending,
+            'launch_running': self.launch is not None and not self.launch.stopping,
+            'nodes': [{k: v for k, v in node.items() if k != 'grace'}
+                      for node in self.nodes.values()],
+            'kept': [{'what': kept.what, 'ok': kept.ok, 'repairs': kept.repairs}
+                     for kept in self.kept.values()],
+            'rss_kb': rss, 'first': self.log.first, 'next': self.log.next,
+        }
+
+    def do_log(self, client: Client, request: Json) -> Optional[Json]:
+        """Send events from a seq on."""
+        begin = max(1, int(request.get('from') or 1))
+        lost = max(0, self.log.first - begin)
+        file = self.log.files[-1]
+        self.reply(client, request.get('id'), {
+            'first': self.log.first, 'next': self.log.next, 'lost': lost})
+        client.cursor = self.log.locate(begin)
+        client.until = None if request.get('follow') else (file, file.size)
+        self._pump(client)
+        return None
+
+    def do_release(self, client: Client, request: Json) -> None:
+        """End a launch in order."""
+        self.config['on_exit'] = checked({
+            'on_exit': request.get('on_exit', self.config['on_exit'])})['on_exit']
+        self.watchdog.disarm()
+        self.config['heartbeat'] = None
+        self.open_heart()
+        self.save()
+        reply = self.reply_later(client, request)
+        leave = bool(request.get('exit'))
+        self.ending = self.ending or leave
+
+        def stopped() -> None:
+            reply({})
+            if leave:
+                self.take_down(self._leave_for_good)
+        self.stop_nodes(stopped)
+
+    # -- the nodes ----------------------------------------------------------------------------
+
+    def start_launch(self) -> CloudLaunch:
+        """
+        Return the running launch process, started if need be.
+
+        :raises Refused: it can't be started now.
+        """
+        if self.ending or self.stopping:
+            raise Refused('the agent is stopping its nodes', kind='ending')
+        if self.launch is not None:
+            return self.launch
+        argv = list(self.config['ros_command'])
+        if not argv:
+            raise Refused("there is no 'ros_command' to run nodes with", 'configure it first')
+        for path in self.config['setup']:
+            if not os.path.isfile(path):
+                raise Refused(f'{path} to be sourced is not there')
+        if self.config['setup']:
+            lines = [f'. {quoted(path)}' for path in self.config['setup']]
+            lines.append('exec ' + ' '.join(quoted(word) for word in argv))
+            argv = ['bash', '-c', '\n'.join(lines)]
+        ours, theirs = socket.socketpair()
+        log = os.open(
+            self.path('launch.log'), os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+            | os.O_CLOEXEC, 0o600)
+        home = self.account.pw_dir
+        identity: Json = {}
+        if self.privileged and self.account.pw_uid != 0:
+            groups = os.getgrouplist(self.account.pw_name, self.account.pw_gid)
+            identity = {'user': self.account.pw_uid, 'group': self.account.pw_gid,
+                        'extra_groups': groups}
+        try:
+            with self.root():
+                child = subprocess.Popen(
+                    argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                    cwd=home if os.path.isdir(home) else '/', start_new_session=True,
+                    env=self._environment(theirs.fileno()), pass_fds=(theirs.fileno(),),
+                    umask=0o022, **identity)
+        except (OSError, ValueError) as error:
+            ours.close()
+            raise Refused(f"{argv[0]} can't be started: {error}") from error
+        finally:
+            os.close(log)
+            theirs.close()
+        child.returncode = 0  # the status is ours to collect: see _reap
+        ours.setblocking(False)
+        launch = CloudLaunch(child.pid, ours)
+        self.launch = launch
+        self.children[child.pid] = lambda status: self._launch_exited(launch, status)
+        self._select(ours, selectors.EVENT_READ, lambda mask: self._hear(launch, mask))
+        return launch
+
+    def _environment(self, fd: int) -> dict[str, str]:
+        """Return what a login of the user would have, then what the launch asked for."""
+        user = self.account
+        if self.privileged:
+            kept = ('LANG', 'LANGUAGE', 'TZ', 'LC_ALL', 'LC_CTYPE', 'LC_NUMERIC')
+            environment = {key: os.environ[key] for key in kept if key in os.environ}
+            environment['PATH'] = search_path()
+            environment.setdefault('LANG', 'C.UTF-8')
+            runtime = f'/run/user/{user.pw_uid}'
+            if os.path.isdir(runtime):
+                environment['XDG_RUNTIME_DIR'] = runtime
+        else:
+            environment = dict(os.environ)
+        environment.update({
+            'HOME': user.pw_dir, 'USER': user.pw_name, 'LOGNAME': user.pw_name,
+            'SHELL': user.pw_shell or '/bin/sh',
+            # output has to arrive when it is written, not when a buffer is full
+            'PYTHONUNBUFFERED': '1', 'RCUTILS_LOGGING_BUFFERED_STREAM': '1'})
+        environment.pop('OVERRIDE_LAUNCH_PROCESS_OUTPUT', None)
+        environment.update(self.config['environment'])
+        environment.update({
+            'FOGROS2_AGENT_FD': str(fd), 'FOGROS2_AGENT_DIRECTORY': self.directory,
+            MARK: self.mark})
+        return environment
+
+    def _tell(self, launch: CloudLaunch, message: Json) -> None:
+        launch.out += dump(message)
+        self._hear(launch, selectors.EVENT_WRITE)
+
+    def _hear(self, launch: CloudLaunch, mask: int) -> None:
+        """Exchange lines with the launch process."""
+        if mask & selectors.EVENT_WRITE:
+            try:
+                while launch.out:
+                    del launch.out[:launch.socket.send(launch.out[:BLOCK])]
+            except BlockingIOError:
+                pass
+            except OSError:
+                launch.out.clear()  # it died; that is told when its status has been collected
+        if mask & selectors.EVENT_READ:
+            self._receive(launch)
+        wanted = 0 if launch.silent else selectors.EVENT_READ
+        if launch.out:
+            wanted |= selectors.EVENT_WRITE
+        self._select(launch.socket, wanted, lambda mask: self._hear(launch, mask))
+
+    def _receive(self, launch: CloudLaunch) -> bool:
+        """Take what the launch process said; returns whether it may have said more."""
+        try:
+            data = launch.socket.recv(BLOCK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b''
+        launch.silent = not data
+        launch.received += data
+        *lines, launch.received = launch.received.split(b'\n')
+        self._reported([bytes(line) for line in lines if line])
+        return bool(data)
+
+    def _reported(self, lines: list[bytes]) -> None:
+        """Take the launch process's events: ``{"event":...}`` lines."""
+        events = []
+        for line in lines:
+            # most lines are output, which changes no state and isn't worth parsing
+            if not line.startswith(b'{"event":"output"'):
+                try:
+                    self._node_changed(json.loads(line))
+                except (KeyError, TypeError, ValueError):
+                    say(f'the launch process said {line[:200]!r}')
+                    continue
+            events.append(line[1:] + b'\n')
+        if events:
+            self.write(events)
+
+    def _node_changed(self, event: Json) -> None:
+        node = self.nodes[event['node']]
+        kind = event['event']
+        if kind == 'started':
+            node['state'], node['pid'] = 'running', event['pid']
+        elif kind == 'exited':
+            node['state'] = 'starting' if event['respawns'] else 'exited'
+            node['restarts'] += bool(event['respawns'])
+            node['pid'], node['returncode'] = None, event['returncode']
+        elif kind == 'refused':
+            node['state'], node['error'] = 'refused', event['error']
+
+    def stop_nodes(self, then: Callable[[], None], *, quickly: bool = False) -> None:
+        """Stop every node and the launch process; call ``then`` when the last one is gone."""
+        self.after_launch.append(then)
+        launch = self.launch
+        if self.stopping and not quickly:
+            return
+        self.stopping = True
+        if launch is None:
+            self.sweep(lambda number: self._stopped(), quickly=quickly)
+            return
+        if not launch.stopping:
+            launch.stopping = True
+            with contextlib.suppress(OSError):
+                # it reads on to the end of file, then stops the nodes in launch's own way
+                launch.socket.shutdown(socket.SHUT_WR)
+        alive = [n['grace'] for n in self.nodes.values() if n['state'] in ('starting', 'running')]
+        patience = [(0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL)]
+        if not quickly:
+            patience = [(max(alive, default=2.0) + 3.0, signal.SIGKILL)]
+        for delay, number in patience:
+            self.at(delay, self._signaller(launch, number))
+
+    def _signaller(self, launch: CloudLaunch, number: int) -> Callable[[], None]:
+        def send() -> None:
+            if self.launch is launch:
+                with self.root(), contextlib.suppress(ProcessLookupError):
+                    os.killpg(launch.pid, number)
+        return send
+
+    def _launch_exited(self, launch: CloudLaunch, status: int) -> None:
+        while self._receive(launch):
+            pass  # what it said last
+        self._select(launch.socket, 0, lambda mask: None)
+        launch.socket.close()
+        self.launch = None
+        expected = self.stopping
+        self.stopping = True  # nothing new until its nodes are gone
+        left = [n for n in self.nodes.values() if n['state'] in ('starting', 'running')]
+
+        def swept(number: int) -> None:
+            lines = []
+            for node in left:
+                node.update(state='exited', pid=None, returncode=-number)
+                lines.append(dump({'event': 'exited', 'node': node['id'], 'name': node['name'],
+                                   'returncode': -number, 'respawns': False})[1:])
+            lines.append(dump({'event': 'launch_exited', 'returncode': status})[1:])
+            self.write(lines)
+            if not expected:
+                say(f'the launch process ended with status {status}')
+            self._remove_files()
+            self._stopped()
+        self.sweep(swept, quickly=self.ending)
+
+    def _stopped(self) -> None:
+        self.stopping = False
+        calls, self.after_launch = self.after_launch, []
+        for call in calls:
+            call()
+
+    def sweep(self, then: Callable[[int], None], *, quickly: bool = False) -> None:
+        """End what nodes and a dead launch process left; ``then`` gets the last signal sent."""
+        begin = self.clock()
+        steps = list(SWEEP_QUICKLY if quickly else SWEEP)
+        last = signal.SIGKILL
+
+        def look() -> None:
+            nonlocal last
+            left = marked(self.mark)
+            if not left or self.clock() - begin > SWEEP[-1][0] + 2.0:
+                then(last)
+                return
+            while steps and self.clock() - begin >= steps[0][0]:
+                last = steps.pop(0)[1]
+                for pid in left:
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.kill(pid, last)
+            self.at(0.02, look)
+        look()
+
+    def _remove_files(self) -> None:
+        """Remove the folder of travelled files that a killed launch process left."""
+        with contextlib.suppress(OSError):
+            for name in os.listdir(self.directory):
+                if name.startswith('files-'):
+                    remove_tree(self.path(name))
+
+    def _trim_launch_log(self) -> None:
+        with contextlib.suppress(OSError):
+            if os.path.getsize(self.path('launch.log')) > LAUNCH_LOG_BYTES:
+                os.truncate(self.path('launch.log'), 0)
+
+    # -- keeping, guarding, ending ------------------------------------------------------------
+
+    def _look(self, kept: Kept) -> None:
+        """See whether a kept thing is alive, repair it if not, and come back."""
+        def later() -> None:
+            pause = min(30.0, kept.interval * 2 ** min(kept.failures, 10))
+            kept.timer = self.at(pause, lambda: self._look(kept))
+
+        def looked(status: int) -> None:
+            if self.kept.get(kept.what) is not kept or self.ending:
+                return
+            if status == 0:
+                kept.ok, kept.failures = True, 0
+                later()
+                return
+            if kept.ok:
+                say(f'{kept.what} is down')
+                kept.ok, kept.since = False, self.clock()
+            self.spawn_all(kept.repair, repaired)
+
+        def repaired(good: bool) -> None:
+            if good:
+                kept.repairs += 1
+                kept.failures, kept.ok = 0, True
+                self.emit('vpn_repaired', what=kept.what, seconds=self.clock() - kept.since)
+            else:
+                kept.failures += 1
+            later()
+
+        self.spawn(kept.alive, looked, timeout=10.0)
+
+    def heartbeat_age(self) -> Optional[float]:
+        """Return seconds since the launch's last sign of life, None while nobody watches."""
+        beat = self.watchdog.beat_at
+        return None if beat is None else self.clock() - beat
+
+    def open_heart(self) -> None:
+        """Listen for heartbeats where the configuration says."""
+        if self.heart is not None:
+            self._select(self.heart, 0, lambda mask: None)
+            self.heart.close()
+            self.heart = None
+        where = self.config['heartbeat']
+        if not where:
+            return
+        heart = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        try:
+            # the VPN's address may come later, and come back
+            heart.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
+            heart.bind((where['bind'], where['port']))
+        except (OSError, OverflowError) as error:
+            heart.close()
+            raise Refused(f"no heartbeats at {where['bind']}:{where['port']}: {error}") from error
+        self.heart = heart
+        self.selector.register(heart, selectors.EVENT_READ, lambda mask: self._beat(heart))
+
+    def _beat(self, heart: socket.socket) -> None:
+        try:
+            data, peer = heart.recvfrom(2048)
+            if peer[0] != self.config['heartbeat']['peer']:
+                return
+            if json.loads(data)['launch'] != self.config['launch']:
+                return
+            self.watchdog.beat(self.clock())
+            heart.sendto(data, peer)
+        except (OSError, KeyError, TypeError, ValueError):
+            return  # the VPN is down, or somebody sends nonsense
+
+    def _guard(self, now: float) -> None:
+        reason = self.watchdog.due(now)
+        if reason is None:
+            return
+        stay = reason == 'robot gone' and self.config['on_exit'] == 'keep'
+        ends = 'end the machine' if self.config['end_command'] else 'leave'
+        action = 'stop the nodes' if stay else ends
+        say(f'{reason}: {action}')
+        self.emit('watchdog', reason=reason, action=action)
+        self.watchdog.disarm()
+        if stay:
+            self.stop_nodes(lambda: None)
+        else:
+            self.ending = True
+            self.stop_nodes(self.end_machine)
+
+    def end_machine(self) -> None:
+        """End the machine, again and again until that works; or leave one that isn't ours."""
+        command = self.config['end_command']
+        if not command:
+            self.take_down(self._leave_for_good)
+            return
+
+        def ended(status: int) -> None:
+            if status != 0:
+                self.emit('end_failed', returncode=status)
+            if os.getpid() == 1:
+                self.done = True  # the container ends with us
+            self.at(RETRY_END, self.end_machine)
+        self.spawn(command, ended, timeout=60.0)
+
+    def take_down(self, then: Callable[[], None]) -> None:
+        """Take the kept things down, then go on."""
+        commands = [argv for kept in self.kept.values() for argv in kept.down]
+        self.kept.clear()
+        self.spawn_all(commands, lambda good: then())
+
+    def _leave_for_good(self) -> None:
+        self.done = True
+        remove_tree(self.directory)
+        with self.root(), contextlib.suppress(OSError):
+            os.rmdir(self.directory)
+
+
+HANDLERS: dict[str, Callable[[Agent, Client, Json], Optional[Json]]] = {
+    name[3:]: getattr(Agent, name) for name in vars(Agent) if name.startswith('do_')}
+
+
+def account(user: str) -> pwd.struct_passwd:
+    """
+    Return the login user's entry.
+
+    :raises Refused: there is none, or the agent can't act for that user.
+    """
+    try:
+        entry = pwd.getpwnam(user) if user else pwd.getpwuid(os.getuid())
+    except KeyError as error:
+        raise Refused(f"there is no user '{user or os.getuid()}' on this machine") from error
+    if os.getuid() not in (0, entry.pw_uid):
+        raise Refused(f"only root can run nodes as '{user}'", f"run the agent as '{user}'")
+    return entry
+
+
+def search_path() -> str:
+    """Return PATH with the folders of system programs in it."""
+    known = os.environ.get('PATH', os.defpath).split(':')
+    more = ('/usr/local/bin', '/usr/bin', '/bin', '/usr/local/sbin', '/usr/sbin', '/sbin')
+    return ':'.join(known + [folder for folder in more if folder not in known])
+
+
+def quoted(word: str) -> str:
+    """Return a word as a shell reads it back."""
+    return "'" + word.replace("'", "'\"'\"'") + "'"
+
+
+def marked(mark: str) -> list[int]:
+    """Return the processes that the agent's launch process started, at whatever remove."""
+    wanted = f'{MARK}={mark}'.encode()
+    found = []
+    for name in os.listdir('/proc'):
+        if name.isdigit() and int(name) != os.getpid():
+            with contextlib.suppress(OSError):
+                with open(f'/proc/{name}/environ', 'rb') as stream:
+                    if wanted in stream.read().split(b'\0'):
+                        found.append(int(name))
+    return found
+
+
+def remove_tree(path: str) -> None:
+    """Remove a folder and what is in it, as far as that can be done."""
+    for folder, subfolders, files in os.walk(path, topdown=False):
+        for name in files + subfolders:
+            entry = os.path.join(folder, name)
+            with contextlib.suppress(OSError):
+                link = os.path.islink(entry)
+                os.rmdir(entry) if name in subfolders and not link else os.unlink(entry)
+    with contextlib.suppress(OSError):
+        os.rmdir(path)
+
+
+def detach() -> int:
+    """
+    Become a daemon; in the parent wait for a line about how that went and exit with it.
+
+    Returns the descriptor for that line.
+    """
+    reader, writer = os.pipe()
+    if os.fork():
+        os.close(writer)
+        with os.fdopen(reader, 'rb') as stream:
+            line = stream.read()
+        sys.stdout.buffer.write(line or dump({'error': 'the agent died while starting'}))
+        sys.stdout.flush()
+        os._exit(0 if b'"ready":true' in line else 1)
+    os.close(reader)
+    os.setsid()
+    if os.fork():
+        os._exit(0)
+    null = os.open(os.devnull, os.O_RDWR)
+    for fd in (0, 1, 2):
+        os.dup2(null, fd)
+    return writer
+
+
+def serve(config_path: str, *, daemon: bool) -> int:
+    """Run the agent with a configuration file; returns the exit status."""
+    answer = -1
+    try:
+        try:
+            with open(config_path) as stream:
+                config = json.load(stream)
+        except (OSError, ValueError) as error:
+            raise Refused(f"the configuration {config_path} can't be read: {error}") from error
+        if not isinstance(config, dict) or not config.get('directory'):
+            raise Refused(f"the configuration {config_path} names no 'directory'")
+        if daemon:
+            answer = detach()
+        agent = Agent(config)
+        agent.open()
+    except Refused as error:
+        line = {'error': str(error), 'hint': error.hint, 'kind': error.kind}
+        if answer >= 0:
+            os.write(answer, dump(line))
+        else:
+            say(str(error))
+        return 1
+    if answer >= 0:
+        log = os.open(agent.path('agent.log'),
+                      os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o600)
+        os.dup2(log, 2)
+        os.close(log)
+        os.write(answer, dump({'ready': True, 'socket': agent.path('agent.sock'),
+                               'pid': os.getpid()}))
+        os.close(answer)
+    agent.run()
+    return 0
+
+
+def connect(directory: str) -> int:
+    """Relay stdin and stdout to the agent of a directory; returns the exit status."""
+    directory = os.path.expanduser(directory)
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        link.connect(f'/proc/self/fd/{folder}/agent.sock')
+        os.close(folder)
+    except OSError as error:
+        sys.stdout.buffer.write(dump({
+            'error': f'no agent serves {directory}: {error.strerror}', 'kind': 'absent'}))
+        return 3
+    sources = [0, link.fileno()]
+    selector = selectors.DefaultSelector()
+    for source in sources:
+        with contextlib.suppress(PermissionError):  # a file or /dev/null as standard input
+            selector.register(source, selectors.EVENT_READ)
+    if 0 not in selector.get_map():
+        link.shutdown(socket.SHUT_WR)
+    try:
+        while True:
+            for key, _ in selector.select():
+                data = os.read(key.fd, BLOCK)
+                if key.fd == 0 and data:
+                    link.sendall(data)
+                elif key.fd == 0:
+                    selector.unregister(0)
+                    link.shutdown(socket.SHUT_WR)  # what was asked is answered still
+                elif data:
+                    while data:
+                        data = data[os.write(1, data):]
+                else:
+                    return 0
+    except (BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
+        return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Run a command line; returns the exit status."""
+    daemon = '--detach' in arguments
+    rest = [word for word in arguments if word != '--detach']
+    if len(rest) == 3 and rest[:2] == ['serve', '--config']:
+        return serve(rest[2], daemon=daemon)
+    if len(rest) == 3 and rest[:2] == ['connect', '--directory']:
+        return connect(rest[2])
+    sys.stderr.write('usage: agent.py serve --config FILE [--detach]\n'
+                     '       agent.py connect --directory DIR\n')
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's end of the agent: requests, events that survive a lost connection, heartbeats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import itertools
+import json
+from pathlib import Path
+import socket
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2.errors import AgentError, Cancelled, ConnectError, DeadlineExceeded, FogError
+from fogros2.model import Command, to_json
+from fogros2.shell import Shell, Stream
+from fogros2.waiting import wait_until
+
+#: Seconds between heartbeats.
+HEARTBEAT_INTERVAL = 2.0
+
+EventCallback = Callable[[dict[str, Any]], None]
+
+
+def agent_source() -> Path:
+    """Return the path of ``agent.py``, to be put onto a machine."""
+    return Path(__file__).with_name('agent.py')
+
+
+def cloud_launch_source() -> Path:
+    """Return the path of the launch file that runs nodes there: needs launch, not fogros2."""
+    return Path(__file__).with_name('cloud_launch.py')
+
+
+class _Pending:
+    """A request that waits for its reply."""
+
+    def __init__(self, line: bytes, repeatable: bool) -> None:
+        self.line = line
+        self.repeatable = repeatable
+        self.done = threading.Event()
+        self.reply: dict[str, Any] = {}
+
+
+class AgentClient:
+    """
+    A connection to a machine's agent that comes back after a loss.
+
+    One thread reads. It calls the subscribers with each event, once and in order, and with
+    ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``, which carry no ``seq``.
+    A subscriber must not make requests: their replies would come in on its own thread.
+
+    :param shell: reaches the machine.
+    :param directory: the agent's directory there.
+    :param python: interpreter there.
+    :param agent_path: where ``agent.py`` is there.
+    :param cancel: once set, requests end with Cancelled and no new connection is tried.
+    """
+
+    def __init__(
+        self,
+        shell: Shell,
+        directory: str,
+        *,
+        agent_path: str,
+        python: str = 'python3',
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        self._shell = shell
+        self._command = Command(
+            # the standard library is all it needs; finding out what else is installed takes time
+            (python, '-IS', agent_path, 'connect', '--directory', directory),
+            what='reach the agent')
+        self._callbacks: list[EventCallback] = []
+        self._cancel = cancel or threading.Event()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._stream: Optional[Stream] = None
+        self._error: Optional[AgentError] = None
+        self._next: Optional[int] = None
+        self._log_request = 0
+        self._thread: Optional[threading.Thread] = None
+
+    @property
+    def next_seq(self) -> int:
+        """The seq that the next event delivered will have at the least."""
+        return self._next or 1
+
+    def connect(self) -> None:
+        """
+        Open the connection now rather than with the first request; harmless when it is open.
+
+        :raises ConnectError: the machine can't be reached.
+        :raises AgentError: no agent answers there.
+        """
+        with self._lock:
+            if self._thread is not None:
+                return
+            if self._closed.is_set():
+                raise AgentError('the connection to the agent was closed')
+            self._stream = self._shell.open(self._command)
+            self._thread = threading.Thread(
+                target=self._read_all, name='fogros2-agent', daemon=True)
+            self._thread.start()
+
+    def request(self, command: str, *, timeout: float = 30.0, **arguments: Any) -> dict[str, Any]:
+        """
+        Ask the agent for something and return its reply.
+
+        A connection that breaks meanwhile comes back and the request is sent again, but for
+        ``signal``, which would count twice.
+
+        :param timeout: seconds, lost connections included.
+        :raises AgentError: refused, with the agent's hint; or there is no agent (any more).
+        :raises DeadlineExceeded: no reply in time.
+        :raises Cancelled: ``cancel`` was set.
+        """
+        if threading.current_thread() is self._thread:
+            raise RuntimeError('a subscriber must not make requests')
+        self.connect()
+        number = next(self._numbers)
+        line = to_json({'id': number, 'command': command, **arguments}).encode() + b'\n'
+        pending = _Pending(line, repeatable=command != 'signal')
+        with self._lock:
+            if self._error is not None:
+                raise self._error
+            self._pending[number] = pending
+            stream = self._stream
+        if stream is not None:
+            with contextlib.suppress(ConnectError):  # the reader sees to it
+                stream.write(line)
+        deadline = time.monotonic() + timeout
+        try:
+            while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
+                if self._cancel.is_set():
+                    raise Cancelled(f"'{command}' of the agent")
+                if time.monotonic() >= deadline:
+                    raise DeadlineExceeded(
+                        f"the agent didn't answer '{command}' within {timeout:g} s")
+        finally:
+            with self._lock:
+                self._pending.pop(number, None)
+        reply = pending.reply
+        if not reply.get('ok'):
+            raise AgentError(str(reply.get('error', 'refused')), str(reply.get('hint', '')))
+        return reply
+
+    def subscribe(self, callback: EventCallback, since: Optional[int] = None) -> None:
+        """
+        Call ``callback`` with events, each once and in order, over lost connections too.
+
+        The first subscriber decides where to begin; a later one joins where the others are.
+
+        :param since: seq to begin with, 1 for all that the agent has; None for new ones alone.
+        :raises AgentError: as ``request``.
+        """
+        if since is None and self._next is None:
+            since = int(self.request('status')['next'])
+        self._callbacks.append(callback)
+        if self._next is not None or since is None:
+            return
+        self._next = since
+        self.connect()
+        with self._lock:
+            stream = self._stream
+        if stream is not None:
+            with contextlib.suppress(ConnectError):
+                self._follow_on(stream)
+
+    def close(self) -> None:
+        """Drop the connection; requests that wait fail; the agent goes on."""
+        self._closed.set()
+        with self._lock:
+            stream, thread = self._stream, self._thread
+        if stream is not None:
+            stream.close()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(5.0)
+
+    # -- the reader's thread --------------------------------------------------------------
+
+    def _read_all(self) -> None:
+        error: FogError
+        try:
+            while not self._closed.is_set():
+                self._read_stream()
+                if self._error is not None or self._closed.is_set():
+                    break
+                self._tell({'event': 'connection', 'state': 'lost'})
+                self._reopen()
+                if self._stream is None:
+                    break
+                self._tell({'event': 'connection', 'state': 'back'})
+        finally:
+            error = self._error or AgentError('the connection to the agent was closed')
+            with self._lock:
+                self._error = error
+                waiting = list(self._pending.values())
+            for pending in waiting:
+                pending.reply = {'ok': False, 'error': str(error.args[0]), 'hint': error.hint}
+                pending.done.set()
+        if self._error is not None and not self._closed.is_set():
+            self._tell({'event': 'connection', 'state': 'absent', 'error': str(self._error)})
+
+    def _read_stream(self) -> None:
+        stream = self._stream
+        assert stream is not None
+        for line in iter(stream.readline, b''):
+            try:
+                message = json.loads(line)
+            except ValueError:
+                continue  # what a login script there says
+            if not isinstance(message, dict):
+                continue
+            if 'event' in message:
+                self._deliver(message)
+            elif 'ok' in message:
+                self._answer(message)
+            elif message.get('kind') == 'absent':
+                self._error = AgentError(str(message.get('error')), 'its machine may have ended')
+        with self._lock:
+            self._stream = None
+        stream.close()
+
+    def _answer(self, reply: dict[str, Any]) -> None:
+        number = reply.get('id')
+        if number is not None and number == self._log_request:
+            if reply.get('next', 0) < self.next_seq:
+                # an agent with a new log: everything in it is new to us
+                self._next = 1
+                stream = self._stream
+                if reply.get('next', 0) > 1 and stream is not None:
+                    with contextlib.suppress(ConnectError):
+                        self._follow_on(stream)
+            elif reply.get('lost'):
+                self._tell({'event': 'lost', 'count': reply['lost']})
+            return
+        with self._lock:
+            pending = self._pending.get(number) if isinstance(number, int) else None
+        if pending is not None:
+            pending.reply = reply
+            pending.done.set()
+
+    def _deliver(self, event: dict[str, Any]) -> None:
+        seq = event.get('seq')
+        if self._next is None or not isinstance(seq, int) or seq < self._next:
+            return
+        self._next = seq + 1
+        self._tell(event)
+
+    def _tell(self, event: dict[str, Any]) -> None:
+        for callback in self._callbacks:
+            callback(event)
+
+    def _follow_on(self, stream: Stream) -> None:
+        self._log_request = next(self._numbers)
+        stream.write(to_json({
+            'id': self._log_request, 'command': 'log', 'from': self._next, 'follow': True,
+        }).encode() + b'\n')
+
+    def _reopen(self) -> None:
+        """Connect again, with growing pauses, for as long as anybody wants it."""
+        def attempt() -> Optional[Stream]:
+            if self._cancel.is_set():
+                raise Cancelled('the connection to the agent')
+            try:
+                return self._shell.open(self._command)
+            except ConnectError:
+                return None
+
+        stream = None
+        while stream is None:
+            try:
+                stream = wait_until(
+                    attempt, timeout=3600.0, what='the agent', cancel=self._closed,
+                    interval=0.1, longest=5.0)
+            except DeadlineExceeded:
+                continue
+            except Cancelled:
+                return
+            except FogError as error:
+                # another host key, our key refused: no reconnecting helps
+                self._error = AgentError(f"the agent can't be reached: {error.args[0]}",
+                                         error.hint)
+                return
+        with self._lock:
+            self._stream = stream
+            again = []
+            for pending in self._pending.values():
+                if pending.repeatable:
+                    again.append(pending.line)
+                elif not pending.done.is_set():
+                    pending.reply = {'ok': False, 'error': 'the connection was lost meanwhile'}
+                    pending.done.set()
+        with contextlib.suppress(ConnectError):
+            if self._next is not None:
+                self._follow_on(stream)
+            for line in again:
+                stream.write(line)
+
+
+class Heartbeat:
+    """
+    Tells a machine over the VPN that the launch lives, and measures the round trip.
+
+    Begins at once. Datagrams get lost, and the VPN may be down for a while: no errors here.
+
+    :param address: the machine's VPN address.
+    :param port: the agent's port there.
+    :param launch_id: as the agent was configured.
+    :param interval: seconds between heartbeats.
+    """
+
+    def __init__(
+        self, address: str, port: int, launch_id: str, interval: float = HEARTBEAT_INTERVAL,
+    ) -> None:
+        self._target = (address, port)
+        self._launch_id = launch_id
+        self._interval = interval
+        self._stopped = threading.Event()
+        self._answered_at: Optional[float] = None
+        self._round_trip: Optional[float] = None
+        self._thread = threading.Thread(target=self._run, name='fogros2-heartbeat', daemon=True)
+        self._thread.start()
+
+    @property
+    def round_trip(self) -> Optional[float]:
+        """Seconds that the last answered heartbeat took there and back, None before one was."""
+        return self._round_trip
+
+    @property
+    def age(self) -> Optional[float]:
+        """Seconds since an answer came, None before the first."""
+        at = self._answered_at
+        return None if at is None else time.monotonic() - at
+
+    def close(self) -> None:
+        """Stop; the agent's watch over the launch runs out after its ``robot_timeout``."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+
+    def _run(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            number = 0
+            while not self._stopped.is_set():
+                number += 1
+                self._send(link, number)
+                self._listen(link, time.monotonic() + self._interval)
+
+    def _send(self, link: socket.socket, number: int) -> None:
+        data = to_json({'launch': self._launch_id, 'n': number, 't': time.monotonic()}).encode()
+        with contextlib.suppress(OSError):  # no route while the VPN is down
+            link.sendto(data, self._target)
+
+    def _listen(self, link: socket.socket, until: float) -> None:
+        while not self._stopped.is_set():
+            left = until - time.monotonic()
+            if left <= 0:
+                return
+            link.settimeout(min(left, 0.25))
+            try:
+                data, peer = link.recvfrom(2048)
+            except TimeoutError:
+                continue
+            except OSError:
+                # 'connection refused' of an agent that isn't there yet; the next may fare better
+                self._stopped.wait(0.05)
+                continue
+            now = time.monotonic()
+            try:
+                answer = json.loads(data)
+                if peer == self._target and answer['launch'] == self._launch_id:
+                    self._round_trip = now - float(answer['t'])
+                    self._answered_at = now
+            except (KeyError, TypeError, ValueError):
+                continue

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Runs on the machine, inside ``ros2 launch``: turns the agent's NodeSpecs into launch's processes.
+
+Imports launch and the ament index alone, nothing of fogros2: the file works where only it and
+``agent.py`` have been copied to. It exchanges JSON lines with the agent over the socket whose
+number is in ``FOGROS2_AGENT_FD``: ``start``, ``stop``, ``signal`` come in, ``started``,
+``output``, ``exited``, ``refused`` go out; its end of file shuts launch down in order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import codecs
+from collections.abc import Mapping, Sequence
+import json
+import os
+import re
+import signal
+import socket
+import sys
+import tempfile
+from typing import Any, Optional, Union
+
+from ament_index_python.packages import (
+    get_package_prefix,
+    get_package_share_directory,
+    get_packages_with_prefixes,
+    PackageNotFoundError,
+)
+from launch import Action, Event, EventHandler, LaunchContext, LaunchDescription
+from launch.actions import ExecuteProcess, OpaqueFunction
+from launch.events import IncludeLaunchDescription, matches_action, Shutdown
+from launch.events.process import (
+    ProcessExited,
+    ProcessIO,
+    ProcessStarted,
+    ShutdownProcess,
+    SignalProcess,
+)
+
+Json = dict[str, Any]
+#: Text with markers, as it arrives: see ``fogros2.model.Text``.
+Text = Union[str, Sequence[Union[str, Mapping[str, str]]]]
+#: Characters of one output event at the most.
+CHUNK = 1 << 16
+
+
+class RefusedNode(Exception):
+    """A node that this machine can't run: message and hint."""
+
+    def __init__(self, message: str, hint: str = '') -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return a launch description that does what the agent says, until the agent goes."""
+    fd = int(os.environ.pop('FOGROS2_AGENT_FD'))
+    directory = os.environ.get('FOGROS2_AGENT_DIRECTORY')
+    return LaunchDescription([ObeyAgent(socket.socket(fileno=fd), directory)])
+
+
+class Node:
+    """A NodeSpec and the process made of it."""
+
+    def __init__(self, spec: Json) -> None:
+        self.id: str = spec['id']
+        self.name: str = spec['name']
+        self.respawn = bool(spec.get('respawn', False))
+        self.retries_left = int(spec.get('respawn_max_retries', -1))
+        self.process: Optional[ExecuteProcess] = None
+        self.running = False
+        self.seen = False
+        self.stopping = False
+        self.waiting: list[str] = []  # signals that came before the process
+        decoder = codecs.getincrementaldecoder('utf-8')
+        self.decoders = {name: decoder('replace') for name in ('stdout', 'stderr')}
+
+
+class ObeyAgent(Action):
+    """
+    Does what comes over the agent's socket and reports what becomes of it.
+
+    :param connection: the socket, blocking: an agent that is slow slows the nodes' output down
+        instead of filling this process's memory.
+    :param directory: private folder below which files that travelled are written; None for the
+        system's own place for such.
+    """
+
+    def __init__(self, connection: socket.socket, directory: Optional[str] = None) -> None:
+        super().__init__()
+        connection.setblocking(True)
+        connection.set_inheritable(False)
+        self._connection = connection
+        self._received = b''
+        self._nodes: dict[str, Node] = {}
+        self._by_action: dict[int, Node] = {}
+        self._done: Optional[asyncio.Future[None]] = None
+        self._directory = directory
+        self._folder: Optional[tempfile.TemporaryDirectory[str]] = None
+        self._files = 0
+
+    def execute(self, context: LaunchContext) -> None:
+        """Listen; launch runs until the socket ends."""
+        loop = context.asyncio_loop
+        self._done = loop.create_future()
+        context.register_event_handler(_Watch(self))
+        loop.add_reader(self._connection.fileno(), self._read, context)
+
+    def get_asyncio_future(self) -> Optional[asyncio.Future[None]]:
+        """Return what is done once launch has been told to shut down."""
+        return self._done
+
+    def _read(self, context: LaunchContext) -> None:
+        try:
+            # the flag spares the socket from being non-blocking for writing too
+            data = self._connection.recv(1 << 18, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b''
+        if not data:
+            context.asyncio_loop.remove_reader(self._connection.fileno())
+            for node in self._nodes.values():
+                node.stopping = True
+            context.emit_event_sync(Shutdown(reason='the agent said so', due_to_sigint=False))
+            self.finish()
+            return
+        *lines, self._received = (self._received + data).split(b'\n')
+        for line in lines:
+            message = json.loads(line)
+            if message['command'] == 'start':
+                # the launch's variables may have come after this process was started
+                os.environ.update(message.get('environment', {}))
+                for spec in message['nodes']:
+                    self._start(context, spec)
+            elif message['command'] == 'stop':
+                for node in message['nodes']:
+                    self._stop(context, self._nodes.get(node))
+            elif message['command'] == 'signal':
+                self._signal(context, self._nodes.get(message['node']), message['signal'])
+
+    def finish(self) -> None:
+        """Let go of launch: it may end once the nodes have."""
+        if self._done is not None and not self._done.done():
+            self._done.set_result(None)
+
+    def _start(self, context: LaunchContext, spec: Json) -> None:
+        node = Node(spec)
+        self._nodes[node.id] = node
+        try:
+            node.process = self._process(spec)
+        except RefusedNode as error:
+            self._refuse(node, str(error), error.hint)
+            return
+        self._by_action[id(node.process)] = node
+        context.emit_event_sync(IncludeLaunchDescription(LaunchDescription([
+            node.process, OpaqueFunction(function=self._executed, args=(node,))])))
+
+    def _process(self, spec: Json) -> ExecuteProcess:
+        """
+        Return the launch action for a NodeSpec.
+
+        :raises RefusedNode: something that it names isn't on this machine.
+        """
+        files = {key: self._write(key, text) for key, text in spec.get('files', {}).items()}
+        # a file may name another one: contents last, when all have a path
+        for key, text in spec.get('files', {}).items():
+            with open(files[key], 'w', encoding='utf-8') as stream:
+                stream.write(resolve(text, files))
+        arguments = [resolve(word, files) for word in spec.get('arguments', [])]
+        environment: dict[Any, Any] = {  # launch's type is a union that a dict can't match
+            name: resolve(value, files) for name, value in spec.get('environment', {}).items()}
+        if spec.get('package'):
+            arguments.insert(0, find_executable(spec['package'], spec.get('executable', '')))
+        words = [*spec.get('prefix', []), *arguments]
+        if not words:
+            raise RefusedNode('there is nothing to run: no executable and no arguments')
+        shell = bool(spec.get('shell', False))
+        cwd = spec.get('cwd')
+        if cwd is not None and not os.path.isdir(cwd):
+            raise RefusedNode(f"the working directory '{cwd}' isn't there")
+        if not shell:
+            path = environment.get('PATH', os.environ.get('PATH', os.defpath))
+            check_program(words[0], path, cwd)
+        return ExecuteProcess(
+            cmd=words,
+            name=re.sub(r'-\d+$', '', spec['name']),
+            cwd=cwd,
+            additional_env=environment,
+            shell=shell,
+            emulate_tty=bool(spec.get('emulate_tty', False)),
+            respawn=bool(spec.get('respawn', False)),
+            respawn_delay=float(spec.get('respawn_delay', 0.0)),
+            respawn_max_retries=int(spec.get('respawn_max_retries', -1)),
+            sigterm_timeout=str(float(spec.get('sigterm_timeout', 5.0))),
+            sigkill_timeout=str(float(spec.get('sigkill_timeout', 5.0))),
+            output={},  # the agent has it already: to no log, to no screen
+        )
+
+    def _write(self, key: str, text: Text) -> str:
+        """Return the path of a new private file for ``key``."""
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix='files-', dir=self._directory)
+        self._files += 1
+        name = re.sub(r'[^A-Za-z0-9._-]', '_', os.path.basename(key)) or 'file'
+        path = os.path.join(self._folder.name, f'{self._files}-{name[-100:]}')
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        return path
+
+    def _stop(self, context: LaunchContext, node: Optional[Node]) -> None:
+        if node is not None and node.process is not None and not node.stopping:
+            node.stopping = True
+            context.emit_event_sync(ShutdownProcess(process_matcher=matches_action(node.process)))
+
+    def _signal(self, context: LaunchContext, node: Optional[Node], name: str) -> None:
+        if node is None or node.process is None:
+            return
+        if not node.running:
+            # launch takes a signal to a process that isn't there yet for an error of its own
+            if not node.seen:
+                node.waiting.append(name)
+            return
+        context.emit_event_sync(SignalProcess(
+            signal_number=signal.Signals[name], process_matcher=matches_action(node.process)))
+
+    def node_of(self, event: Event) -> Optional[Node]:
+        """Return the node whose process an event of launch's is about."""
+        return self._by_action.get(id(getattr(event, 'action', None)))
+
+    def started(self, context: LaunchContext, node: Node, event: ProcessStarted) -> None:
+        """Report a process."""
+        node.running = node.seen = True
+        self._report('started', node, pid=event.pid, cmd=list(event.cmd))
+        waiting, node.waiting = node.waiting, []
+        for name in waiting:
+            self._signal(context, node, name)
+
+    def output(self, node: Node, event: ProcessIO) -> None:
+        """Report what a process wrote."""
+        stream = 'stdout' if event.from_stdout else 'stderr'
+        self._output(node, stream, node.decoders[stream].decode(event.text))
+
+    def exited(self, context: LaunchContext, node: Node, event: ProcessExited) -> None:
+        """Report the end of a process, and whether launch starts it again."""
+        node.running = False
+        for stream, decoder in node.decoders.items():
+            self._output(node, stream, decoder.decode(b'', final=True))
+        respawns = (
+            node.respawn and not node.stopping and not context.is_shutdown
+            and node.retries_left != 0)
+        if respawns and node.retries_left > 0:
+            node.retries_left -= 1
+        self._report('exited', node, returncode=event.returncode, respawns=respawns)
+
+    def _executed(self, context: LaunchContext, node: Node) -> None:
+        """See to it that a process which launch fails to start is reported."""
+        future = node.process.get_asyncio_future() if node.process is not None else None
+        if future is None:
+            self._refuse(node, f'{node.name} came when the machine was shutting down')
+            return
+        # behind the ProcessStarted of one that ended at once
+        future.add_done_callback(lambda _: context.emit_event_sync(_Ended(node)))
+
+    def ended(self, node: Node) -> None:
+        """Report a process that never started."""
+        if not node.seen:
+            self._refuse(node, f'{node.name} could not be executed', 'see launch.log there')
+
+    def _output(self, node: Node, stream: str, text: str) -> None:
+        for begin in range(0, len(text), CHUNK):
+            self._report('output', node, stream=stream, text=text[begin:begin + CHUNK])
+
+    def _refuse(self, node: Node, error: str, hint: str = '') -> None:
+        self._report('refused', node, error=error, hint=hint)
+
+    def _report(self, event: str, node: Node, **data: Any) -> None:
+        line = json.dumps(
+            {'event': event, 'node': node.id, 'name': node.name, **data}, separators=(',', ':'))
+        try:
+            self._connection.sendall(line.encode() + b'\n')
+        except OSError:
+            pass  # the agent is gone; the end of file that comes next shuts down
+
+
+class _Ended(Event):
+    """Launch is through with a process."""
+
+    name = 'fogros2.Ended'
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+
+
+class _Watch(EventHandler):
+    """Takes launch's events about the agent's processes."""
+
+    def __init__(self, obey: ObeyAgent) -> None:
+        kinds = (ProcessStarted, ProcessIO, ProcessExited, Shutdown, _Ended)
+        super().__init__(matcher=lambda event: isinstance(event, kinds))
+        self._obey = obey
+
+    def handle(self, event: Event, context: LaunchContext) -> None:
+        super().handle(event, context)
+        if isinstance(event, Shutdown):
+            self._obey.finish()
+            return
+        if isinstance(event, _Ended):
+            self._obey.ended(event.node)
+            return
+        node = self._obey.node_of(event)
+        if node is None:
+            return
+        if isinstance(event, ProcessStarted):
+            self._obey.started(context, node, event)
+        elif isinstance(event, ProcessExited):
+            self._obey.exited(context, node, event)
+        elif isinstance(event, ProcessIO):
+            self._obey.output(node, event)
+
+
+def resolve(text: Text, files: Mapping[str, str]) -> str:
+    """
+    Return a Text with its markers replaced by this machine's paths.
+
+    :param files: path of each file that travelled.
+    :raises RefusedNode: a package isn't on this machine.
+    """
+    if isinstance(text, str):
+        return text
+    parts = []
+    for part in text:
+        if isinstance(part, str):
+            parts.append(part)
+        elif 'share' in part:
+            prefix_of(part['share'])
+            parts.append(get_package_share_directory(part['share']))
+        elif 'prefix' in part:
+            parts.append(prefix_of(part['prefix']))
+        elif part.get('file') in files:
+            parts.append(files[part['file']])
+        else:
+            raise RefusedNode(f'{json.dumps(part)} means nothing to this version of fogros2')
+    return ''.join(parts)
+
+
+def prefix_of(package: str) -> str:
+    """
+    Return the prefix that a package is installed in.
+
+    :raises RefusedNode: it isn't on this machine.
+    """
+    try:
+        return str(get_package_prefix(package))
+    except (PackageNotFoundError, ValueError) as error:
+        import difflib
+        near = difflib.get_close_matches(package, get_packages_with_prefixes(), n=1)
+        hint = f"did you mean '{near[0]}'?" if near else 'is its workspace the one that travels?'
+        raise RefusedNode(f"package '{package}' not found on the machine", hint) from error
+
+
+def find_executable(package: str, executable: str) -> str:
+    """
+    Return the path of a package's executable.
+
+    :raises RefusedNode: the package or the executable isn't on this machine.
+    """
+    folder = os.path.join(prefix_of(package), 'lib', package)
+    path = os.path.join(folder, executable)
+    if executable and os.path.isfile(path) and os.access(path, os.X_OK):
+        return path
+    names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
+    hint = f"it has: {', '.join(names[:20])}" if names else 'it has none there'
+    raise RefusedNode(
+        f"executable '{executable}' not found in package '{package}' on the machine", hint)
+
+
+def check_program(program: str, path: str, cwd: Optional[str]) -> None:
+    """
+    Look for a program as exec would.
+
+    :raises RefusedNode: there is none, or it isn't executable.
+    """
+    if '/' in program:
+        candidates = [os.path.join(cwd or os.getcwd(), program)]
+    else:
+        candidates = [os.path.join(folder or '.', program) for folder in path.split(':')]
+    if any(os.path.isfile(c) and os.access(c, os.X_OK) for c in candidates):
+        return
+    there = [c for c in candidates if os.path.exists(c)]
+    if there:
+        raise RefusedNode(f"'{there[0]}' isn't executable on the machine")
+    raise RefusedNode(f"'{program}' not found on the machine")
+
+
+def main() -> int:
+    """Run without ``ros2 launch`` around it; returns the exit status."""
+    from launch import LaunchService
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(generate_launch_description())
+    return int(service.run())
+
+
+if __name__ == '__main__':
+    sys.exit(main())
