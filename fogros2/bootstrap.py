@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pure: from what a machine has, the commands that make it ready for ROS 2 nodes.
+From what a machine has to a machine that is ready for ROS 2 nodes.
 
-One script asks the machine everything in one round trip (``probe``, ``parse_facts``), one
-function decides (``plan``), and what it returns is carried out in this order: ``tools``, the
-wheels into ``wheels_target`` where ``send_wheels`` says so, ``commands``. After that the nodes
-run as ``environment`` says.
+``host.probe`` asks the machine everything in one round trip; ``plan`` decides, pure; what it
+returns is carried out in this order: ``tools``, the wheels into ``wheels_target`` where
+``send_wheels`` says so, ``commands``. ``ensure`` does all three.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 import dataclasses
+import os
+from pathlib import Path
 import shlex
+import threading
 from typing import Literal, Optional
 
+from fogros2 import host, process
+from fogros2 import wheels as wheel_cache
+from fogros2 import workspace as workspaces
 from fogros2.errors import PrerequisiteError
-from fogros2.model import Bootstrap, Command
+from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python, RMW
+from fogros2.model import Bootstrap, Command, MachineSpec
+from fogros2.plan import PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.shell import Shell
 
-DISTRO = 'jazzy'
-RMW = 'rmw_cyclonedds_cpp'
 #: The system that ROS 2 Jazzy has packages for.
 APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
-#: Below the login user's home: one folder for each version of the embedded default.
+#: Below the login user's home: one folder for each version of what was sent.
 INSTALL_FOLDER = '.local/share/fogros2'
-MIN_PYTHON = (3, 10)
 #: Free bytes that the embedded default takes, and that ROS 2's packages take.
 EMBEDDED_BYTES, APT_BYTES = 300 << 20, 3 << 30
 
@@ -39,156 +45,34 @@ APT_PACKAGES = (
     'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
     'wireguard-tools', 'rsync', 'iproute2',
 )
-
-_PROBE = r"""
-PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
-ID=unknown VERSION_ID= VERSION_CODENAME=
-[ ! -r /etc/os-release ] || . /etc/os-release
-echo "os $ID ${VERSION_ID:--} ${VERSION_CODENAME:--}"
-echo "arch $(uname -m)"
-echo "user $(id -u) $(id -un)"
-echo "home $HOME"
-echo "libc $(getconf GNU_LIBC_VERSION 2>/dev/null || echo other 0)"
-if [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; then echo root; fi
-seen=
-for x in /usr/bin/python3 "$(command -v python3)" /usr/bin/python3.1[0-9] \
-        /usr/local/bin/python3.1[0-9]; do
-    [ -x "$x" ] || continue
-    r=$(readlink -f "$x")
-    case " $seen " in *" $r "*) continue ;; esac
-    seen="$seen $r"
-    "$x" -ISc 'import importlib.util as u, sys
-print("python", *sys.version_info[:2], int(u.find_spec("venv") is not None), sys.executable)'
-done
-for p in rsync ip wg wireguard-go nft apt-get colcon rosdep sudo; do
-    command -v $p >/dev/null && echo "program $p"
-done
-for s in /opt/ros/*/setup.sh; do
-    [ -r "$s" ] || continue
-    d=${s%/setup.sh}
-    echo "ros ${d##*/} $d"
-    for r in "$d"/share/ament_index/resource_index/rmw_typesupport/*; do
-        [ ! -e "$r" ] || echo "rmw ${d##*/} ${r##*/}"
-    done
-done
-[ ! -d /sys/module/wireguard ] && ! modprobe -nq wireguard 2>/dev/null || echo kernel-wireguard
-[ ! -c /dev/net/tun ] || echo tun
-df -Pk "$HOME" 2>/dev/null | while read -r _ _ _ free _; do echo "disk $free"; done | tail -n 1
-ip -4 route show 2>/dev/null | while read -r to _; do echo "route $to"; done
-for k in "$HOME"/.local/share/fogros2/*/complete; do
-    [ ! -e "$k" ] || { k=${k%/complete}; echo "installed ${k##*/}"; }
-done
-for e in "$@"; do
-    [ -x "$e/bin/ros2" ] && "$e/bin/python" -c 'import importlib.util as u, sys
-sys.exit(not (u.find_spec("fogros2") and u.find_spec("rclpy")))' 2>/dev/null || continue
-    s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD 2>/dev/null | cksum)
-    echo "environment ${s% *}-${s#* } $e"
-done
-exit 0
-"""
+#: Variables that list folders; those of the robot's hold only where the folder travels.
+_PATH_VARIABLES = (
+    'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'LD_LIBRARY_PATH',
+    'PYTHONPATH', 'PATH')
+#: What ROS's own setup script sets.
+_ROS_VARIABLES = ('ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION')
 
 
 @dataclasses.dataclass(frozen=True)
-class Python:
-    """
-    An interpreter on a machine.
-
-    :param venv: whether it can make virtual environments (without pip).
-    """
-
-    path: str
-    version: tuple[int, int]
-    venv: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class HostFacts:
-    """
-    What one round trip tells of a computer.
-
-    :param system: ``ID`` of os-release (ubuntu, debian, ...), ``release`` its ``VERSION_ID``.
-    :param architecture: as ``uname -m`` has it.
-    :param libc: such as ``glibc 2.36``.
-    :param root: commands can run as root: the login user is root, or sudo asks nothing.
-    :param ros: prefixes of ROS 2 by distro, ``rmw`` the middlewares each has.
-    :param free_bytes: on the home's disk; None where unknown.
-    :param routes: IPv4 networks the computer has routes to, in CIDR form or as addresses.
-    :param installed: keys of embedded defaults that earlier launches have left complete.
-    :param environments: of the Python environments asked for, those that are there and have
-        ROS in them, each with a signature of what is installed in it.
-    """
-
-    system: str = 'unknown'
-    release: str = ''
-    codename: str = ''
-    architecture: str = ''
-    uid: int = 0
-    user: str = 'root'
-    home: str = '/root'
-    libc: str = ''
-    root: bool = False
-    pythons: tuple[Python, ...] = ()
-    programs: frozenset[str] = frozenset()
-    ros: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    rmw: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    kernel_wireguard: bool = False
-    tun: bool = False
-    free_bytes: Optional[int] = None
-    routes: tuple[str, ...] = ()
-    installed: frozenset[str] = frozenset()
-    environments: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    @property
-    def python(self) -> Optional[Python]:
-        """The interpreter for the agent: the first that is new enough."""
-        return next((p for p in self.pythons if p.version >= MIN_PYTHON), None)
-
-    @property
-    def name(self) -> str:
-        """The system in words for messages."""
-        return f'{self.system} {self.release} {self.architecture}'
-
-
-@dataclasses.dataclass(frozen=True)
-class Wheels:
-    """
-    The embedded default as wheels on the robot; see ``fogros2.wheels``.
-
-    :param folder: where they are on the robot.
-    :param key: hash of their contents; names the folder on the machine.
-    :param python: version of the interpreter they are for, with ``architecture`` and ``libc``.
-    :param fogros2: file name of our own wheel, which any Python takes.
-    :param pip: file name of pip's.
-    :param embedded: whether the embedded default is among them (a robot with ROS 2 has none).
-    """
-
-    folder: str
-    key: str
-    python: tuple[int, int]
-    architecture: str
-    libc: str
-    fogros2: str
-    pip: str = ''
-    embedded: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Environment:
+class RosInstall:
     """
     How things with ROS run on a machine.
 
-    :param kind: ROS 2 itself or the embedded default.
-    :param python: interpreter that imports rclpy once ``setup`` is sourced.
-    :param ros2: first words of a ``ros2`` command line.
-    :param setup: scripts for sh to source, in order, after ``variables`` are set.
+    :param kind: ROS 2 itself, or the embedded default.
+    :param command: words that start our launch file there.
+    :param setup: scripts for sh to source, in order, after ``environment`` is set; the
+        workspace's is among them where it is needed.
+    :param facts: of the machine, ``robot`` those of the robot.
+    :param workspace: how the workspace gets there, None without one.
     """
 
     kind: Literal['ros', 'embedded']
-    prefix: str
-    python: str
-    ros2: tuple[str, ...]
+    command: tuple[str, ...]
     setup: tuple[str, ...] = ()
-    variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    facts: HostFacts = HostFacts()
+    robot: HostFacts = HostFacts()
+    workspace: Optional[workspaces.WorkspacePlan] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,124 +80,161 @@ class Preparation:
     """
     What has to happen on a machine, in this order: ``tools``, wheels, ``commands``.
 
-    :param mode: what was decided; 'none' where everything is there.
+    :param mode: what was decided; 'none' where ROS is there already.
     :param tools: install rsync and the VPN's programs, needed before anything can be sent.
     :param send_wheels: sync the wheels' folder to ``wheels_target`` before ``commands``.
     """
 
     mode: Literal['none', 'apt', 'embedded']
-    environment: Environment
+    install: RosInstall
     tools: tuple[Command, ...] = ()
     send_wheels: bool = False
     wheels_target: str = ''
     commands: tuple[Command, ...] = ()
 
     @property
-    def empty(self) -> bool:
-        """Whether nothing has to be done."""
-        return not (self.tools or self.send_wheels or self.commands)
+    def note(self) -> str:
+        """What is done, in a few words."""
+        if self.mode == 'none':
+            return 'there already' if not (self.tools or self.commands) else 'completed'
+        return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
 
 
-def probe(environments: Sequence[str] = ()) -> Command:
+def ensure(
+    shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
+    cancel: Optional[threading.Event] = None, wheel_folder: Optional[Path] = None,
+) -> tuple[RosInstall, str]:
     """
-    Return the command whose output ``parse_facts`` understands.
+    Make a machine ready for ROS 2 nodes, by what it has and by ``spec.bootstrap``.
 
-    :param environments: prefixes of Python environments to look for, the robot's own first.
+    :param under: the environment of the robot's launch.
+    :param timeout: seconds that each command may take.
+    :param wheel_folder: the robot's wheel cache, if not the usual one.
+    :returns: how things run there, and a few words on what was done.
+    :raises PrerequisiteError: the machine can't be made ready.
+    :raises WorkspaceError: the workspace can't go there, built or not.
     """
-    return Command(('sh', '-c', _PROBE, 'probe', *environments), what='look at the machine')
+    question = host.probe(under.prefixes)
+    with ThreadPoolExecutor(1, 'fog-probe') as pool:
+        here = pool.submit(process.run, question, timeout=timeout, cancel=cancel)
+        there = shell.run(question, timeout=timeout, cancel=cancel)
+        robot = host.parse_facts(here.result().stdout)
+    facts = host.parse_facts(there.stdout)
+    workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
+    todo = plan_alike(spec, facts, robot, under, workspace)
+    if todo is None:
+        wheels = wheel_cache.collect(wheel_folder)
+        todo = plan(spec, facts, robot, under, wheels, workspace)
+    for command in todo.tools:
+        shell.run(command, timeout=timeout, cancel=cancel)
+    if todo.send_wheels:
+        shell.run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'),
+                  timeout=timeout, cancel=cancel)
+        shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
+                   cancel=cancel)
+    for command in todo.commands:
+        shell.run(command, timeout=timeout, cancel=cancel)
+    return todo.install, todo.note
 
 
-def parse_facts(output: str) -> HostFacts:
-    """Return what the probe's output says; lines that others print in between are left out."""
-    one: dict[str, str] = {}
-    pythons: list[Python] = []
-    programs: set[str] = set()
-    ros: dict[str, str] = {}
-    rmw: dict[str, tuple[str, ...]] = {}
-    routes: list[str] = []
-    installed: set[str] = set()
-    environments: dict[str, str] = {}
-    for line in output.splitlines():
-        key, _, value = line.partition(' ')
-        words = value.split()
-        if key == 'python' and len(words) >= 4:
-            path = value.split(' ', 3)[3]
-            if path not in [p.path for p in pythons]:
-                pythons.append(Python(path, (int(words[0]), int(words[1])), words[2] == '1'))
-        elif key == 'program':
-            programs.add(value)
-        elif key == 'ros' and len(words) == 2:
-            ros[words[0]] = words[1]
-        elif key == 'rmw' and len(words) == 2:
-            rmw[words[0]] = (*rmw.get(words[0], ()), words[1])
-        elif key == 'route' and value != 'default':
-            routes.append(value)
-        elif key == 'installed':
-            installed.add(value)
-        elif key == 'environment' and len(words) >= 2:
-            environments[value.split(' ', 1)[1]] = words[0]
-        else:
-            one[key] = value
-    system, release, codename = (one.get('os', '').split() + ['-'] * 3)[:3]
-    uid, _, user = one.get('user', '0 root').partition(' ')
-    disk = one.get('disk', '')
-    return HostFacts(
-        system=system, release=release.replace('-', ''), codename=codename.replace('-', ''),
-        architecture=one.get('arch', ''), uid=int(uid), user=user,
-        home=one.get('home', '/root'), libc=one.get('libc', ''), root='root' in one,
-        pythons=tuple(pythons), programs=frozenset(programs), ros=ros, rmw=rmw,
-        kernel_wireguard='kernel-wireguard' in one, tun='tun' in one,
-        free_bytes=int(disk) * 1024 if disk.isdigit() else None, routes=tuple(routes),
-        installed=frozenset(installed), environments=environments)
+def plan_alike(
+    spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
+    workspace: Optional[workspaces.Workspace],
+) -> Optional[Preparation]:
+    """
+    Return the plan for a machine that has the robot's very environment, None for another one.
+
+    That is an image made from it, the robot itself, or a computer set up alike: each folder of
+    the underlay is there with the same packages in it.
+    """
+    same = all(
+        facts.environments.get(prefix, '?') == robot.environments.get(prefix)
+        for prefix in under.prefixes)
+    if not same or not facts.cloud_launch or spec.bootstrap == 'apt':
+        return None
+    install = RosInstall(
+        'ros' if robot.has_ros else 'embedded', (under.ros2, 'launch', facts.cloud_launch),
+        environment=under.environment, facts=facts, robot=robot)
+    return Preparation('none', _with_workspace(install, workspace, spec.name),
+                       _tools(facts, spec.bootstrap, spec.name))
 
 
 def plan(
-    mode: Bootstrap, facts: HostFacts, wheels: Optional[Wheels], *, machine: str,
-    robot: HostFacts, python_only: bool,
+    spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
+    wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
 ) -> Preparation:
     """
-    Decide how a machine gets what its nodes need.
+    Decide how a machine that isn't like the robot gets what its nodes need.
 
-    :param mode: as the launch file has it; 'auto' takes what is there, else the embedded default
-        where the nodes are Python alone, else ROS 2's packages.
     :param wheels: what the robot can send.
-    :param machine: the machine's name, for messages.
-    :param robot: facts of the robot, by the same probe.
-    :param python_only: nothing in the workspace is compiled.
-    :raises PrerequisiteError: the machine can't be made ready in that mode.
+    :raises PrerequisiteError: the machine can't be made ready in ``spec.bootstrap``'s way.
+    :raises WorkspaceError: the workspace can't go there.
     """
+    mode, machine = spec.bootstrap, f"machine '{spec.name}' ({facts.name})"
     if facts.python is None:
-        raise PrerequisiteError(
-            f"machine '{machine}' ({facts.name}) has no Python 3.10 or newer",
-            'install python3 there')
-    tools = _tools(facts, mode, machine)
-    if mode in ('auto', 'none', 'embedded'):
-        there = _there(facts, robot, wheels, embedded_only=mode == 'embedded')
-        if there is not None:
-            return _with_fogros2(there, tools, facts, wheels, machine)
-    no_embedded = _why_not_embedded(facts, wheels, python_only=python_only or mode != 'auto')
+        raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
+                                'install python3 there')
+    tools = _tools(facts, mode, spec.name)
+    python_only = workspace is None or workspace.python_only or mode == 'embedded'
+    no_embedded = _why_not_embedded(facts, wheels, python_only)
     no_apt = _why_not_apt(facts)
-    if mode == 'none':
-        raise PrerequisiteError(
-            f"machine '{machine}' ({facts.name}) has no ROS 2 {DISTRO} with {RMW}",
-            "bootstrap='auto' would install what is missing")
-    if mode == 'embedded' or (mode == 'auto' and not no_embedded):
-        if no_embedded:
-            raise PrerequisiteError(
-                f"machine '{machine}' ({facts.name}) can't take the embedded default: "
-                f'{no_embedded}')
-        assert wheels is not None
-        return _embedded(facts, wheels, tools)
-    if no_apt and not _has_ros(facts):
+    if facts.has_ros and (
+            mode in ('auto', 'none')
+            or mode == 'apt' and {'colcon', 'rosdep'} <= facts.programs):
+        todo = _ros(facts, wheels)
+    elif mode != 'apt' and wheels.embedded and wheels.key in facts.installed:
+        todo = Preparation('none', _embedded_install(facts, wheels))
+    elif mode == 'none':
+        raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {RMW}',
+                                "bootstrap='auto' would install what is missing")
+    elif mode != 'apt' and not no_embedded:
+        todo = _embedded(facts, wheels)
+    elif mode == 'embedded':
+        raise PrerequisiteError(f"{machine} can't take the embedded default: {no_embedded}")
+    elif not no_apt:
+        todo = _apt(facts, wheels)
+    else:
         reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
         raise PrerequisiteError(
-            f"machine '{machine}' ({facts.name}) can't be made ready for ROS 2: {reason}",
+            f"{machine} can't be made ready for ROS 2: {reason}",
             'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
-    return _apt(facts, wheels, tools, machine)
+    install = dataclasses.replace(
+        todo.install, facts=facts, robot=robot,
+        environment=_merged(todo.install, under, workspace))
+    return dataclasses.replace(
+        todo, tools=tools, install=_with_workspace(install, workspace, spec.name))
 
 
-def _has_ros(facts: HostFacts) -> bool:
-    return RMW in facts.rmw.get(DISTRO, ())
+def _with_workspace(
+    install: RosInstall, workspace: Optional[workspaces.Workspace], name: str,
+) -> RosInstall:
+    """Add how the workspace gets there; one that is built there brings its setup script."""
+    if workspace is None:
+        return install
+    way = workspaces.plan(
+        workspace, install.facts, install.robot, ros_setup=install.setup,
+        can_build=install.kind == 'ros', name=name)
+    setup = (*install.setup, way.setup) if way.commands else install.setup
+    return dataclasses.replace(install, workspace=way, setup=setup)
+
+
+def _merged(
+    install: RosInstall, under: Underlay, workspace: Optional[workspaces.Workspace],
+) -> dict[str, str]:
+    """Return the install's variables after the robot's: plain ones, the workspace's folders."""
+    merged = {name: under.environment[name] for name in PLAIN_VARIABLES
+              if name in under.environment and name not in _ROS_VARIABLES}
+    below = f'{workspace.root}/' if workspace is not None else None
+    for name in _PATH_VARIABLES:
+        entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
+                   if below and entry.startswith(below)]
+        own = install.environment.get(name)
+        entries += [own] if own else []
+        if entries:
+            merged[name] = os.pathsep.join(entries)
+    for name, value in install.environment.items():
+        merged.setdefault(name, value)
+    return merged
 
 
 def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ...]:
@@ -327,48 +248,13 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
         raise PrerequisiteError(
             f"machine '{machine}' lacks {', '.join(packages)}",
             f"on the machine: apt-get install {' '.join(packages)}")
-    return (_apt_install(packages, 'install the VPN and rsync'),)
-
-
-def _there(
-    facts: HostFacts, robot: HostFacts, wheels: Optional[Wheels], *, embedded_only: bool,
-) -> Optional[Environment]:
-    """Return the environment that the machine has already, if it has one."""
-    for prefix, signature in facts.environments.items():
-        if robot.environments.get(prefix) == signature:
-            return _python_environment(prefix)
-    if wheels is not None and wheels.embedded and wheels.key in facts.installed:
-        return _python_environment(f'{_folder(facts, wheels)}/venv')
-    if _has_ros(facts) and not embedded_only:
-        return _ros_environment(facts, wheels)
-    return None
-
-
-def _python_environment(prefix: str) -> Environment:
-    return Environment(
-        'embedded', prefix, f'{prefix}/bin/python', (f'{prefix}/bin/ros2',),
-        variables={'VIRTUAL_ENV': prefix})
-
-
-def _ros_environment(facts: HostFacts, wheels: Optional[Wheels]) -> Environment:
-    prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
-    variables = {}
-    if wheels is not None:
-        site = f'{_folder(facts, wheels)}/site'
-        variables = {'PYTHONPATH': site, 'AMENT_PREFIX_PATH': f'{site}/prefix'}
-    return Environment(
-        'ros', prefix, '/usr/bin/python3', (f'{prefix}/bin/ros2',), (f'{prefix}/setup.sh',),
-        variables)
-
-
-def _folder(facts: HostFacts, wheels: Wheels) -> str:
-    return f'{facts.home}/{INSTALL_FOLDER}/{wheels.key}'
+    return (_apt_install(packages, f"install {', '.join(packages)}"),)
 
 
 def _why_not_embedded(
-    facts: HostFacts, wheels: Optional[Wheels], *, python_only: bool,
+    facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool,
 ) -> str:
-    if wheels is None or not wheels.embedded:
+    if not wheels.embedded:
         return 'this robot runs ROS 2 itself and has no embedded default to send'
     if not python_only:
         return 'the workspace has compiled packages, which need ROS 2 itself'
@@ -390,7 +276,7 @@ def _why_not_apt(facts: HostFacts) -> str:
     return ''
 
 
-def _fits(facts: HostFacts, wheels: Wheels) -> Optional[Python]:
+def _fits(facts: HostFacts, wheels: wheel_cache.Wheels) -> Optional[Python]:
     """Return the interpreter that can take the robot's compiled wheels as they are, if any."""
     def libc(text: str) -> tuple[str, tuple[int, ...]]:
         kind, _, version = text.partition(' ')
@@ -403,47 +289,81 @@ def _fits(facts: HostFacts, wheels: Wheels) -> Optional[Python]:
     return next((p for p in facts.pythons if p.venv and p.version == wheels.python), None)
 
 
-def _embedded(facts: HostFacts, wheels: Wheels, tools: tuple[Command, ...]) -> Preparation:
+def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
+    return f'{facts.home}/{INSTALL_FOLDER}/{wheels.key}'
+
+
+def _embedded_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
+    return _fits(facts, wheels) or next(
+        p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
+
+
+def _embedded_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
+    prefix = f'{_folder(facts, wheels)}/venv'
+    version = '{}.{}'.format(*_embedded_python(facts, wheels).version)
+    program = f'{prefix}/lib/python{version}/site-packages/fogros2/cloud_launch.py'
+    return RosInstall('embedded', (f'{prefix}/bin/ros2', 'launch', program), environment={
+        'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
+        'VIRTUAL_ENV': prefix})
+
+
+def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return what makes a virtual environment from wheels that have travelled."""
     folder = _folder(facts, wheels)
-    fitting = _fits(facts, wheels)
-    python = fitting or next(
-        p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
     target = f'{folder}/wheels'
     # pip runs from its own wheel: the venv needs none, and python3-venv needn't be installed
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
              '--disable-pip-version-check', '--no-warn-script-location', '--find-links', target]
-    if fitting is not None:
-        words += ['--no-index', '--no-deps']
-        install = f'"$venv/bin/python" {shlex.join(words)} {shlex.quote(target)}/*.whl'
+    if _fits(facts, wheels) is not None:
+        install = (f'"$venv/bin/python" {shlex.join(words)} --no-index --no-deps '
+                   f'{shlex.quote(target)}/*.whl')
     else:
-        install = (f'"$venv/bin/python" {shlex.join(words)} ros2-embedded fogros2')
+        # compiled for another Python or processor: the machine asks its own package index
+        install = f'"$venv/bin/python" {shlex.join(words)} ros2-embedded fogros2'
     script = (
         f'venv={shlex.quote(folder)}/venv\n'
         f'rm -rf "$venv"\n'
-        f'{shlex.quote(python.path)} -m venv --without-pip "$venv"\n'
+        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip "$venv"\n'
         f'{install}\n'
         f': >{shlex.quote(folder)}/complete\n')
     return Preparation(
-        'embedded', _python_environment(f'{folder}/venv'), tools, send_wheels=True,
-        wheels_target=target,
+        'embedded', _embedded_install(facts, wheels), send_wheels=True, wheels_target=target,
         commands=(Command.script(script, what='install the embedded default'),))
 
 
-def _apt(
-    facts: HostFacts, wheels: Optional[Wheels], tools: tuple[Command, ...], machine: str,
-) -> Preparation:
-    """Return what installs ROS 2's packages where they are missing."""
-    commands: list[Command] = []
-    if not _has_ros(facts) or not {'colcon', 'rosdep'} <= facts.programs:
-        if DISTRO not in facts.ros:
-            commands.append(Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
-        commands.append(_apt_install(APT_PACKAGES, f'install ROS 2 {DISTRO}'))
-    ready = _with_fogros2(_ros_environment(facts, wheels), tools, facts, wheels, machine)
-    if not commands:
-        return ready
-    return dataclasses.replace(
-        ready, mode='apt', commands=(*commands, *ready.commands))
+def _ros(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+    """Return what adds this package to a ROS that is there; plain Python, so it is unpacked."""
+    prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
+    folder = _folder(facts, wheels)
+    install = RosInstall(
+        'ros', (f'{prefix}/bin/ros2', 'launch', f'{folder}/site/fogros2/cloud_launch.py'),
+        (f'{prefix}/setup.sh',),
+        {'PYTHONPATH': f'{folder}/site', 'AMENT_PREFIX_PATH': f'{folder}/site/prefix'})
+    if wheels.key in facts.installed:
+        return Preparation('none', install)
+    assert facts.python is not None
+    script = (
+        f'cd {shlex.quote(folder)}\n'
+        'rm -rf site\n'
+        f'{shlex.quote(facts.python.path)} -m zipfile -e '
+        f'wheels/{shlex.quote(wheels.fogros2)} site\n'
+        'mkdir -p site/prefix\n'
+        'for data in site/*.data/data; do [ ! -d "$data" ] || cp -R "$data/." site/prefix; done\n'
+        # zipfile leaves the modes behind
+        '[ ! -d site/prefix/lib ] || chmod -R u+x site/prefix/lib\n'
+        ': >complete\n')
+    return Preparation(
+        'none', install, send_wheels=True, wheels_target=f'{folder}/wheels',
+        commands=(Command.script(script, what='unpack fogros2'),))
+
+
+def _apt(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+    """Return what installs ROS 2's packages, then adds this one."""
+    ours = _ros(facts, wheels)
+    commands = [_apt_install(APT_PACKAGES, f'install ROS 2 {DISTRO}')]
+    if DISTRO not in facts.ros:
+        commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
+    return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))
 
 
 #: The way of ROS's own instructions: a package that brings the source list and its key.
@@ -469,32 +389,3 @@ def _apt_install(packages: Sequence[str], what: str) -> Command:
         'apt-get -q -o DPkg::Lock::Timeout=300 update\n'
         'apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends '
         f'{shlex.join(packages)}\n', sudo=True, what=what)
-
-
-def _with_fogros2(
-    environment: Environment, tools: tuple[Command, ...], facts: HostFacts,
-    wheels: Optional[Wheels], machine: str,
-) -> Preparation:
-    """Return what adds this package to a ROS that is there; it is plain Python and unpacked."""
-    if environment.kind == 'embedded':
-        return Preparation('none', environment, tools)
-    if wheels is None:
-        raise PrerequisiteError(
-            f"machine '{machine}' has ROS 2 and lacks the package fogros2",
-            'install the same fogros2 on the machine, or let it travel in the workspace')
-    folder = _folder(facts, wheels)
-    if wheels.key in facts.installed:
-        return Preparation('none', environment, tools)
-    assert facts.python is not None
-    script = (
-        f'cd {shlex.quote(folder)}\n'
-        'rm -rf site\n'
-        f'{shlex.quote(facts.python.path)} -m zipfile -e '
-        f'wheels/{shlex.quote(wheels.fogros2)} site\n'
-        # zipfile leaves the modes behind
-        'if [ -d site/*.data/data ]; then mv site/*.data/data site/prefix; '
-        'chmod -R u+x site/prefix/lib; fi\n'
-        ': >complete\n')
-    return Preparation(
-        'none', environment, tools, send_wheels=True, wheels_target=f'{folder}/wheels',
-        commands=(Command.script(script, what='unpack fogros2'),))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Iterator
+import dataclasses
 import hashlib
 from importlib import metadata
 import json
@@ -25,7 +26,6 @@ import urllib.parse
 import zipfile
 
 from fogros2 import process
-from fogros2.bootstrap import Wheels
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import Command
 
@@ -34,6 +34,29 @@ OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 _ROBOT_ONLY = frozenset({'paramiko', 'setuptools'})
 #: A wheel's fixed date: the same files always give the same wheel.
 _DATE = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Wheels:
+    """
+    What this interpreter has of FogROS2, as wheels on the robot.
+
+    :param folder: where they are on the robot.
+    :param key: hash of their contents; names the folder on the machine.
+    :param python: version of the interpreter they are for, with ``architecture`` and ``libc``.
+    :param fogros2: file name of our own wheel, which any Python takes.
+    :param pip: file name of pip's.
+    :param embedded: whether the embedded default is among them (a robot with ROS 2 has none).
+    """
+
+    folder: str
+    key: str
+    python: tuple[int, int]
+    architecture: str
+    libc: str
+    fogros2: str
+    pip: str = ''
+    embedded: bool = True
 
 
 def cache_folder() -> Path:

@@ -1,25 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pure: what of a colcon workspace travels, and how it is built where it can't travel built.
+What of a colcon workspace travels, and how it is built where it can't travel built.
 
-Reads folders, changes none. ``read`` looks at the workspace, ``plan`` decides, and the Shell's
-``sync`` takes what it decided: the install space as it is where the machine is like the robot,
-else the sources, then ``commands`` on the machine.
+``inspect`` looks at the workspace, ``plan`` decides, pure, and ``transfer`` does what it decided:
+the install space as it is where the machine is like the robot, else the sources and the commands
+that build them there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 import os
 from pathlib import Path
 import shlex
-from typing import Optional
+import threading
+from typing import Optional, Protocol
 import xml.etree.ElementTree as ElementTree
 
-from fogros2.bootstrap import DISTRO, Environment, HostFacts
 from fogros2.errors import WorkspaceError
+from fogros2.host import DISTRO, HostFacts
 from fogros2.model import Command
+from fogros2.shell import Shell
+from fogros2.waiting import Timeouts
 
 #: rsync patterns of what no machine needs, wherever it is in a workspace.
 EXCLUDES = ('.git', '.hg', '.svn', '__pycache__', '*.pyc', '.venv', '.cache', '.mypy_cache',
@@ -92,7 +95,7 @@ class WorkspacePlan:
     reason: str = ''
 
 
-def read(path: str | os.PathLike[str]) -> Workspace:
+def inspect(path: str | os.PathLike[str]) -> Workspace:
     """
     Look at a workspace; 10,000 files take about a tenth of a second.
 
@@ -115,13 +118,14 @@ def read(path: str | os.PathLike[str]) -> Workspace:
 
 
 def plan(
-    workspace: Workspace, machine: HostFacts, robot: HostFacts, environment: Environment, *,
-    name: str,
+    workspace: Workspace, machine: HostFacts, robot: HostFacts, *, ros_setup: Sequence[str],
+    can_build: bool, name: str,
 ) -> WorkspacePlan:
     """
     Decide what travels to a machine, and what is built there.
 
-    :param environment: how things with ROS run on the machine.
+    :param ros_setup: scripts to source on the machine before anything of ROS runs.
+    :param can_build: whether the machine will have colcon and rosdep.
     :param name: the machine's name, for messages.
     :raises WorkspaceError: it has to be built there, and can't be.
     """
@@ -142,13 +146,61 @@ def plan(
         raise WorkspaceError(
             f"{root} can't go to machine '{name}' as it is ({reason}), and has no src/ to build",
             'keep the sources in the workspace, or use a machine like this one')
-    if environment.kind != 'ros':
+    if not can_build:
         raise WorkspaceError(
             f"{root} would have to be built on machine '{name}' ({reason}), which has no colcon",
             'run colcon build here first')
     return WorkspacePlan(
         root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)),
-        tuple(_build(workspace, environment)), setup, reason)
+        tuple(_build(workspace, ros_setup)), setup, reason)
+
+
+class Destination(Protocol):
+    """What is known of the machine: how the workspace gets there."""
+
+    @property
+    def workspace(self) -> Optional[WorkspacePlan]:
+        """The plan, None where no workspace travels."""
+
+
+def transfer(
+    shell: Shell, path: Path, destination: Destination, *, timeouts: Timeouts,
+    cancel: Optional[threading.Event] = None,
+    on_progress: Optional[Callable[[int, int], None]] = None,
+    on_output: Optional[Callable[[str], None]] = None,
+) -> str:
+    """
+    Take a workspace to a machine, the same path there, and build it where it has to be.
+
+    :param path: the workspace, as ``destination.workspace`` was planned for.
+    :param on_progress: gets bytes sent and bytes in all.
+    :param on_output: gets each line that the build prints.
+    :returns: a few words on what was done.
+    """
+    way = destination.workspace
+    if way is None or way.source != Path(os.path.abspath(path.expanduser())):
+        raise WorkspaceError(f'{path} is not the workspace that was planned for')
+    target = shlex.quote(way.target)
+    # the login user may not write to where the robot's user has their workspace
+    shell.run(Command.script(
+        f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
+        f'{{ sudo -n mkdir -p {target} && sudo -n chown "$(id -u):$(id -g)" {target}; }}',
+        what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
+    report = shell.sync(
+        way.source, way.target, includes=way.includes, excludes=way.excludes,
+        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
+    for command in way.commands:
+        shell.run(command, timeout=timeouts.build, cancel=cancel, on_output=on_output)
+    sent = f'{report.files} files, {_size(report.bytes)}'
+    return f'{sent}, built there: {way.reason}' if way.commands else sent
+
+
+def _size(number: float) -> str:
+    for unit in ('B', 'kB', 'MB'):
+        if number < 1000:
+            return f'{number:.3g} {unit}'
+        number /= 1000
+    return f'{number:.3g} GB'
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
@@ -169,11 +221,11 @@ def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> st
     return ''
 
 
-def _build(workspace: Workspace, environment: Environment) -> Iterator[Command]:
+def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Iterator[Command]:
     """Yield rosdep's and colcon's commands, to be run on the machine as the login user."""
     root = shlex.quote(str(workspace.root))
     below = 'src' if (workspace.root / 'src').is_dir() else '.'
-    source = ''.join(f'. {shlex.quote(script)}\n' for script in environment.setup)
+    source = ''.join(f'. {shlex.quote(script)}\n' for script in ros_setup)
     yield Command.script(
         '[ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || sudo -n rosdep init\n'
         f'rosdep update --rosdistro {DISTRO}\n'

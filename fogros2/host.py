@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one round trip tells of a computer: a script that asks, a dataclass that holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import dataclasses
+from typing import Optional
+
+from fogros2.model import Command
+
+DISTRO = 'jazzy'
+RMW = 'rmw_cyclonedds_cpp'
+MIN_PYTHON = (3, 10)
+
+_PROBE = r"""
+PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+ID=unknown VERSION_ID= VERSION_CODENAME=
+[ ! -r /etc/os-release ] || . /etc/os-release
+echo "os $ID ${VERSION_ID:--} ${VERSION_CODENAME:--}"
+echo "arch $(uname -m)"
+echo "user $(id -u) $(id -un)"
+echo "home $HOME"
+echo "libc $(getconf GNU_LIBC_VERSION 2>/dev/null || echo other 0)"
+if [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; then echo root; fi
+seen=
+for x in /usr/bin/python3 "$(command -v python3)" /usr/bin/python3.1[0-9] \
+        /usr/local/bin/python3.1[0-9]; do
+    [ -x "$x" ] || continue
+    r=$(readlink -f "$x")
+    case " $seen " in *" $r "*) continue ;; esac
+    seen="$seen $r"
+    "$x" -ISc 'import importlib.util as u, sys
+print("python", *sys.version_info[:2], int(u.find_spec("venv") is not None), sys.executable)'
+done
+for p in rsync ip wg wireguard-go nft apt-get colcon rosdep sudo; do
+    command -v $p >/dev/null && echo "program $p"
+done
+for s in /opt/ros/*/setup.sh; do
+    [ -r "$s" ] || continue
+    d=${s%/setup.sh}
+    echo "ros ${d##*/} $d"
+    for r in "$d"/share/ament_index/resource_index/rmw_typesupport/*; do
+        [ ! -e "$r" ] || echo "rmw ${d##*/} ${r##*/}"
+    done
+done
+[ ! -d /sys/module/wireguard ] && ! modprobe -nq wireguard 2>/dev/null || echo kernel-wireguard
+[ ! -c /dev/net/tun ] || echo tun
+df -Pk "$HOME" 2>/dev/null | while read -r _ _ _ free _; do echo "disk $free"; done | tail -n 1
+ip -4 route show 2>/dev/null | while read -r to _; do echo "route $to"; done
+for k in "$HOME"/.local/share/fogros2/*/complete; do
+    [ ! -e "$k" ] || { k=${k%/complete}; echo "installed ${k##*/}"; }
+done
+for e in "$@"; do
+    [ -d "$e" ] || continue
+    if [ -e "$e/pyvenv.cfg" ]; then
+        w=$("$e/bin/python" -c 'import importlib.util as u
+print(*u.find_spec("fogros2").submodule_search_locations)' 2>/dev/null) || continue
+        [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+    fi
+    s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD "$e"/share/*/package.xml \
+        2>/dev/null | cksum)
+    echo "environment ${s% *}-${s#* } $e"
+done
+exit 0
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Python:
+    """
+    An interpreter on a machine.
+
+    :param venv: whether it can make virtual environments (without pip).
+    """
+
+    path: str
+    version: tuple[int, int]
+    venv: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class HostFacts:
+    """
+    What one round trip tells of a computer.
+
+    :param system: ``ID`` of os-release (ubuntu, debian, ...), ``release`` its ``VERSION_ID``.
+    :param architecture: as ``uname -m`` has it.
+    :param libc: such as ``glibc 2.36``.
+    :param root: commands can run as root: the login user is root, or sudo asks nothing.
+    :param ros: prefixes of ROS 2 by distro, ``rmw`` the middlewares each has.
+    :param free_bytes: on the home's disk; None where unknown.
+    :param routes: IPv4 networks the computer has routes to, in CIDR form or as addresses.
+    :param installed: keys of embedded defaults that earlier launches have left complete.
+    :param environments: of the prefixes asked for, those that are there and work, each with a
+        signature of the packages in it.
+    :param cloud_launch: path of our launch file in one of them, '' where it isn't.
+    """
+
+    system: str = 'unknown'
+    release: str = ''
+    codename: str = ''
+    architecture: str = ''
+    uid: int = 0
+    user: str = 'root'
+    home: str = '/root'
+    libc: str = ''
+    root: bool = False
+    pythons: tuple[Python, ...] = ()
+    programs: frozenset[str] = frozenset()
+    ros: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    rmw: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    kernel_wireguard: bool = False
+    tun: bool = False
+    free_bytes: Optional[int] = None
+    routes: tuple[str, ...] = ()
+    installed: frozenset[str] = frozenset()
+    environments: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    cloud_launch: str = ''
+
+    @property
+    def python(self) -> Optional[Python]:
+        """The interpreter for the agent: the first that is new enough."""
+        return next((p for p in self.pythons if p.version >= MIN_PYTHON), None)
+
+    @property
+    def has_ros(self) -> bool:
+        """Whether ROS 2 itself is there, with the middleware that we lead over the VPN."""
+        return RMW in self.rmw.get(DISTRO, ())
+
+    @property
+    def name(self) -> str:
+        """The system in words for messages."""
+        return f'{self.system} {self.release} {self.architecture}'
+
+
+def probe(environments: Sequence[str] = ()) -> Command:
+    """
+    Return the command whose output ``parse_facts`` understands.
+
+    :param environments: prefixes to look for: virtual environments, ROS 2's, overlays.
+    """
+    return Command(('sh', '-c', _PROBE, 'probe', *environments), what='look at the machine')
+
+
+def parse_facts(output: str) -> HostFacts:
+    """Return what the probe's output says; lines that others print in between are left out."""
+    one: dict[str, str] = {}
+    pythons: list[Python] = []
+    programs: set[str] = set()
+    ros: dict[str, str] = {}
+    rmw: dict[str, tuple[str, ...]] = {}
+    routes: list[str] = []
+    installed: set[str] = set()
+    environments: dict[str, str] = {}
+    for line in output.splitlines():
+        key, _, value = line.partition(' ')
+        words = value.split()
+        if key == 'python' and len(words) >= 4:
+            path = value.split(' ', 3)[3]
+            if path not in [p.path for p in pythons]:
+                pythons.append(Python(path, (int(words[0]), int(words[1])), words[2] == '1'))
+        elif key == 'program':
+            programs.add(value)
+        elif key == 'ros' and len(words) == 2:
+            ros[words[0]] = words[1]
+        elif key == 'rmw' and len(words) == 2:
+            rmw[words[0]] = (*rmw.get(words[0], ()), words[1])
+        elif key == 'route' and value != 'default':
+            routes.append(value)
+        elif key == 'installed':
+            installed.add(value)
+        elif key == 'environment' and len(words) >= 2:
+            environments[value.split(' ', 1)[1]] = words[0]
+        else:
+            one[key] = value
+    system, release, codename = (one.get('os', '').split() + ['-'] * 3)[:3]
+    uid, _, user = one.get('user', '0 root').partition(' ')
+    disk = one.get('disk', '')
+    return HostFacts(
+        system=system, release=release.replace('-', ''), codename=codename.replace('-', ''),
+        architecture=one.get('arch', ''), uid=int(uid), user=user,
+        home=one.get('home', '/root'), libc=one.get('libc', ''), root='root' in one,
+        pythons=tuple(pythons), programs=frozenset(programs), ros=ros, rmw=rmw,
+        kernel_wireguard='kernel-wireguard' in one, tun='tun' in one,
+        free_bytes=int(disk) * 1024 if disk.isdigit() else None, routes=tuple(routes),
+        installed=frozenset(installed), environments=environments,
+        cloud_launch=one.get('cloud_launch', ''))
