@@ -26,6 +26,8 @@ import pytest
 pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
 
 ME = pwd.getpwuid(os.getuid()).pw_name
+#: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.
+ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
 LAUNCH = [sys.executable, str(cloud_launch_source())]
 
 
@@ -101,7 +103,9 @@ class Rig:
     def config(self, **more: Any) -> Path:
         config = {
             'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory),
-            'user': ME, 'ros_command': LAUNCH, 'environment': {'ROS_LOG_DIR': str(self.folder)},
+            'user': ME, 'ros_command': LAUNCH, 'environment': {
+                'ROS_LOG_DIR': str(self.folder),
+                **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}},
             **more}
         path = self.folder / 'config.json'
         path.write_text(json.dumps(config))
