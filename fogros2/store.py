@@ -245,10 +245,10 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     """Return the Record that ``model.to_json`` wrote; unknown keys of a later version are left."""
     known = {f.name for f in dataclasses.fields(Record)}
     values = {key: value for key, value in data.items() if key in known}
-    spec = {f.name for f in dataclasses.fields(MachineSpec)}
-    values['spec'] = MachineSpec(**{
-        key: tuple(value) if key == 'containers' else value
-        for key, value in values['spec'].items() if key in spec})
+    fields = {f.name for f in dataclasses.fields(MachineSpec)}
+    spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
+    spec['containers'] = tuple(spec.get('containers', ()))
+    values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
             values[key] = kind(**values[key])

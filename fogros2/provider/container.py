@@ -180,6 +180,8 @@ class ContainerProvider(Provider):
     """Containers of podman or docker on this computer."""
 
     name: ClassVar[str] = 'container'
+    agent_directory: ClassVar[str] = '/run/fogros2'
+    agent_program: ClassVar[str] = f'/{container_entry.FOLDER}/agent.py'
 
     def __init__(self) -> None:
         self._host_keys: dict[str, str] = {}

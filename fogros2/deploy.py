@@ -1,0 +1,814 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one orchestrator: from machine specs to machines that run nodes, and back to nothing.
+
+A :class:`Launch` is the robot's side of one launch: its VPN interface and its DDS configuration.
+:meth:`Launch.up` takes one machine through the steps of the paper; several run in parallel, each
+in a thread of its caller. Every undo is pushed before its step runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+import secrets
+import shutil
+import threading
+import time
+from typing import Any, Optional
+import uuid
+
+from fogros2 import bootstrap, model, plan, plugin_system, process, workspace
+from fogros2 import shell as shells
+from fogros2.agent_client import agent_source, AgentClient, Heartbeat
+from fogros2.dds import DdsVendor
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    ConnectError,
+    FogError,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    ProviderError,
+    Unsupported,
+    VpnError,
+)
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Machine,
+    MachineSpec,
+    MachineState,
+    NodeSpec,
+    Peer,
+    VpnInterface,
+)
+from fogros2.provider import (
+    Provider,
+    TAG_EXPIRES,
+    TAG_LAUNCH,
+    TAG_NAME,
+    TAG_ON_EXIT,
+    TAG_ROBOT,
+)
+from fogros2.report import Progress, Reporter, silent, step, StepFailed
+from fogros2.shell import Shell
+from fogros2.store import (
+    check_name,
+    MachineDirectory,
+    process_start,
+    Record,
+    robot_name,
+    Store,
+    write_private,
+)
+from fogros2.vpn import addresses, Vpn
+from fogros2.waiting import Timeouts, wait_until
+
+#: Programs that the robot's side calls, and the Debian packages that have them.
+ROBOT_PROGRAMS = {
+    'ip': 'iproute2', 'wg': 'wireguard-tools', 'nft': 'nftables', 'rsync': 'rsync',
+    'ssh-keygen': 'openssh-client',
+}
+AGENT_FOLDER = '/run/fogros2'
+
+
+class Launch:
+    """
+    The robot's side of one launch; thread-safe.
+
+    :param report: gets each step as it begins and ends.
+    :param cancel: set to make every wait of the deployment end with Cancelled.
+    :param environment: the environment that the launch was started in.
+    """
+
+    def __init__(
+        self, *, store: Optional[Store] = None, report: Reporter = silent,
+        timeouts: Optional[Timeouts] = None, environment: Optional[Mapping[str, str]] = None,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        self.id = secrets.token_hex(3)
+        self.store = store or Store()
+        self.report = report
+        self.timeouts = timeouts or Timeouts()
+        self.cancel = cancel or threading.Event()
+        self.user_environment = dict(os.environ if environment is None else environment)
+        self._lock = threading.RLock()
+        self._undo = contextlib.ExitStack()
+        self._failures: list[FogError] = []
+        self._indices: dict[str, int] = {}
+        self._ups: dict[str, Future[RunningMachine]] = {}
+        self._robot: Optional[RobotVpn] = None
+        self._rmw = ''
+        self._closed = False
+
+    # -- before anything is created -------------------------------------------------------------
+
+    def prepare(
+        self, specs: Sequence[MachineSpec],
+        programs: Mapping[str, Sequence[tuple[str, str]]] = {},
+    ) -> None:
+        """
+        Check everything that can be checked at no cost.
+
+        :param programs: per machine name the (package, executable) pairs that will run there.
+        :raises FogError: the first thing that is wrong, with its remedy.
+        """
+        self.dds()
+        process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
+        if os.geteuid() != 0:
+            check_sudo()
+        if not Path('/dev/net/tun').exists():
+            raise PrerequisiteError('/dev/net/tun is missing on this computer',
+                                    'sudo modprobe tun')
+        names = [spec.name for spec in specs]
+        for name in names:
+            check_name(name)
+            if names.count(name) > 1:
+                raise ConfigurationError(f"two machines of this launch are called '{name}'",
+                                         'give each a name= of its own')
+        prefixes = plan.ament_prefixes(self.user_environment)
+        for spec in specs:
+            provider(spec.provider).check(spec)
+            if spec.workspace is not None:
+                workspace.inspect(Path(spec.workspace))
+            for package, executable in programs.get(spec.name, ()):
+                if not spec.options.get('image'):
+                    plan.check_program(package, executable, prefixes)
+
+    def dds(self) -> DdsVendor:
+        """
+        Return the DDS vendor of the launch.
+
+        :raises DdsError: the user's RMW_IMPLEMENTATION is one without a plugin.
+        """
+        if not self._rmw:
+            self._rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
+        vendor: DdsVendor = plugin_system.load('fogros2.dds', self._rmw)()
+        return vendor
+
+    def underlay(self, workspace_root: Optional[str]) -> plan.Underlay:
+        """
+        Return the robot's own ROS 2 as paths.
+
+        :raises PrerequisiteError: there is none.
+        """
+        ros2 = shutil.which('ros2', path=self.user_environment.get('PATH'))
+        if ros2 is None:
+            raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
+        return plan.underlay(self.user_environment, workspace_root, ros2)
+
+    def robot_environment(self) -> dict[str, str]:
+        """
+        Return the variables that the robot's nodes need; valid before the VPN is there.
+
+        Peers are the machines known so far; those that come later find the robot by themselves.
+        """
+        with self._lock:
+            interface = self._robot_vpn().interface
+            vendor = self.dds()
+            path = self.store.launch(self.id) / 'dds.xml'
+            peers = [self._machine_address(name) for name in self._indices]
+            write_private(path, vendor.render(
+                plan.robot_dds_interfaces(interface.name), peers).encode())
+            return dict(vendor.environment(str(path), self.user_environment))
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Give machines their addresses ahead, so that nodes started meanwhile know them."""
+        with self._lock:
+            for name in names:
+                self._indices.setdefault(name, len(self._indices))
+
+    def _machine_address(self, name: str) -> str:
+        network = self._robot_vpn().interface.network
+        return plan.machine_interface('', network, self._indices[name], 0, '').address
+
+    # -- up -------------------------------------------------------------------------------------
+
+    def up(self, spec: MachineSpec) -> RunningMachine:
+        """
+        Bring a machine up and return it; a second call for the same name joins the first.
+
+        Blocks for as long as it takes: call it in a thread.
+
+        :raises FogError: what failed; nothing of the machine is left then.
+        :raises Cancelled: the launch is ending.
+        """
+        with self._lock:
+            if self._closed or self.cancel.is_set():
+                raise Cancelled(f"machine '{spec.name}'")
+            known = self._ups.get(spec.name)
+            if known is None:
+                self.expect([spec.name])
+                mine: Future[RunningMachine] = Future()
+                self._ups[spec.name] = mine
+        if known is not None:
+            return known.result()
+        try:
+            machine = _Deployment(self, spec).run()
+        except BaseException as error:
+            mine.set_exception(error)
+            raise
+        mine.set_result(machine)
+        return machine
+
+    def _robot_vpn(self) -> RobotVpn:
+        """Return the robot's VPN, chosen but not necessarily up."""
+        with self._lock:
+            if self._robot is None:
+                folder = self.store.launch(self.id)
+                self._undo.callback(shutil.rmtree, folder, ignore_errors=True)
+                self._robot = RobotVpn(self, folder)
+            return self._robot
+
+    def machines(self) -> list[RunningMachine]:
+        """Return the machines that are up now."""
+        return [up.result() for up in list(self._ups.values())
+                if up.done() and up.exception() is None]
+
+    # -- down -----------------------------------------------------------------------------------
+
+    def down(self) -> list[FogError]:
+        """
+        End everything, each machine by its ``on_exit``, the VPN's interface last; idempotent.
+
+        Call it when the robot's nodes have exited: they must not lose the interface while they
+        run. Returns the undo steps that failed; the others ran all the same.
+        """
+        with self._lock:
+            self._closed = True
+        self.cancel.set()
+        ups = list(self._ups.values())
+        ended: list[Future[None]] = []
+        with ThreadPoolExecutor(max(1, len(ups)), 'fog-down') as pool:
+            for up in ups:
+                # one that still comes up sees the cancel and takes itself away
+                if up.exception() is None:
+                    ended.append(pool.submit(up.result().close))
+        with self._lock:
+            self._ups.clear()
+            for future in ended:
+                self._note(future.exception())
+            self._undo.close()
+            failures, self._failures = self._failures, []
+        return failures
+
+    def _note(self, error: Optional[BaseException]) -> None:
+        if isinstance(error, FogError):
+            self._failures.append(error)
+        elif error is not None:
+            raise error
+
+    def attempt(self, machine: str, name: str, undo: Callable[[], None]) -> None:
+        """Run an undo step; if it fails, report and remember it, so that the others still run."""
+        begin = time.monotonic()
+        try:
+            undo()
+        except FogError as error:
+            self.report(StepFailed(machine, name, time.monotonic() - begin, str(error)))
+            with self._lock:
+                self._failures.append(error)
+
+    def robot(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
+        """Run commands on the robot, one after the other; return what the last one printed."""
+        output = ''
+        for command in commands:
+            output = process.run(command, timeout=self.timeouts.vpn,
+                                 cancel=self.cancel if cancel else None).stdout
+        return output
+
+
+class RobotVpn:
+    """The robot's VPN interface: one per launch, with every machine of it as a peer."""
+
+    def __init__(self, launch: Launch, folder: Path) -> None:
+        self._launch = launch
+        self._lock = threading.Lock()
+        self._up = False
+        self._peers: dict[str, Peer] = {}
+        self._public_key = ''
+        self._stop = threading.Event()
+        self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
+            domain=int(launch.user_environment.get('ROS_DOMAIN_ID') or 0))
+        used = addresses.parse_used(launch.robot([addresses.used_networks()]))
+        network = addresses.choose_subnet(
+            used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))
+        self.interface = plan.robot_interface(
+            launch.id, network, addresses.choose_port(), str(folder / 'vpn.key'))
+
+    def ensure(self) -> Peer:
+        """Bring the interface up if it isn't; return the robot as the machines' peer."""
+        with self._lock:
+            if not self._up:
+                launch = self._launch
+                with step(launch.report, '', 'VPN interface') as detail:
+                    launch._undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
+                    self._public_key = launch.robot([self.vpn.keys(self.interface)]).strip()
+                    launch.robot(self.vpn.up(self.interface, []))
+                    detail.append(f'{self.interface.name} {self.interface.address}')
+                self._up = True
+                threading.Thread(target=self._keep, name='fog-vpn', daemon=True).start()
+            return Peer('robot', self._public_key, self.interface.address)
+
+    def add(self, peer: Peer) -> dict[str, Peer]:
+        """Add a machine; return all machines."""
+        with self._lock:
+            self._peers[peer.name] = peer
+            self._launch.robot(self.vpn.peers(self.interface, self._sorted()))
+            return dict(self._peers)
+
+    def remove(self, name: str) -> None:
+        """Take a machine out."""
+        with self._lock:
+            if self._peers.pop(name, None) is not None and self._up:
+                self._launch.robot(
+                    self.vpn.peers(self.interface, self._sorted()), cancel=False)
+
+    def peers(self) -> dict[str, Peer]:
+        """Return the machines that are peers now."""
+        with self._lock:
+            return dict(self._peers)
+
+    def _sorted(self) -> list[Peer]:
+        return [self._peers[name] for name in sorted(self._peers)]
+
+    def _keep(self) -> None:
+        """Get the interface's program going again when it died; nodes don't notice."""
+        while not self._stop.wait(1.0):
+            with self._lock:
+                if self._stop.is_set():
+                    return
+                alive = process.run(self.vpn.alive(self.interface), check=False,
+                                    timeout=self._launch.timeouts.vpn)
+                if alive.returncode == 0:
+                    continue
+                try:
+                    with step(self._launch.report, '', 'VPN repair'):
+                        self._launch.robot(
+                            self.vpn.repair(self.interface, self._sorted()), cancel=False)
+                except FogError:
+                    pass  # reported by the step; the next round tries again
+
+    def _take_down(self) -> None:
+        self._stop.set()
+        with self._lock:
+            self._up = False
+            self._launch.robot(self.vpn.down(self.interface), cancel=False)
+
+
+class RunningMachine:
+    """A machine of the launch that is up, and the nodes on it."""
+
+    def __init__(
+        self, launch: Launch, spec: MachineSpec, machine: Machine, shell: Shell,
+        agent: AgentClient, heartbeat: Heartbeat, interface: VpnInterface,
+        undo: contextlib.ExitStack,
+    ) -> None:
+        self.spec = spec
+        self.machine = machine
+        self.shell = shell
+        self.agent = agent
+        self.heartbeat = heartbeat
+        self.vpn_address = interface.address
+        self.interface = interface
+        self._launch = launch
+        self._undo = undo
+
+    def start(self, nodes: Sequence[NodeSpec]) -> None:
+        """Start nodes; what becomes of them arrives as events."""
+        self.agent.request('start', nodes=[_json(node) for node in nodes])
+
+    def stop(self, ids: Optional[Sequence[str]] = None) -> None:
+        """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
+        self.agent.request('stop', nodes=None if ids is None else list(ids))
+
+    def signal(self, node: str, name: str) -> None:
+        """Send a node a signal, by its name (``SIGUSR1``)."""
+        self.agent.request('signal', node=node, signal=name)
+
+    def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
+        """
+        Hand every event of the agent from now on to ``callback``.
+
+        It is called from a thread of the connection's and must not make requests of the agent.
+        """
+        self.agent.subscribe(callback)
+
+    def close(self) -> None:
+        """End the machine as its ``on_exit`` says."""
+        self._undo.close()
+
+
+class _Deployment:
+    """One machine's way up; its undo stack becomes the running machine's way down."""
+
+    def __init__(self, launch: Launch, spec: MachineSpec) -> None:
+        self.launch = launch
+        self.spec = spec
+        self.name = spec.name
+        self.timeouts = launch.timeouts
+        self.provider = provider(spec.provider)
+        self.folder: MachineDirectory = launch.store.machine(spec.name)
+        self.record = Record(spec.name, spec.provider, spec)
+        self.reused = False
+        self.failed = True
+
+    def run(self) -> RunningMachine:
+        """Take the steps; on any failure undo those taken."""
+        with contextlib.ExitStack() as undo:
+            undo.enter_context(self.folder.lock())
+            # the robot's side needs nothing of the machine's: it comes up meanwhile
+            with ThreadPoolExecutor(4, f'fog-{self.name}') as pool:
+                robot = pool.submit(self.launch._robot_vpn().ensure)
+                machine = self._create(undo)
+                shell = self._connect(machine, undo)
+                ros = self._prepare_host(shell)
+                interface = self._interface()
+                agent = self._arm(machine, shell, undo)
+                joining = pool.submit(self._join_vpn, machine, shell, interface, robot, undo)
+                syncing = pool.submit(self._sync, shell, ros)
+                configuring = pool.submit(self._configure_dds, shell, interface)
+                public_key = joining.result()
+                syncing.result()
+                dds = configuring.result()
+            with step(self.launch.report, self.name, 'agent') as detail:
+                heartbeat = self._start_agent(agent, interface, ros, dds, undo)
+                detail.append(f'VPN round trip {(heartbeat.round_trip or 0) * 1e3:.2f} ms')
+            self._save(public_key=public_key)
+            self._undo_nodes(agent, undo)
+            self.failed = False
+            return RunningMachine(
+                self.launch, self.spec, machine, shell, agent, heartbeat, interface,
+                undo.pop_all())
+
+    def _save(self, **changes: Any) -> None:
+        self.record = self.folder.save(dataclasses.replace(self.record, **changes))
+
+    # -- steps 1 to 3: create, wait, pin --------------------------------------------------------
+
+    def _create(self, undo: contextlib.ExitStack) -> Machine:
+        with step(self.launch.report, self.name, 'machine') as detail:
+            kept = self._kept()
+            if kept is not None:
+                self._adopt(kept, undo)
+                detail.append('kept from before')
+            else:
+                self._create_new(undo)
+            machine = wait_until(
+                self._reachable, timeout=self.timeouts.boot, cancel=self.launch.cancel,
+                what=f"the machine '{self.name}' to run", longest=self._poll_longest())
+            self._save(shell=machine.shell)
+            detail.append(machine.shell.host if machine.shell else machine.id[:20])
+            return machine
+
+    def _poll_longest(self) -> float:
+        return 0.1 if self.spec.provider in ('container', 'ssh') else 3.0
+
+    def _kept(self) -> Optional[Machine]:
+        """Return the machine of this name that an earlier launch kept or stopped, if any."""
+        if self.folder.exists():
+            before = self.folder.load()
+            if before.launch_alive:
+                raise NameTaken(
+                    f"the launch with process {before.pid} has the machine '{self.name}'",
+                    'give the machine another name=, or end that launch')
+            if before.provider != self.spec.provider:
+                raise NameTaken(
+                    f"'{self.name}' is a machine of the provider '{before.provider}'",
+                    f'give the machine another name=, or: ros2 fog delete {self.name}')
+            if before.machine_id is not None:
+                with contextlib.suppress(MachineNotFound):
+                    machine = self.provider.describe(before.machine_id)
+                    if machine.state is not MachineState.DELETED:
+                        self.record = dataclasses.replace(before, spec=self.spec)
+                        return machine
+        try:
+            found = list(self.provider.find({TAG_NAME: self.name}))
+        except Unsupported:
+            return None
+        for machine in found:
+            owner = machine.tags.get(TAG_ROBOT, '?')
+            whose = 'this robot' if owner == robot_name() else f"the robot '{owner}'"
+            raise NameTaken(
+                f"{whose} has a machine '{self.name}' that this launch has no key for",
+                f'give the machine another name=, or: ros2 fog delete {self.name}')
+        return None
+
+    def _adopt(self, machine: Machine, undo: contextlib.ExitStack) -> None:
+        self.reused = True
+        undo.callback(self.launch.attempt, self.name, 'end', self._end)
+        self._claim(self.record.token)
+        if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
+            self.provider.start(machine.id)
+
+    def _create_new(self, undo: contextlib.ExitStack) -> None:
+        token = str(uuid.uuid4())
+        self.folder.delete()
+        undo.callback(self.launch.attempt, self.name, 'end', self._end)
+        self._claim(token)
+        public_key = self._login_key()
+        config = {}
+        if self.provider.agent_directory:
+            config = plan.agent_config(
+                self.spec, self.launch.id, self.provider.agent_directory, [])
+        tags = {
+            TAG_NAME: self.name, TAG_ROBOT: robot_name(), TAG_LAUNCH: self.launch.id,
+            TAG_EXPIRES: str(int(time.time() + self.spec.lifetime)),
+            TAG_ON_EXIT: self.spec.on_exit,
+        }
+        machine_id = self.provider.create(self.spec, CreateRequest(
+            token=token, authorized_key=public_key, tags=tags,
+            vpn_port=plan.machine_port(self.launch.id), agent_config=config))
+        self._save(machine_id=machine_id)
+
+    def _claim(self, token: str) -> None:
+        """Write down that this launch has the machine, before there is anything to lose."""
+        pid = os.getpid()
+        self._save(
+            token=token, created=self.record.created or time.time(), launch=self.launch.id,
+            pid=pid, pid_start=process_start(pid) or 0,
+            robot_vpn=self.launch._robot_vpn().interface)
+
+    def _login_key(self) -> str:
+        path = self.folder.key_file
+        process.run(Command((
+            'ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', f'fogros2-{self.name}',
+            '-f', str(path)), what='make the login key'), timeout=self.timeouts.command)
+        return path.with_suffix('.pub').read_text().strip()
+
+    def _reachable(self) -> Optional[Machine]:
+        assert self.record.machine_id is not None
+        machine = self.provider.describe(self.record.machine_id)
+        if machine.state in (MachineState.DELETED, MachineState.STOPPING):
+            raise ProviderError(f"the machine '{self.name}' ended while it was coming up",
+                                "the provider's own log says why")
+        return machine if machine.state is MachineState.RUNNING and machine.shell else None
+
+    def _connect(self, machine: Machine, undo: contextlib.ExitStack) -> Shell:
+        with step(self.launch.report, self.name, 'connect'):
+            assert machine.shell is not None
+            endpoint = machine.shell
+            if self.folder.key_file.exists():
+                endpoint = dataclasses.replace(endpoint, key_file=str(self.folder.key_file))
+            self._save(shell=endpoint)
+            shell = shells.connect(endpoint, name=self.name, timeout=self.timeouts.ssh)
+            undo.callback(shell.close)
+            wait_until(
+                _answers(shell, self.timeouts.ssh), timeout=self.timeouts.ssh,
+                cancel=self.launch.cancel, what=f"'{self.name}' to let us in", longest=0.5)
+            return shell
+
+    # -- step 4: ROS on the machine -------------------------------------------------------------
+
+    def _prepare_host(self, shell: Shell) -> bootstrap.RosInstall:
+        with step(self.launch.report, self.name, 'ROS 2') as detail:
+            ros, note = bootstrap.ensure(
+                shell, self.launch.underlay(self.spec.workspace), self.spec,
+                timeout=self.timeouts.install, cancel=self.launch.cancel)
+            detail.append(note)
+            return ros
+
+    # -- step 5: VPN ----------------------------------------------------------------------------
+
+    def _interface(self) -> VpnInterface:
+        robot = self.launch._robot_vpn().interface
+        port = self.record.vpn.port if self.record.vpn else plan.machine_port(self.launch.id)
+        interface = plan.machine_interface(
+            self.launch.id, robot.network, self.launch._indices[self.name], port,
+            f'{self._agent_directory()}/vpn.key')
+        self._save(vpn=interface)
+        return interface
+
+    def _join_vpn(
+        self, machine: Machine, shell: Shell, interface: VpnInterface,
+        robot: Future[Peer], undo: contextlib.ExitStack,
+    ) -> str:
+        with step(self.launch.report, self.name, 'VPN') as detail:
+            vpn = self.launch._robot_vpn().vpn
+            me = robot.result()
+            undo.callback(
+                self.launch.attempt, self.name, 'VPN', lambda: self._leave_vpn(shell, interface))
+            public_key = self._on(shell, [vpn.keys(interface)]).strip()
+            others = self.launch._robot_vpn().peers()
+            self._on(shell, vpn.up(interface, plan.machine_peers(me, self.name, others)))
+            everyone = self.launch._robot_vpn().add(Peer(
+                self.name, public_key, interface.address,
+                f'{machine.vpn_host}:{interface.port}'))
+            self._introduce(me, everyone)
+            detail.append(interface.address)
+            return public_key
+
+    def _introduce(self, robot: Peer, machines: Mapping[str, Peer]) -> None:
+        """Tell the machines that are up already of the one that joined."""
+        vpn = self.launch._robot_vpn().vpn
+        for other in self.launch.machines():
+            if other.spec.name != self.name:
+                self._on(other.shell, vpn.peers(
+                    other.interface, plan.machine_peers(robot, other.spec.name, machines)))
+
+    def _leave_vpn(self, shell: Shell, interface: VpnInterface) -> None:
+        self.launch._robot_vpn().remove(self.name)
+        if self._survives():
+            self._on(shell, self.launch._robot_vpn().vpn.down(interface), cancel=False)
+
+    def _on(self, shell: Shell, commands: Iterable[Command], *, cancel: bool = True) -> str:
+        output = ''
+        for command in commands:
+            output = shell.run(
+                command, timeout=self.timeouts.vpn,
+                cancel=self.launch.cancel if cancel else None).stdout
+        return output
+
+    # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
+
+    def _sync(self, shell: Shell, ros: bootstrap.RosInstall) -> None:
+        if self.spec.workspace is None:
+            return
+        with step(self.launch.report, self.name, 'workspace') as detail:
+            note = workspace.transfer(
+                shell, Path(self.spec.workspace), ros, timeouts=self.timeouts,
+                cancel=self.launch.cancel,
+                on_progress=lambda done, total: self.launch.report(
+                    Progress(self.name, 'workspace', done, total)))
+            detail.append(note)
+
+    def _configure_dds(self, shell: Shell, interface: VpnInterface) -> dict[str, str]:
+        vendor = self.launch.dds()
+        robot = self.launch._robot_vpn().interface
+        with self.launch._lock:
+            others = [name for name in self.launch._indices if name != self.name]
+            peers = [robot.address, *(self.launch._machine_address(name) for name in others)]
+        path = f'{self._agent_directory()}/dds.xml'
+        shell.put(
+            vendor.render(plan.machine_dds_interfaces(interface.name), peers).encode(),
+            path, mode=0o600, timeout=self.timeouts.command)
+        return dict(vendor.environment(path, {}))
+
+    # -- steps 8 to 11: the agent ---------------------------------------------------------------
+
+    def _agent_directory(self) -> str:
+        return self.provider.agent_directory or f'{AGENT_FOLDER}/{self.name}'
+
+    def _arm(self, machine: Machine, shell: Shell, undo: contextlib.ExitStack) -> AgentClient:
+        """Make sure that an agent guards the machine, before anything slow."""
+        directory = self._agent_directory()
+        program = self.provider.agent_program
+        config = plan.agent_config(
+            self.spec, self.launch.id, directory, machine.end_command)
+        config['user'] = machine.shell.user if machine.shell else ''
+        with step(self.launch.report, self.name, 'guard'):
+            if not program:
+                program = f'{directory}/agent.py'
+                owner = config['user']
+                undo.callback(self.launch.attempt, self.name, 'guard',
+                              lambda: self._remove_agent(shell, directory))
+                self._on(shell, [Command.script(
+                    f'install -d -m 755 {AGENT_FOLDER}; '
+                    f'install -d -m 700 -o {owner} {directory}', sudo=True,
+                    what="make the agent's folder")])
+                shell.put(agent_source().read_bytes(), program, mode=0o700)
+                shell.put(model.to_json(config).encode(), f'{directory}/config.json', mode=0o600)
+                self._on(shell, [Command(
+                    ('python3', program, 'serve', '--detach', '--config',
+                     f'{directory}/config.json'), sudo=True, what='start the agent')])
+            self._save(agent=directory, agent_program=program)
+            # no cancel: it is needed on the way down as well, and each request has its deadline
+            agent = AgentClient(shell, directory, agent_path=program)
+            undo.callback(agent.close)
+            agent.request('configure', timeout=self.timeouts.agent, **config)
+            return agent
+
+    def _remove_agent(self, shell: Shell, directory: str) -> None:
+        if self._survives():
+            self._on(shell, [Command(('rm', '-rf', '--', directory), sudo=True,
+                                     what='remove the agent')], cancel=False)
+
+    def _start_agent(
+        self, agent: AgentClient, interface: VpnInterface, ros: bootstrap.RosInstall,
+        dds: Mapping[str, str], undo: contextlib.ExitStack,
+    ) -> Heartbeat:
+        robot = self.launch._robot_vpn()
+        vpn = robot.vpn
+        me = robot.ensure()
+        peers = plan.machine_peers(me, self.name, robot.peers())
+        agent.request(
+            'configure',
+            heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
+                       'peer': me.address},
+            environment={**ros.environment, **dds, **self.spec.environment},
+            setup=list(ros.setup), ros_command=list(ros.command))
+        agent.request(
+            'keep', what='vpn', alive=list(vpn.alive(interface).argv), interval=1.0,
+            repair=[list(command.argv) for command in vpn.repair(interface, peers)])
+        agent.request('launch')
+        heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, self.launch.id)
+        undo.callback(heartbeat.close)
+        try:
+            wait_until(
+                lambda: heartbeat.round_trip is not None, timeout=self.timeouts.vpn,
+                cancel=self.launch.cancel, what='an answer through the VPN', longest=0.05)
+        except FogError as error:
+            if isinstance(error, Cancelled):
+                raise
+            raise VpnError(
+                f"nothing comes back from '{self.name}' through the VPN",
+                f'is UDP port {interface.port} open on the way there?') from error
+        return heartbeat
+
+    # -- the way down ---------------------------------------------------------------------------
+
+    def _undo_nodes(self, agent: AgentClient, undo: contextlib.ExitStack) -> None:
+        """Push what comes first on the way down: the nodes end."""
+        def release() -> None:
+            agent.request('release', on_exit=self.spec.on_exit, exit=not self._boots_agent())
+
+        if self._survives():
+            undo.callback(self.launch.attempt, self.name, 'nodes', release)
+
+    def _boots_agent(self) -> bool:
+        return bool(self.provider.agent_program)
+
+    def _survives(self) -> bool:
+        """Whether the computer stays when the launch ends, so that it has to be tidied up."""
+        if self.failed and not self.reused:
+            return self.spec.provider == 'ssh'
+        return self.spec.on_exit == 'keep' or self.spec.provider == 'ssh'
+
+    def _end(self) -> None:
+        """End the machine by its ``on_exit``; the record goes only when the machine has gone."""
+        mode = self.spec.on_exit
+        if self.failed and not self.reused:
+            mode = 'delete'
+        machine_id = self.record.machine_id
+        with step(self.launch.report, self.name, mode):
+            if mode == 'delete':
+                if machine_id is not None:
+                    self.provider.destroy(machine_id)
+                self.folder.delete()
+                return
+            if mode == 'stop' and machine_id is not None:
+                self.provider.stop(machine_id)
+            self._save(launch='', pid=0, pid_start=0, robot_vpn=None)
+
+
+def provider(name: str) -> Provider:
+    """
+    Return the provider of that name.
+
+    :raises ConfigurationError: there is none.
+    """
+    instance: Provider = plugin_system.load('fogros2.provider', name)()
+    return instance
+
+
+def check_sudo() -> None:
+    """
+    Check that root's commands run without a question in the middle of a launch.
+
+    :raises PrerequisiteError: they don't.
+    """
+    if process.which('sudo') is None:
+        raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
+                                'run the launch as root, or install sudo')
+    if process.run(Command(('sudo', '-n', 'true')), timeout=10.0, check=False).returncode:
+        raise PrerequisiteError('a VPN interface takes root, and sudo wants a password',
+                                'run `sudo -v` first, then launch again')
+
+
+def _answers(shell: Shell, timeout: float) -> Callable[[], Optional[bool]]:
+    """Return a probe that is true once the machine's SSH server lets us in."""
+    def probe() -> Optional[bool]:
+        try:
+            shell.run(Command(('true',), what='connect'), timeout=timeout)
+            return True
+        except ConnectError:
+            return None
+
+    return probe
+
+
+def _json(node: NodeSpec) -> dict[str, Any]:
+    return {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
+
+
+def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
+    """
+    Take away what a launch that died left on the robot for a machine that is gone.
+
+    Its VPN interface with its program and filter, the launch's folder, the machine's folder with
+    its keys. A launch that still runs keeps its own; idempotent.
+
+    :raises FogError: something could not be taken away; the record stays then.
+    """
+    if record.robot_vpn is not None and record.launch and not record.launch_alive:
+        with step(report, record.name, 'VPN interface'):
+            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+            for command in vpn.down(record.robot_vpn):
+                process.run(command, timeout=Timeouts().vpn)
+            shutil.rmtree(store.launch(record.launch), ignore_errors=True)
+    store.machine(record.name).delete()
