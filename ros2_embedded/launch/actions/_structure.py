@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Actions that contain others: groups, included files, timers."""
+from __future__ import annotations
+
+import asyncio
+import collections.abc
+import os
+from typing import Any, cast, Dict, Iterable, List, Optional, Sequence, Tuple, TYPE_CHECKING
+from typing import Union
+import warnings
+
+import launch.logging
+
+from ._environment import parse_keeps, PopEnvironment, PopLaunchConfigurations
+from ._environment import PushEnvironment, PushLaunchConfigurations, ResetEnvironment
+from ._environment import ResetLaunchConfigurations, SetLaunchConfiguration, SomeConfigurations
+from ._simple import OpaqueFunction
+from ..action import Action, ParsedAction
+from ..event_handler import EventHandler
+from ..events import Shutdown, TimerEvent
+from ..frontend.entity import Entity
+from ..frontend.expose import expose_action
+from ..launch_context import LaunchContext
+from ..launch_description_entity import LaunchDescriptionEntity
+from ..launch_description_source import LaunchDescriptionSource
+from ..some_entities_type import SomeEntitiesType
+from ..some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
+from ..utilities import ensure_argument_type, is_a_subclass
+from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
+from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
+
+if TYPE_CHECKING:
+    from ..frontend import Parser
+
+Entities = List[LaunchDescriptionEntity]
+Arguments = Sequence[Tuple[SomeSubstitutionsType, SomeSubstitutionsType]]
+
+
+@expose_action('group')
+class GroupAction(Action):
+    """
+    Actions that belong together.
+
+    :param scoped: whether launch configurations and environment are as before afterwards.
+    :param forwarding: whether a scoped group sees the launch configurations and environment
+        set outside of it.
+    :param launch_configurations: what is set for the group.
+    """
+
+    def __init__(
+        self, actions: Iterable[Action], *, scoped: bool = True, forwarding: bool = True,
+        launch_configurations: Optional[SomeConfigurations] = None, **left_over_kwargs: Any
+    ) -> None:
+        super().__init__(**left_over_kwargs)
+        self.__actions = actions
+        self.__scoped = scoped
+        self.__forwarding = forwarding
+        self.__launch_configurations = launch_configurations or {}
+        self.__actions_to_return: Optional[Entities] = None
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        for name in ('scoped', 'forwarding'):
+            value = entity.get_attr(name, data_type=bool, optional=True)
+            if value is not None:
+                kwargs[name] = value
+        kwargs.update(parse_keeps(entity, parser))
+        kwargs['actions'] = [
+            parser.parse_action(child) for child in entity.children
+            if child.type_name != 'keep']
+        return cls, kwargs
+
+    def get_sub_entities(self) -> Entities:
+        if self.__actions_to_return is None:
+            entities: Entities = list(self.__actions)
+            sets: Entities = [
+                SetLaunchConfiguration(name, value)
+                for name, value in self.__launch_configurations.items()]
+            if self.__scoped:
+                if not self.__forwarding:
+                    sets = [ResetEnvironment(),
+                            ResetLaunchConfigurations(self.__launch_configurations)]
+                self.__actions_to_return = [
+                    PushLaunchConfigurations(), PushEnvironment(), *sets, *entities,
+                    PopEnvironment(), PopLaunchConfigurations()]
+            else:
+                self.__actions_to_return = [*sets, *entities]
+        return self.__actions_to_return
+
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
+        return self.get_sub_entities()
+
+
+@expose_action('include')
+class IncludeLaunchDescription(Action):
+    """
+    Visits a launch description from elsewhere.
+
+    :param launch_description_source: a source, or the path of a launch file.
+    :param launch_arguments: launch configurations to set before.
+    """
+
+    def __init__(
+        self,
+        launch_description_source: Union[LaunchDescriptionSource, SomeSubstitutionsType], *,
+        launch_arguments: Optional[
+            Iterable[Tuple[SomeSubstitutionsType, SomeSubstitutionsType]]] = None,
+        **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        if not isinstance(launch_description_source, LaunchDescriptionSource):
+            from ..launch_description_sources import AnyLaunchDescriptionSource
+            launch_description_source = AnyLaunchDescriptionSource(launch_description_source)
+        self.__launch_description_source = launch_description_source
+        self.__launch_arguments: Arguments = tuple(launch_arguments or ())
+        self.__logger = launch.logging.get_logger(__name__)
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        kwargs['launch_description_source'] = parser.parse_substitution(entity.get_attr('file'))
+        args = entity.get_attr('arg', data_type=List[Entity], optional=True)
+        if args is not None:
+            kwargs['launch_arguments'] = [
+                (parser.parse_substitution(arg.get_attr('name')),
+                 parser.parse_substitution(arg.get_attr('value'))) for arg in args]
+            for arg in args:
+                arg.assert_entity_completely_parsed()
+        return cls, kwargs
+
+    @property
+    def launch_description_source(self) -> LaunchDescriptionSource:
+        """Where the launch description comes from."""
+        return self.__launch_description_source
+
+    @property
+    def launch_arguments(self) -> Arguments:
+        """The launch configurations to set before."""
+        return self.__launch_arguments
+
+    def _get_launch_file(self) -> str:
+        return os.path.abspath(self.__launch_description_source.location)
+
+    def _get_launch_file_directory(self) -> str:
+        path = self._get_launch_file()
+        if os.path.exists(path):
+            return os.path.dirname(path)
+        return self.__launch_description_source.location
+
+    def get_sub_entities(self) -> Entities:
+        source = self.__launch_description_source
+        description = source.try_get_launch_description_without_context()
+        return [] if description is None else [description]
+
+    def __argument_names(self, context: LaunchContext) -> List[str]:
+        return [perform_substitutions(context, normalize_to_list_of_substitutions(name))
+                for name, _ in self.__launch_arguments]
+
+    def _try_get_arguments_names_without_context(self) -> Optional[List[str]]:
+        try:
+            return self.__argument_names(LaunchContext())
+        except Exception as exc:  # A substitution may raise anything.
+            self.__logger.debug(
+                'Failed to get launch arguments names for launch description '
+                f"'{self.__launch_description_source.location}', with exception: {exc}")
+        return None
+
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
+        description = self.__launch_description_source.get_launch_description(context)
+        context.extend_locals({
+            'current_launch_file_path': self._get_launch_file(),
+            'current_launch_file_directory': self._get_launch_file_directory()})
+        given = self.__argument_names(context)
+        pairs = description.get_launch_arguments_with_include_launch_description_actions()
+        for argument, includes in pairs:
+            if argument._conditionally_included or argument.default_value is not None:
+                continue
+            for include in includes or ():
+                given.extend(include._try_get_arguments_names_without_context() or ())
+            if argument.name not in given:
+                raise RuntimeError(
+                    'Included launch description missing required argument '
+                    f"'{argument.name}' (description: '{argument.description}'), "
+                    f"given: [{', '.join(given)}]")
+        return [
+            *(SetLaunchConfiguration(name, value) for name, value in self.launch_arguments),
+            description]
+
+
+@expose_action('timer')
+class TimerAction(Action):
+    """
+    Visits actions when a period has passed.
+
+    :param period: in seconds.
+    :param cancel_on_shutdown: whether a shutdown of the launch cancels the timer.
+    """
+
+    def __init__(
+        self, *, period: Union[float, SomeSubstitutionsType],
+        actions: Iterable[LaunchDescriptionEntity],
+        cancel_on_shutdown: Union[bool, SomeSubstitutionsType] = True, **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        ensure_argument_type(
+            period, (*SomeSubstitutionsType_types_tuple, float), 'period', 'TimerAction')
+        ensure_argument_type(actions, collections.abc.Iterable, 'actions', 'TimerAction')
+        if isinstance(period, str):
+            period = float(period)
+            warnings.warn(
+                "The parameter 'period' must be a float or substitution,"
+                'passing a string literal was deprecated', stacklevel=2)
+        self.__period = normalize_typed_substitution(period, float)
+        self.__actions = actions
+        self.__context_locals: Dict[str, Any] = {}
+        self._completed_future: Optional[asyncio.Future[Any]] = None
+        self.__canceled = False
+        self._canceled_future: Optional[asyncio.Future[Any]] = None
+        self.__cancel_on_shutdown = normalize_typed_substitution(cancel_on_shutdown, bool)
+        self.__logger = launch.logging.get_logger(__name__)
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        kwargs['period'] = parser.parse_if_substitutions(
+            entity.get_attr('period', data_type=float, can_be_str=True))
+        kwargs['actions'] = [parser.parse_action(child) for child in entity.children]
+        cancel = entity.get_attr(
+            'cancel_on_shutdown', optional=True, data_type=bool, can_be_str=True)
+        if cancel is not None:
+            kwargs['cancel_on_shutdown'] = parser.parse_if_substitutions(cancel)
+        return cls, kwargs
+
+    @property
+    def period(self) -> Any:
+        """The period, in seconds."""
+        return self.__period
+
+    @property
+    def actions(self) -> Iterable[LaunchDescriptionEntity]:
+        """What is visited then."""
+        return self.__actions
+
+    def describe(self) -> str:
+        return f'TimerAction(period={self.__period}, actions=<actions>)'
+
+    def describe_conditional_sub_entities(
+        self
+    ) -> List[Tuple[str, Iterable[LaunchDescriptionEntity]]]:
+        return [(f'{self.__period} seconds pass without being canceled', self.__actions)]
+
+    async def _wait_to_fire_event(self, context: LaunchContext) -> None:
+        assert self._canceled_future is not None and self._completed_future is not None
+        await asyncio.wait(
+            [self._canceled_future],
+            timeout=perform_typed_substitution(context, self.__period, float))
+        if not self._canceled_future.done():
+            await context.emit_event(TimerEvent(timer_action=self))
+        self._completed_future.set_result(None)
+
+    def handle(self, context: LaunchContext) -> Optional[SomeEntitiesType]:
+        """Return what is to be visited, in the locals of when the timer was started."""
+        context.extend_locals(self.__context_locals)
+        return self.__actions
+
+    def cancel(self) -> None:
+        """Cancel the timer, started or not."""
+        self.__canceled = True
+        if self._canceled_future is not None and not self._canceled_future.done():
+            self._canceled_future.set_result(True)
+
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
+        self._completed_future = context.asyncio_loop.create_future()
+        self._canceled_future = context.asyncio_loop.create_future()
+        if self.__canceled:
+            self.__logger.debug(
+                f'timer {self} not waiting because it was canceled before being executed')
+            self._completed_future.set_result(None)
+            return None
+        if not hasattr(context, '_TimerAction__event_handler_has_been_installed'):
+            # One handler does for all timers of a launch.
+            context.register_event_handler(EventHandler(
+                matcher=lambda event: is_a_subclass(event, TimerEvent),
+                entities=OpaqueFunction(function=lambda context: cast(
+                    TimerEvent, context.locals.event).timer_action.handle(context))))
+            setattr(context, '_TimerAction__event_handler_has_been_installed', True)
+        self.__context_locals = dict(context.get_locals_as_dict())
+        context.asyncio_loop.create_task(self._wait_to_fire_event(context))
+        if perform_typed_substitution(context, self.__cancel_on_shutdown, bool):
+            context.register_event_handler(EventHandler(
+                matcher=lambda event: is_a_subclass(event, Shutdown),
+                entities=OpaqueFunction(function=lambda context: self.cancel())))
+        return None
+
+    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
+        return self._completed_future

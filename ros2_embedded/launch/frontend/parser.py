@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the parser for a launch file, and builds what its entities describe."""
+from __future__ import annotations
+
+import io
+import os
+import traceback
+from typing import Any, Dict, Iterable, List, Optional, Set, Tuple, Type, TYPE_CHECKING
+import warnings
+
+from .entity import Entity
+from .expose import instantiate_action
+from .parse_substitution import parse_if_substitutions, parse_substitution
+from .parse_substitution import replace_escaped_characters
+from ..invalid_launch_file_error import InvalidLaunchFileError
+from ..substitution import Substitution
+from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
+
+if TYPE_CHECKING:
+    from ..action import Action
+    from ..launch_description import LaunchDescription
+
+
+class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
+    """No frontend could read the file."""
+
+
+def _load_entry_points(group: str, kind: str) -> Dict[str, Any]:
+    from ros2cli.entry_points import get_entry_points
+    loaded = {}
+    for entry_point in get_entry_points(group).values():
+        try:
+            loaded[entry_point.name] = entry_point.load()
+        except Exception:  # Whatever another's module raises must not end this launch.
+            warnings.warn(
+                f'Failed to load the {kind} extension: {entry_point.name}\n'
+                f'{traceback.format_exc()}')
+    return loaded
+
+
+class Parser:
+    """
+    Base of the frontends' parsers.
+
+    Entry points: ``launch.frontend.launch_extension`` names modules that expose actions and
+    substitutions, ``launch.frontend.parser`` parsers beside those for XML and YAML.
+    """
+
+    extensions_loaded = False
+    frontend_parsers: Optional[Dict[str, Type[Parser]]] = None
+
+    @classmethod
+    def load_launch_extensions(cls) -> None:
+        """Import, once, all that exposes actions and substitutions."""
+        if not Parser.extensions_loaded:
+            Parser.extensions_loaded = True
+            import launch_ros  # noqa: F401
+            _load_entry_points('launch.frontend.launch_extension', 'launch')
+
+    @classmethod
+    def load_parser_implementations(cls) -> None:
+        """Import, once, all parsers."""
+        cls._parsers()
+
+    @classmethod
+    def _parsers(cls) -> Dict[str, Type[Parser]]:
+        if Parser.frontend_parsers is None:
+            import launch_xml
+            import launch_yaml
+            parsers = {'xml': launch_xml.Parser, 'yaml': launch_yaml.Parser}
+            parsers.update(_load_entry_points('launch.frontend.parser', 'parser'))
+            Parser.frontend_parsers = dict(sorted(parsers.items()))
+        return Parser.frontend_parsers
+
+    def parse_action(self, entity: Entity) -> Action:
+        """Return the action that the entity describes."""
+        self.load_launch_extensions()
+        return instantiate_action(entity, self)
+
+    def parse_substitution(self, value: str) -> List[Substitution]:
+        """Return the substitutions that the text consists of."""
+        return parse_substitution(value)
+
+    def parse_if_substitutions(self, value: StrSomeValueType) -> NormalizedValueType:
+        """Return texts in the value as substitutions, unless they are plain."""
+        return parse_if_substitutions(value)
+
+    def escape_characters(self, value: str) -> str:
+        """Return the text without the backslashes that escape."""
+        return replace_escaped_characters(value)
+
+    def parse_description(self, entity: Entity) -> LaunchDescription:
+        """
+        Return the launch description of a root entity.
+
+        :raises RuntimeError: if it isn't called 'launch'.
+        """
+        from ..launch_description import LaunchDescription
+        if entity.type_name != 'launch':
+            raise RuntimeError("Expected 'launch' as root tag")
+        self.load_launch_extensions()
+        deprecated = entity.get_attr('deprecated', optional=True)
+        return LaunchDescription(
+            [self.parse_action(child) for child in entity.children],
+            deprecated_reason=deprecated)
+
+    @classmethod
+    def get_available_extensions(cls) -> Iterable[str]:
+        """Return the parsers' names."""
+        return cls._parsers().keys()
+
+    @classmethod
+    def may_parse(cls, filename: str) -> bool:
+        """Say whether the file's name ends as this parser's do."""
+        return any(filename.endswith('.' + end) for end in cls.get_file_extensions())
+
+    @classmethod
+    def is_filename_valid(cls, filename: str) -> bool:
+        """Say whether any parser claims files of such a name."""
+        return bool(cls.get_parsers_from_filename(filename))
+
+    @classmethod
+    def get_parsers_from_filename(cls, filename: str) -> List[Type[Parser]]:
+        """Return the parsers that claim files of such a name."""
+        return [parser for parser in cls._parsers().values() if parser.may_parse(filename)]
+
+    @classmethod
+    def get_file_extensions_from_parsers(cls) -> Set[str]:
+        """Return how the names of all parsers' files end."""
+        return {end for parser in cls._parsers().values()
+                for end in parser.get_file_extensions()}
+
+    @classmethod
+    def load(cls, file: Any) -> Tuple[Entity, Parser]:
+        """
+        Read a file, by path or open, with the parsers that claim it, then with all others.
+
+        :return: the root entity, and the parser that read it.
+        :raises InvalidFrontendLaunchFileError: if none could.
+        """
+        if isinstance(file, (str, bytes, os.PathLike)):
+            with open(file) as opened:
+                return cls.load(opened)
+        stream: io.TextIOBase = file
+        name = getattr(stream, 'name', '')
+        claiming = cls.get_parsers_from_filename(name)
+        errors: List[Exception] = []
+        for parser in [*claiming, *(p for p in cls._parsers().values() if p not in claiming)]:
+            try:
+                return parser.load(stream)
+            except Exception as exc:  # Each format's own library has its own errors.
+                errors.append(exc)
+                stream.seek(0)
+        extension = os.path.splitext(name)[1][1:] if claiming else ''
+        raise InvalidFrontendLaunchFileError(extension, likely_errors=errors)
+
+    @classmethod
+    def get_file_extensions(cls) -> Set[str]:
+        """Return how the names of this parser's files end, without the dot."""
+        return set()

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launch descriptions from launch files."""
+from __future__ import annotations
+
+from importlib.machinery import SourceFileLoader
+import os
+from types import ModuleType
+from typing import Callable, cast, List, Type
+
+from .._aliases import alias_submodules
+from ..frontend import InvalidFrontendLaunchFileError, Parser
+from ..invalid_launch_file_error import InvalidLaunchFileError
+from ..launch_description import LaunchDescription
+from ..launch_description_source import LaunchDescriptionSource
+from ..some_substitutions_type import SomeSubstitutionsType
+
+__all__ = [
+    'get_launch_description_from_any_launch_file',
+    'get_launch_description_from_python_launch_file',
+    'get_launch_description_from_frontend_launch_file',
+    'InvalidFrontendLaunchFileError',
+    'InvalidLaunchFileError',
+    'InvalidPythonLaunchFileError',
+    'load_python_launch_file_as_module',
+    'AnyLaunchDescriptionSource',
+    'FrontendLaunchDescriptionSource',
+    'PythonLaunchDescriptionSource',
+]
+
+
+class InvalidPythonLaunchFileError(Exception):
+    """A Python launch file without ``generate_launch_description``."""
+
+
+def load_python_launch_file_as_module(python_launch_file_path: str) -> ModuleType:
+    """Execute a Python file, whatever its name ends with, as a module of its own."""
+    loader = SourceFileLoader('python_launch_file', python_launch_file_path)
+    module = ModuleType(loader.name)
+    module.__file__ = python_launch_file_path
+    module.__loader__ = loader
+    loader.exec_module(module)
+    return module
+
+
+def get_launch_description_from_python_launch_file(
+    python_launch_file_path: str
+) -> LaunchDescription:
+    """
+    Return what the file's ``generate_launch_description()`` returns.
+
+    :raises InvalidPythonLaunchFileError: if there is none.
+    """
+    module = load_python_launch_file_as_module(python_launch_file_path)
+    if not hasattr(module, 'generate_launch_description'):
+        raise InvalidPythonLaunchFileError(
+            f"launch file at '{python_launch_file_path}' does not contain the required function "
+            "'generate_launch_description()'")
+    return cast(LaunchDescription, module.generate_launch_description())
+
+
+def get_launch_description_from_frontend_launch_file(
+    frontend_launch_file_path: str, *, parser: Type[Parser] = Parser
+) -> LaunchDescription:
+    """
+    Return what a file for a frontend (XML, YAML, ...) describes.
+
+    :raises InvalidFrontendLaunchFileError: if no frontend can read it.
+    """
+    entity, reader = parser.load(frontend_launch_file_path)
+    return reader.parse_description(entity)
+
+
+def get_launch_description_from_any_launch_file(
+    launch_file_path: str, *, parser: Type[Parser] = Parser
+) -> LaunchDescription:
+    """
+    Return what a launch file describes.
+
+    :raises InvalidLaunchFileError: if nothing can read it.
+    """
+    loaders: List[Callable[[str], LaunchDescription]] = [
+        get_launch_description_from_frontend_launch_file,
+        get_launch_description_from_python_launch_file]
+    name = os.path.basename(launch_file_path)
+    extension = os.path.splitext(name)[1][1:]
+    if extension == 'py':
+        loaders.reverse()
+    elif not Parser.is_filename_valid(name):
+        extension = ''
+    errors: List[Exception] = []
+    for load in loaders:
+        try:
+            return load(launch_file_path)
+        except Exception as exc:  # A launch file can raise anything.
+            errors.append(exc)
+    raise InvalidLaunchFileError(extension, likely_errors=errors)
+
+
+class AnyLaunchDescriptionSource(LaunchDescriptionSource):
+    """A launch file in any format."""
+
+    def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
+        super().__init__(None, launch_file_path, 'interpreted launch file')
+
+    def _get_launch_description(self, location: str) -> LaunchDescription:
+        return get_launch_description_from_any_launch_file(location)
+
+
+class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
+    """A launch file for a frontend."""
+
+    def __init__(
+        self, launch_file_path: SomeSubstitutionsType, *,
+        method: str = 'interpreted frontend launch file', parser: Type[Parser] = Parser
+    ) -> None:
+        super().__init__(None, launch_file_path, method)
+        self._parser = parser
+
+    def _get_launch_description(self, location: str) -> LaunchDescription:
+        return get_launch_description_from_frontend_launch_file(location, parser=self._parser)
+
+
+class PythonLaunchDescriptionSource(LaunchDescriptionSource):
+    """A launch file in Python."""
+
+    def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
+        super().__init__(None, launch_file_path, 'interpreted python launch file')
+
+    def _get_launch_description(self, location: str) -> LaunchDescription:
+        return get_launch_description_from_python_launch_file(location)
+
+
+alias_submodules(__name__, __all__[-3:], {
+    'any_launch_file_utilities': ('get_launch_description_from_any_launch_file',),
+    'frontend_launch_file_utilities': (
+        'get_launch_description_from_frontend_launch_file', 'InvalidFrontendLaunchFileError'),
+    'python_launch_file_utilities': (
+        'get_launch_description_from_python_launch_file', 'InvalidPythonLaunchFileError',
+        'load_python_launch_file_as_module')})

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals as callbacks of an event loop."""
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from types import TracebackType
+from typing import Callable, Dict, Optional, Type, Union
+
+
+class AsyncSafeSignalManager:
+    """
+    While entered, calls handlers from the loop for signals that Python notices.
+
+    It listens on :func:`signal.set_wakeup_fd` and leaves handlers of :func:`signal.signal`
+    alone: a signal whose disposition is the operating system's default still has its default
+    effect. Managers nest. ``signal.set_wakeup_fd``, also as asyncio calls it, is intercepted
+    meanwhile, and the descriptor given there gets a copy of what arrives.
+
+    :raises ValueError: on entering outside of the main thread.
+    """
+
+    __current: Optional[AsyncSafeSignalManager] = None
+    __real_set_wakeup_fd = staticmethod(signal.set_wakeup_fd)
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.__loop = loop
+        self.__handlers: Dict[signal.Signals, Callable[[int], None]] = {}
+        self.__outer: Optional[AsyncSafeSignalManager] = None
+        self.__next_fd = -1
+
+    def __enter__(self) -> AsyncSafeSignalManager:
+        self.__reader, self.__writer = socket.socketpair()
+        self.__reader.setblocking(False)
+        self.__writer.setblocking(False)
+        try:
+            self.__next_fd = self.__real_set_wakeup_fd(self.__writer.fileno())
+        except ValueError:
+            self.__reader.close()
+            self.__writer.close()
+            raise
+        self.__loop.add_reader(self.__reader.fileno(), self.__on_readable)
+        self.__outer = AsyncSafeSignalManager.__current
+        AsyncSafeSignalManager.__current = self
+        if self.__outer is None:
+            signal.set_wakeup_fd = self.__replace_next_fd  # type: ignore[assignment]
+        return self
+
+    def __exit__(
+        self, exc_type: Optional[Type[BaseException]], exc: Optional[BaseException],
+        traceback: Optional[TracebackType]
+    ) -> None:
+        self.__loop.remove_reader(self.__reader.fileno())
+        self.__real_set_wakeup_fd(self.__next_fd)
+        if self.__outer is None:
+            signal.set_wakeup_fd = self.__real_set_wakeup_fd
+        AsyncSafeSignalManager.__current = self.__outer
+        self.__next_fd = -1
+        self.__reader.close()
+        self.__writer.close()
+
+    def __replace_next_fd(self, fd: int, *, warn_on_full_buffer: bool = True) -> int:
+        previous, self.__next_fd = self.__next_fd, fd
+        return previous
+
+    def __on_readable(self) -> None:
+        try:
+            received = self.__reader.recv(4096)
+        except (BlockingIOError, InterruptedError):
+            return
+        for number in received:
+            handler = self.__handlers.get(signal.Signals(number))
+            if handler is not None:
+                handler(number)
+        if self.__next_fd != -1:
+            os.write(self.__next_fd, received)
+
+    def handle(
+        self, signum: Union[signal.Signals, int], handler: Optional[Callable[[int], None]]
+    ) -> Optional[Callable[[int], None]]:
+        """
+        Set what is called for a signal; None removes it.
+
+        :return: the handler there was.
+        """
+        signum = signal.Signals(signum)
+        if handler is None:
+            return self.__handlers.pop(signum, None)
+        if not callable(handler):
+            raise ValueError('signal handler must be a callable')
+        previous = self.__handlers.get(signum)
+        self.__handlers[signum] = handler
+        return previous

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Containers of composable nodes, and what they load."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, List, Optional, Union
+
+from launch import Action, LaunchContext, SomeSubstitutionsType
+from launch.action import ParsedAction
+from launch.frontend import Entity, expose_action, Parser
+from launch.launch_description_entity import LaunchDescriptionEntity
+import launch.logging
+from launch.some_substitutions_type import SomeSubstitutionsType_types_tuple
+from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
+from launch.utilities import perform_substitutions
+
+from ._services import call_service
+from .node import Node
+from ..descriptions import ComposableNode
+from ..parameter_descriptions import ParameterFile
+from ..ros_adapters import get_ros_node
+from ..utilities import add_node_name, evaluate_parameters, get_node_name_count
+from ..utilities import make_namespace_absolute, prefix_namespace, to_parameters_list
+from ..utilities.normalize_parameters import normalize_parameter_dict
+
+
+def _parse_nodes(entities: List[Entity], parser: Parser) -> List[ComposableNode]:
+    parsed = [ComposableNode.parse(parser, entity) for entity in entities]
+    return [cls(**kwargs) for cls, kwargs in parsed]
+
+
+@expose_action('node_container')
+class ComposableNodeContainer(Node):
+    """Executes a container, and has it load composable nodes."""
+
+    def __init__(
+        self, *, name: SomeSubstitutionsType, namespace: SomeSubstitutionsType,
+        composable_node_descriptions: Optional[List[ComposableNode]] = None, **kwargs: Any
+    ) -> None:
+        super().__init__(name=name, namespace=namespace, **kwargs)
+        self.__composable_node_descriptions = composable_node_descriptions
+
+    @classmethod
+    def parse(
+        cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
+    ) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser, ignore)
+        nodes = entity.get_attr('composable_node', data_type=List[Entity], optional=True)
+        if nodes is not None:
+            kwargs['composable_node_descriptions'] = _parse_nodes(nodes, parser)
+        return cls, kwargs
+
+    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+        nodes = [
+            node for node in self.__composable_node_descriptions or ()
+            if (condition := node.condition()) is None or condition.evaluate(context)]
+        entities = list(super().execute(context) or ())
+        if nodes:
+            entities.append(LoadComposableNodes(
+                composable_node_descriptions=nodes, target_container=self))
+        return entities or None
+
+
+@expose_action('load_composable_node')
+class LoadComposableNodes(Action):
+    """
+    Has a container load composable nodes, one after another.
+
+    :param target_container: the action, or the container's full name.
+    """
+
+    def __init__(
+        self, *, composable_node_descriptions: List[ComposableNode],
+        target_container: Union[SomeSubstitutionsType, ComposableNodeContainer], **kwargs: Any
+    ) -> None:
+        ensure_argument_type(
+            target_container, (*SomeSubstitutionsType_types_tuple, ComposableNodeContainer),
+            'target_container', 'LoadComposableNodes')
+        super().__init__(**kwargs)
+        self.__composable_node_descriptions = composable_node_descriptions
+        self.__target_container = target_container
+        self.__final_target_container_name: Optional[str] = None
+        self.__rclpy_load_node_client: Any = None
+        self.__logger = launch.logging.get_logger(__name__)
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        kwargs['target_container'] = parser.parse_substitution(entity.get_attr('target'))
+        kwargs['composable_node_descriptions'] = _parse_nodes(
+            entity.get_attr('composable_node', data_type=List[Entity]), parser)
+        return cls, kwargs
+
+    def _load_node(self, request: Any, context: LaunchContext) -> None:
+        response = call_service(
+            self.__rclpy_load_node_client, request, context, self.__logger)
+        if response is None:
+            return
+        container = self.__final_target_container_name
+        name = response.full_node_name or request.node_name
+        if not response.success:
+            self.__logger.error(
+                f"Failed to load node '{name}' of type '{request.plugin_name}' in container "
+                f"'{container}': {response.error_message}")
+            return
+        add_node_name(context, name)
+        count = get_node_name_count(context, name)
+        if count > 1:
+            launch.logging.get_logger(container).warning(
+                f'there are now at least {count} nodes with the name {name} created within '
+                'this launch context')
+        self.__logger.info(
+            f"Loaded node '{response.full_node_name}' in container '{container}'")
+
+    def _load_in_sequence(self, load_node_requests: List[Any], context: LaunchContext) -> None:
+        for request in load_node_requests:
+            self._load_node(request, context)
+
+    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+        if isinstance(self.__target_container, ComposableNodeContainer):
+            container = self.__target_container.node_name
+        else:
+            container = perform_substitutions(
+                context, normalize_to_list_of_substitutions(self.__target_container))
+        self.__final_target_container_name = container
+        from composition_interfaces.srv import LoadNode
+        self.__rclpy_load_node_client = get_ros_node(context).create_client(
+            LoadNode, f'{container}/_container/load_node')
+        requests = [
+            request for node in self.__composable_node_descriptions
+            if (request := get_composable_node_load_request(node, context)) is not None]
+        if requests:
+            context.add_completion_future(context.asyncio_loop.run_in_executor(
+                None, self._load_in_sequence, requests, context))
+        return None
+
+
+def get_composable_node_load_request(
+    composable_node_description: ComposableNode, context: LaunchContext
+) -> Any:
+    """Return the LoadNode request for a composable node, None if its condition is false."""
+    node = composable_node_description
+    condition = node.condition()
+    if condition is not None and not condition.evaluate(context):
+        return None
+    from composition_interfaces.srv import LoadNode
+    configurations = context.launch_configurations
+    request = LoadNode.Request()
+    request.package_name = perform_substitutions(context, node.package)
+    request.plugin_name = perform_substitutions(context, node.node_plugin)
+    if node.node_name is not None:
+        request.node_name = perform_substitutions(context, node.node_name)
+    namespace = prefix_namespace(
+        configurations.get('ros_namespace'),
+        None if node.node_namespace is None else (
+            perform_substitutions(context, node.node_namespace)))
+    if namespace is not None:
+        namespace = make_namespace_absolute(namespace)
+        request.node_namespace = namespace
+    remappings = [f'{source}:={target}' for source, target in configurations.get(
+        'ros_remaps', ())]
+    remappings += [
+        f'{perform_substitutions(context, source)}:={perform_substitutions(context, target)}'
+        for source, target in node.remappings or ()]
+    if remappings:
+        request.remap_rules = remappings
+
+    def messages(parameters: List[Any]) -> List[Any]:
+        return [parameter.to_parameter_msg() for parameter in to_parameters_list(
+            context, request.node_name, namespace, evaluate_parameters(context, parameters))]
+
+    parameters: List[Any] = [
+        normalize_parameter_dict({given[0]: given[1]}) if isinstance(given, tuple)
+        else ParameterFile(Path(given).resolve())
+        for given in configurations.get('global_params', ())]
+    parameters += node.parameters or ()
+    if parameters:
+        request.parameters = messages(parameters)
+    if node.extra_arguments is not None:
+        request.extra_arguments = messages(list(node.extra_arguments))
+    return request

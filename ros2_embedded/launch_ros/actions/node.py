@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The action that executes a ROS node."""
+from __future__ import annotations
+
+import os
+import pathlib
+from tempfile import NamedTemporaryFile
+from typing import Any, Dict, Iterable, List, Optional, Tuple
+
+from launch.action import ParsedAction
+from launch.actions import ExecuteProcess
+from launch.frontend import Entity, expose_action, Parser
+from launch.frontend.type_utils import get_data_type_from_identifier
+from launch.launch_context import LaunchContext
+from launch.launch_description_entity import LaunchDescriptionEntity
+import launch.logging
+from launch.some_substitutions_type import SomeSubstitutionsType
+from launch.substitutions import LocalSubstitution
+from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
+from launch.utilities import perform_substitutions
+
+from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from ..parameters_type import Parameters, SomeParameters
+from ..remap_rule_type import RemapRule, SomeRemapRules
+from ..substitutions import ExecutableInPackage
+from ..utilities import add_node_name, evaluate_parameters, get_node_name_count
+from ..utilities import make_namespace_absolute, normalize_parameters, normalize_remap_rules
+from ..utilities import plugin_support, prefix_namespace
+from ..utilities.namespace_utils import check_namespace, check_node_name
+
+
+class NodeActionExtension:
+    """
+    Changes how nodes are executed; entry point group ``launch_ros.node_action``.
+
+    :raises PluginException: if the extension is for another version.
+    """
+
+    NAME: Optional[str] = None
+    EXTENSION_POINT_VERSION = '0.1'
+
+    def __init__(self) -> None:
+        plugin_support.satisfies_version(self.EXTENSION_POINT_VERSION, '^0.1')
+
+    def prepare_for_execute(
+        self, context: LaunchContext, ros_specific_arguments: Dict[str, Any], node_action: Node
+    ) -> Tuple[List[Any], Dict[str, Any]]:
+        """Return further words for the command, and the arguments, changed at will."""
+        return [], ros_specific_arguments
+
+
+def _as_yaml(value: Any) -> str:
+    import yaml
+    return str(yaml.dump(value))
+
+
+@expose_action('node')
+class Node(ExecuteProcess):
+    """
+    Executes a node.
+
+    :param executable: a file name in the package, or without a package a path.
+    :param name: of the node; without one it is what the executable says.
+    :param exec_name: the process's name in the launch.
+    :param parameters: files and dictionaries; later ones win.
+    :param remappings: pairs of names.
+    :param ros_arguments: what goes behind ``--ros-args``.
+    :param arguments: what goes to the executable itself.
+    """
+
+    UNSPECIFIED_NODE_NAME = '<node_name_unspecified>'
+    UNSPECIFIED_NODE_NAMESPACE = '<node_namespace_unspecified>'
+
+    def __init__(
+        self, *, executable: SomeSubstitutionsType,
+        package: Optional[SomeSubstitutionsType] = None,
+        name: Optional[SomeSubstitutionsType] = None,
+        namespace: Optional[SomeSubstitutionsType] = None,
+        exec_name: Optional[SomeSubstitutionsType] = None,
+        parameters: Optional[SomeParameters] = None,
+        remappings: Optional[SomeRemapRules] = None,
+        ros_arguments: Optional[Iterable[SomeSubstitutionsType]] = None,
+        arguments: Optional[Iterable[SomeSubstitutionsType]] = None, **kwargs: Any
+    ) -> None:
+        cmd: List[SomeSubstitutionsType] = [
+            executable if package is None else
+            ExecutableInPackage(package=package, executable=executable)]
+        cmd += arguments or ()
+        if ros_arguments is not None:
+            cmd += ['--ros-args', *ros_arguments]
+        cmd += ['--ros-args']
+        if name is not None:
+            cmd += ['-r', LocalSubstitution(
+                "ros_specific_arguments['name']", description='node name')]
+        self.__parameters: Parameters = ()
+        if parameters is not None:
+            ensure_argument_type(parameters, list, 'parameters', 'Node')
+            self.__parameters = normalize_parameters(parameters)
+        super().__init__(cmd=cmd, name=exec_name, **kwargs)
+        self.__package = package
+        self.__node_executable = executable
+        self.__node_name = name
+        self.__node_namespace = namespace
+        self.__remappings: List[RemapRule] = list(normalize_remap_rules(remappings or ()))
+        self.__ros_arguments = ros_arguments
+        self.__arguments = arguments
+        self.__expanded_node_name = self.UNSPECIFIED_NODE_NAME
+        self.__expanded_node_namespace = self.UNSPECIFIED_NODE_NAMESPACE
+        self.__expanded_parameter_arguments: Optional[List[Tuple[str, bool]]] = None
+        self.__final_node_name: Optional[str] = None
+        self.__expanded_remappings: Optional[List[Tuple[str, str]]] = None
+        self.__substitutions_performed = False
+        self.__logger = launch.logging.get_logger(__name__)
+        self.__extensions = plugin_support.get_extensions(
+            'launch_ros.node_action', self.__logger)
+
+    @staticmethod
+    def parse_nested_parameters(params: List[Entity], parser: Parser) -> List[Any]:
+        """
+        Return ``parameters`` from ``<param name= value=/>`` and ``<param from=/>`` elements.
+
+        :raises RuntimeError: for attributes that exclude each other.
+        :raises ValueError: for an element with neither name nor file.
+        """
+        def read_named(elements: List[Entity]) -> Dict[Any, Any]:
+            values: Dict[Any, Any] = {}
+            for element in elements:
+                name = tuple(parser.parse_substitution(element.get_attr('name')))
+                identifier = element.get_attr('type', data_type=None, optional=True)
+                kind = None if identifier is None else (
+                    get_data_type_from_identifier(identifier))
+                value = element.get_attr('value', data_type=kind, optional=True)
+                nested = element.get_attr('param', data_type=List[Entity], optional=True)
+                element.assert_entity_completely_parsed()
+                if nested:
+                    for other, given in (('value', value), ('type', kind)):
+                        if given is not None:
+                            raise RuntimeError(
+                                f'nested parameters and {other} attributes are mutually '
+                                'exclusive')
+                    values[name] = read_named(nested)
+                elif value is not None:
+                    values[name] = ParameterValue(
+                        parser.parse_if_substitutions(value), value_type=kind)
+                else:
+                    raise RuntimeError('either a value attribute or nested params are needed')
+            return values
+
+        parameters: List[Any] = []
+        for param in params:
+            file = param.get_attr('from', optional=True)
+            allow_substs = param.get_attr('allow_substs', data_type=bool, optional=True)
+            name = param.get_attr('name', optional=True)
+            if file is not None and name is not None:
+                raise RuntimeError('name and from attributes are mutually exclusive')
+            if file is not None:
+                param.assert_entity_completely_parsed()
+                parameters.append(ParameterFile(
+                    parser.parse_substitution(file), allow_substs=bool(allow_substs)))
+            elif name is not None:
+                if allow_substs is not None:
+                    raise RuntimeError(
+                        "'allow_substs' can only be used together with 'from' attribute")
+                parameters.append(read_named([param]))
+            else:
+                raise ValueError('param Entity should have name or from attribute')
+        return parameters
+
+    @classmethod
+    def parse(
+        cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
+    ) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser, ignore=['cmd', *(ignore or ())])
+        kwargs.pop('name', None)
+        for name, attribute in (('arguments', 'args'), ('ros_arguments', 'ros_args')):
+            text = entity.get_attr(attribute, optional=True)
+            if text is not None:
+                kwargs[name] = cls._parse_cmdline(text, parser)
+        for name, attribute in (
+            ('name', 'name'), ('exec_name', 'exec_name'), ('package', 'pkg'),
+            ('namespace', 'namespace')
+        ):
+            text = entity.get_attr(attribute, optional=True)
+            if text is not None:
+                kwargs[name] = parser.parse_substitution(text)
+        kwargs['executable'] = parser.parse_substitution(entity.get_attr('exec'))
+        remappings = parse_remappings(entity, parser)
+        if remappings is not None:
+            kwargs['remappings'] = remappings
+        parameters = entity.get_attr('param', data_type=List[Entity], optional=True)
+        if parameters is not None:
+            kwargs['parameters'] = cls.parse_nested_parameters(parameters, parser)
+        return cls, kwargs
+
+    @property
+    def node_package(self) -> Optional[SomeSubstitutionsType]:
+        """The package as it was given."""
+        return self.__package
+
+    @property
+    def node_executable(self) -> SomeSubstitutionsType:
+        """The executable as it was given."""
+        return self.__node_executable
+
+    @property
+    def node_name(self) -> str:
+        """
+        The node's full name; what isn't specified is so named.
+
+        :raises RuntimeError: before the action executes.
+        """
+        if self.__final_node_name is None:
+            raise RuntimeError("cannot access 'node_name' before executing action")
+        return self.__final_node_name
+
+    @property
+    def expanded_node_namespace(self) -> str:
+        """The namespace, once substitutions are performed."""
+        return self.__expanded_node_namespace
+
+    @property
+    def expanded_remapping_rules(self) -> Optional[List[Tuple[str, str]]]:
+        """The pairs of names, global ones first, once substitutions are performed."""
+        return self.__expanded_remappings
+
+    def is_node_name_fully_specified(self) -> bool:
+        """Say whether name and namespace are known."""
+        return (self.UNSPECIFIED_NODE_NAME not in self.node_name
+                and self.UNSPECIFIED_NODE_NAMESPACE not in self.node_name)
+
+    def _create_params_file_from_dict(self, params: Dict[str, Any]) -> str:
+        import yaml
+        node = self.node_name if self.is_node_name_fully_specified() else '/**'
+        with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
+            values = {
+                name: list(value) if isinstance(value, tuple) else value
+                for name, value in params.items()}
+            yaml.dump({node: {'ros__parameters': values}}, file, default_flow_style=False)
+        return file.name
+
+    def _get_parameter_rule(self, param: Parameter, context: LaunchContext) -> str:
+        name, value = param.evaluate(context)
+        return f'{name}:={_as_yaml(value)}'
+
+    def __extend_cmd(self, *words: SomeSubstitutionsType) -> None:
+        self.cmd.extend(normalize_to_list_of_substitutions(word) for word in words)
+
+    def __expand_name(self, context: LaunchContext) -> None:
+        if self.__node_name is not None:
+            self.__expanded_node_name = perform_substitutions(
+                context, normalize_to_list_of_substitutions(self.__node_name))
+            check_node_name(self.__expanded_node_name)
+        namespace: Optional[str] = None
+        if self.__node_namespace is not None:
+            namespace = perform_substitutions(
+                context, normalize_to_list_of_substitutions(self.__node_namespace))
+        namespace = prefix_namespace(
+            context.launch_configurations.get('ros_namespace'), namespace)
+        if namespace is not None:
+            self.__expanded_node_namespace = make_namespace_absolute(namespace)
+            self.__extend_cmd('-r', LocalSubstitution("ros_specific_arguments['ns']"))
+            check_namespace(self.__expanded_node_namespace)
+
+    def __expand_parameters(self, context: LaunchContext) -> None:
+        self.__expanded_parameter_arguments = []
+        for given in context.launch_configurations.get('global_params', ()):
+            if isinstance(given, tuple):
+                name, value = given
+                self.__extend_cmd('-p', f'{name}:={value}')
+            else:
+                path = os.path.abspath(given)
+                self.__expanded_parameter_arguments.append((path, True))
+                if not os.path.isfile(path):
+                    raise AssertionError(f'Parameter file path is not a file: {path}')
+                self.__extend_cmd('--params-file', path)
+        for parameter in evaluate_parameters(context, self.__parameters):
+            is_file = not isinstance(parameter, Parameter)
+            if isinstance(parameter, Parameter):
+                argument = self._get_parameter_rule(parameter, context)
+            elif isinstance(parameter, pathlib.Path):
+                argument = str(parameter)
+                if not os.path.isfile(argument):
+                    self.__logger.warning(f'Parameter file path is not a file: {argument}')
+                    continue
+            else:
+                argument = self._create_params_file_from_dict(parameter)
+            self.__expanded_parameter_arguments.append((argument, is_file))
+            self.__extend_cmd('--params-file' if is_file else '-p', argument)
+
+    def __expand_remappings(self, context: LaunchContext) -> None:
+        rules = list(context.launch_configurations.get('ros_remaps') or ())
+        rules += [
+            (perform_substitutions(context, source), perform_substitutions(context, target))
+            for source, target in self.__remappings]
+        if rules:
+            self.__expanded_remappings = rules
+        for source, target in rules:
+            self.__extend_cmd('-r', f'{source}:={target}')
+
+    def _perform_substitutions(self, context: LaunchContext) -> None:
+        if self.__substitutions_performed:
+            # Derived classes need the name before this class executes.
+            return
+        self.__substitutions_performed = True
+        try:
+            self.__expand_name(context)
+        except Exception:
+            self.__logger.error(
+                'Error while expanding or validating node name or namespace for '
+                f"'package={self.__package}, executable={self.__node_executable}, "
+                f"name={self.__node_name}, namespace={self.__node_namespace}':")
+            raise
+        self.__final_node_name = prefix_namespace(
+            self.__expanded_node_namespace, self.__expanded_node_name)
+        self.__expand_parameters(context)
+        self.__expand_remappings(context)
+
+    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+        self._perform_substitutions(context)
+        arguments: Dict[str, Any] = {}
+        if self.__node_name is not None:
+            arguments['name'] = f'__node:={self.__expanded_node_name}'
+        if self.__expanded_node_namespace != '':
+            arguments['ns'] = f'__ns:={self.__expanded_node_namespace}'
+        for extension in self.__extensions.values():
+            words, arguments = extension.prepare_for_execute(context, arguments, self)
+            self.cmd.extend(words)
+        context.extend_locals({'ros_specific_arguments': arguments})
+        entities = super().execute(context)
+        if self.is_node_name_fully_specified():
+            add_node_name(context, self.node_name)
+            count = get_node_name_count(context, self.node_name)
+            if count > 1:
+                launch.logging.get_logger(self.name).warning(
+                    f'there are now at least {count} nodes with the name {self.node_name} '
+                    'created within this launch context')
+        return entities
+
+
+def parse_remappings(entity: Entity, parser: Parser) -> Optional[List[Any]]:
+    """Return ``remappings`` from ``<remap from= to=/>`` elements, if there are any."""
+    remaps = entity.get_attr('remap', data_type=List[Entity], optional=True)
+    if remaps is None:
+        return None
+    rules = [
+        (parser.parse_substitution(remap.get_attr('from')),
+         parser.parse_substitution(remap.get_attr('to'))) for remap in remaps]
+    for remap in remaps:
+        remap.assert_entity_completely_parsed()
+    return rules

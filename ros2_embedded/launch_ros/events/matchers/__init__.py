@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What says of an action whether its node is meant."""
+from __future__ import annotations
+
+from typing import Callable, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ...actions import Node
+
+__all__ = ['matches_node_name']
+
+
+def matches_node_name(node_name: str) -> Callable[[Node], bool]:
+    """Return a matcher for the node of that full name; '/' in front may be left out."""
+    full_name = node_name if node_name.startswith('/') else f'/{node_name}'
+    return lambda action: action.node_name == full_name

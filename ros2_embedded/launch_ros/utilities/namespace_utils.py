@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Namespaces, and whether names can be names of nodes."""
+import re
+from typing import Optional, TypeVar
+
+OptionalText = TypeVar('OptionalText', str, None)
+
+_TOKEN = '[A-Za-z_][A-Za-z0-9_]*'
+
+
+def is_root_namespace(ns: str) -> bool:
+    """Say whether it is '/'."""
+    return ns == '/'
+
+
+def is_namespace_absolute(ns: str) -> bool:
+    """Say whether it begins with '/'."""
+    return ns.startswith('/')
+
+
+def prefix_namespace(base_ns: Optional[str], ns: Optional[str]) -> Optional[str]:
+    """Return the namespace below the base, or as it is if absolute; None if both are."""
+    if ns is None:
+        combined = base_ns
+    elif not base_ns or is_namespace_absolute(ns):
+        combined = ns
+    else:
+        combined = f"{'' if is_root_namespace(base_ns) else base_ns}/{ns}"
+    if combined is None or is_root_namespace(combined):
+        return combined
+    return combined.rstrip('/')
+
+
+def make_namespace_absolute(ns: OptionalText) -> OptionalText:
+    """Return the namespace with '/' in front; None stays None."""
+    if ns is None or is_namespace_absolute(ns):
+        return ns
+    return '/' + ns
+
+
+def check_node_name(name: str) -> None:
+    """
+    Refuse what can't be a node's name.
+
+    :raises rclpy.exceptions.InvalidNodeNameException: saying why.
+    """
+    if len(name) > 255 or not re.fullmatch(_TOKEN, name):
+        # Only its error is needed: importing rclpy takes longer than all else here.
+        from rclpy.validate_node_name import validate_node_name
+        validate_node_name(name)
+
+
+def check_namespace(namespace: str) -> None:
+    """
+    Refuse what can't be an absolute namespace.
+
+    :raises rclpy.exceptions.InvalidNamespaceException: saying why.
+    """
+    if len(namespace) > 245 or not re.fullmatch(f'/|(/{_TOKEN})+', namespace):
+        from rclpy.validate_namespace import validate_namespace
+        validate_namespace(namespace)

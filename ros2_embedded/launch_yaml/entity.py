@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A YAML mapping or sequence as an entity."""
+from __future__ import annotations
+
+from typing import Any, List, Optional, Set
+
+from launch.frontend import Entity as BaseEntity
+from launch.frontend.type_utils import check_is_list_entity
+from launch.utilities.type_utils import is_instance_of
+
+
+class Entity(BaseEntity):
+    """A mapping of attributes, its children under 'children'; or a sequence of children."""
+
+    def __init__(
+        self, element: Any, type_name: str, *, parent: Optional[Entity] = None
+    ) -> None:
+        self.__element = element
+        self.__type_name = type_name
+        self.__parent = parent
+        self.__read_keys: Set[str] = set()
+        self.__children_called = False
+
+    @property
+    def type_name(self) -> str:
+        return self.__type_name
+
+    @property
+    def parent(self) -> Optional[Entity]:
+        return self.__parent
+
+    @property
+    def children(self) -> List[BaseEntity]:
+        self.__children_called = True
+        children = self.__element
+        if not isinstance(children, (dict, list)):
+            raise TypeError(
+                f'Expected a dict or list, got {type(children)}:\n---\n{children}\n---')
+        if isinstance(children, dict):
+            if 'children' not in children:
+                raise ValueError(
+                    f'Expected entity `{self.__type_name}` to have children entities.'
+                    'That can be a list of subentities or a dictionary with a `children` '
+                    'list element')
+            self.__read_keys.add('children')
+            children = children['children']
+        entities: List[BaseEntity] = []
+        for child in children:
+            if not isinstance(child, dict) or len(child) != 1:
+                raise RuntimeError(
+                    'Subentities must be a dictionary with only one key, '
+                    'which is the entity type')
+            [(type_name, element)] = child.items()
+            entities.append(Entity(element, type_name, parent=self))
+        return entities
+
+    def assert_entity_completely_parsed(self) -> None:
+        if isinstance(self.__element, list):
+            if not self.__children_called:
+                raise ValueError(
+                    f'Unexpected nested entity(ies) found in `{self.__type_name}`: '
+                    f'{self.__element}')
+        elif isinstance(self.__element, dict):
+            unread = set(self.__element) - self.__read_keys
+            if unread:
+                raise ValueError(
+                    f'Unexpected key(s) found in `{self.__type_name}`: {unread}')
+
+    def get_attr(
+        self, name: str, *, data_type: Any = str, optional: bool = False,
+        can_be_str: bool = True
+    ) -> Any:
+        if not isinstance(self.__element, dict) or name not in self.__element:
+            if optional:
+                return None
+            raise AttributeError(
+                f"Can not find attribute '{name}' in Entity '{self.type_name}'")
+        self.__read_keys.add(name)
+        value = self.__element[name]
+        if check_is_list_entity(data_type):
+            if isinstance(value, list) and value and isinstance(value[0], dict):
+                return [Entity(child, name, parent=self) for child in value]
+            raise TypeError(
+                f"Attribute '{name}' of Entity '{self.type_name}' expected to be a list of "
+                'dictionaries.')
+        if not is_instance_of(value, data_type, can_be_str=can_be_str):
+            raise TypeError(
+                f"Attribute '{name}' of Entity '{self.type_name}' expected to be of type "
+                f"'{data_type}', got '{type(value)}'")
+        return value
