@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Optional, Union
 
+from launch import Action, LaunchContext, LaunchDescriptionEntity
+from launch.actions import ExecuteLocal, GroupAction
+
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess, send
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
-from launch import LaunchContext, LaunchDescriptionEntity
-from launch.actions import ExecuteLocal, GroupAction
 
 
 class CloudGroup(GroupAction):
@@ -30,7 +31,7 @@ class CloudGroup(GroupAction):
 
     def __init__(
         self, machine: Union[CloudInstance, str],
-        actions: Iterable[LaunchDescriptionEntity], **kwargs: Any,
+        actions: Iterable[Action], **kwargs: Any,
     ) -> None:
         super().__init__(list(actions), **kwargs)
         if not isinstance(machine, (CloudInstance, str)):

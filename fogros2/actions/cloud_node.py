@@ -6,14 +6,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Optional, Union
 
+from launch import LaunchContext, LaunchDescriptionEntity
+from launch_ros.actions import Node
+
 from fogros2 import plugin_system
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess
 from fogros2.errors import ConfigurationError
 from fogros2.model import Stream
-from launch import LaunchContext, LaunchDescriptionEntity
-from launch_ros.actions import Node
 
 
 class CloudNode(Node, RemoteProcess):

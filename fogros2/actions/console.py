@@ -8,8 +8,9 @@ import sys
 import threading
 from typing import Optional, TextIO
 
-from fogros2.report import Event, OutputLine, Progress, StepDone, StepFailed, StepStarted
 import launch.logging
+
+from fogros2.report import Event, OutputLine, Progress, StepDone, StepFailed, StepStarted
 
 _WIDTH = 24
 

@@ -2,10 +2,10 @@
 """
 What ties a launch to its machines: one coordinator in each launch context.
 
-Cloud processes register here as launch executes them. When launch has gone through everything that
-is there to execute at that moment, the machines that are new are checked together, before any of
-them is made, then brought up in parallel, in threads. When launch shuts down, by whatever cause, it
-is kept alive until all processes have ended and everything is taken down again.
+Cloud processes register here as launch executes them. When launch has gone through everything
+that is there to execute at that moment, the machines that are new are checked together, before
+any of them is made, then brought up in parallel, in threads. When launch shuts down, by whatever
+cause, it is kept alive until all processes have ended and everything is taken down again.
 """
 
 from __future__ import annotations
@@ -17,17 +17,22 @@ import difflib
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
-from fogros2.actions import signals
-from fogros2.actions.console import Console
-from fogros2.actions.session import Session
-from fogros2.errors import Cancelled, ConfigurationError, FogError
 from launch import Event, EventHandler, LaunchContext
 from launch.actions import (
-    ExecuteLocal, OpaqueFunction, PopEnvironment, PushEnvironment, ResetEnvironment,
+    ExecuteLocal,
+    OpaqueFunction,
+    PopEnvironment,
+    PushEnvironment,
+    ResetEnvironment,
 )
 from launch.event_handlers import OnShutdown
 from launch.events.process import ShutdownProcess
 import launch.logging
+
+from fogros2.actions import signals
+from fogros2.actions.console import Console
+from fogros2.actions.session import Session
+from fogros2.errors import Cancelled, ConfigurationError, FogError
 
 if TYPE_CHECKING:
     from fogros2.actions.machines import CloudInstance
@@ -63,7 +68,11 @@ class _Census(ShutdownProcess):
     """Asks every process action for itself; shuts none of them down."""
 
     def __init__(self, found: list[ExecuteLocal]) -> None:
-        super().__init__(process_matcher=found.append)  # returns None: no match
+        def note(action: ExecuteLocal) -> bool:
+            found.append(action)
+            return False  # not meant for this one
+
+        super().__init__(process_matcher=note)
 
 
 class Coordinator:

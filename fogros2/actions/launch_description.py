@@ -7,6 +7,9 @@ from collections.abc import Iterable, Iterator
 import functools
 from typing import get_args, Optional, Union
 
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import ExecuteLocal, IncludeLaunchDescription, TimerAction
+
 from fogros2.actions import private
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.coordinator import Coordinator
@@ -14,8 +17,6 @@ from fogros2.actions.remote import RemoteProcess
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 from fogros2.model import RobotNodes
-from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import ExecuteLocal, IncludeLaunchDescription, TimerAction
 
 
 class FogROSLaunchDescription(LaunchDescription):

@@ -15,7 +15,11 @@ from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 from fogros2.actions import words
 from fogros2.errors import ConfigurationError
 from fogros2.model import (
-    Bootstrap, DEFAULT_LIFETIME, DEFAULT_ROBOT_TIMEOUT, MachineSpec, OnExit,
+    Bootstrap,
+    DEFAULT_LIFETIME,
+    DEFAULT_ROBOT_TIMEOUT,
+    MachineSpec,
+    OnExit,
 )
 from fogros2.store import check_name
 
@@ -103,7 +107,7 @@ class CloudInstance:
     def _unknown(self, name: str) -> ConfigurationError:
         known = sorted({
             parameter for cls in type(self).__mro__[:-1]
-            for parameter in inspect.signature(cls.__init__).parameters
+            for parameter in inspect.signature(cls).parameters
         } - {'self', 'options', 'unknown', 'common'})
         near = difflib.get_close_matches(name, known, n=1)
         return ConfigurationError(
@@ -300,7 +304,8 @@ def _choice(kind: Any) -> Any:
             near = difflib.get_close_matches(str(value), get_args(kind), n=1)
             raise ConfigurationError(
                 f'{what}={value!r} is unknown',
-                f"did you mean '{near[0]}'?" if near else f"use one of {get_args(kind)}")
+                f"did you mean '{near[0]}'?" if near else
+                f"use one of {', '.join(get_args(kind))}")
         return cast(str, value)
     return check
 

@@ -9,16 +9,17 @@ from pathlib import Path
 import re
 from typing import Optional
 
-from fogros2 import plan
-from fogros2.actions import private
-from fogros2.errors import ConfigurationError
-from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
 from launch import LaunchContext, Substitution
 from launch.actions import ExecuteLocal
 from launch.conditions import evaluate_condition_expression
 from launch.substitutions import FindExecutable
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.substitutions import ExecutableInPackage
+
+from fogros2 import plan
+from fogros2.actions import private
+from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
 
 #: ROS arguments whose next word is a file, which travels.
 _FILE_ARGUMENTS = ('--params-file', '--log-config-file')
@@ -70,7 +71,7 @@ def from_action(
     """
     description = action.process_description
     texts = Texts(plan.ament_prefixes(base), spec.workspace)
-    final = list(description.final_cmd)
+    final = list(description.final_cmd or ())
     # launch puts the prefix's words before the command's
     count = len(final) - len(description.cmd)
     prefix, final = final[:count], final[count:]
@@ -89,7 +90,7 @@ def from_action(
             files[key] = texts.text(_read(final[index]))
             arguments[index] = ({'file': key},)
     options = private.options(action)
-    name = description.final_name
+    name = str(description.final_name)
     return NodeSpec(
         id=f'{name}.{launch_id}',
         name=name,
@@ -117,7 +118,7 @@ def _environment(
 ) -> dict[str, str]:
     """Return the variables that the launch file set, for this process or for all."""
     description = action.process_description
-    final: Mapping[str, str] = description.final_env
+    final: Mapping[str, str] = description.final_env or {}
     if description.env is not None:
         # an environment of its own: on a machine it comes on top of what ROS needs there
         return dict(final)

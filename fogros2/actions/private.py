@@ -3,11 +3,11 @@
 What is used of launch's private parts, all in this module, and why.
 
 launch has no seam for "start the process elsewhere": ``ExecuteLocal.execute`` resolves the
-action, registers its handlers and then creates a task from its private method ``__execute_process``.
-That method is the seam here. A cloud process overrides it and sets ``_subprocess_transport`` and
-``_subprocess_protocol``; a robot process that waits for the cloud runs it later. All the rest
-(substitutions, handlers, output, ``on_exit``, signals) stays launch's own code. The options that
-the method reads have no getters.
+action, registers its handlers and then creates a task from its private method
+``__execute_process``. That method is the seam here. A cloud process overrides it and sets
+``_subprocess_transport`` and ``_subprocess_protocol``; a robot process that waits for the cloud
+runs it later. All the rest (substitutions, handlers, output, ``on_exit``, signals) stays launch's
+own code. The options that the method reads have no getters.
 
 The names are those of Jazzy (launch 3.4) and the same in its embedded default;
 ``test/unit/test_actions_private.py`` looks for each.
@@ -44,18 +44,22 @@ class Options:
 def options(action: ExecuteLocal) -> Options:
     """Return a prepared action's options (``prepare`` resolves ``respawn`` to a bool)."""
     return Options(
-        respawn=bool(getattr(action, '_ExecuteLocal__respawn')),
-        respawn_delay=getattr(action, '_ExecuteLocal__respawn_delay') or 0.0,
-        respawn_max_retries=getattr(action, '_ExecuteLocal__respawn_max_retries'),
-        log_cmd=getattr(action, '_ExecuteLocal__log_cmd'))
+        respawn=bool(_private(action, 'respawn')),
+        respawn_delay=_private(action, 'respawn_delay') or 0.0,
+        respawn_max_retries=_private(action, 'respawn_max_retries'),
+        log_cmd=_private(action, 'log_cmd'))
 
 
 def prefix_output(action: ExecuteLocal, machine: str) -> None:
     """Put the machine's name before the process's where the output format names the process."""
     name = '{this.process_description.final_name}'
-    before = getattr(action, '_ExecuteLocal__output_format')
+    before: str = _private(action, 'output_format')
     # a name has no braces, so it is safe in a format
-    setattr(action, '_ExecuteLocal__output_format', before.replace(name, f'{machine}.{name}'))
+    vars(action)['_ExecuteLocal__output_format'] = before.replace(name, f'{machine}.{name}')
+
+
+def _private(action: ExecuteLocal, name: str) -> Any:
+    return getattr(action, f'_ExecuteLocal__{name}')
 
 
 def execute_process(action: ExecuteLocal) -> Waiting:
@@ -64,14 +68,18 @@ def execute_process(action: ExecuteLocal) -> Waiting:
     return bound
 
 
-def set_transport(action: ExecuteLocal, transport: object) -> None:
+def set_transport(action: ExecuteLocal, process: object) -> None:
     """
-    Make ``transport`` what the action takes for its subprocess.
+    Make ``process`` what the action takes for its subprocess.
 
     launch calls ``send_signal``, ``kill``, ``get_returncode`` and looks at ``complete``.
     """
-    action._subprocess_transport = transport
-    action._subprocess_protocol = transport
+    vars(action).update(_subprocess_transport=process, _subprocess_protocol=process)
+
+
+def transport(action: ExecuteLocal) -> Any:
+    """Return what the action takes for its subprocess, None before it has one."""
+    return action._subprocess_transport
 
 
 def replace(entity: Any, method: str, replacement: Waiting) -> None:
@@ -93,6 +101,6 @@ def signal_manager() -> Optional[AsyncSafeSignalManager]:
 
     Its handler for SIGTERM cancels the service on the spot; there is no public way to replace it.
     """
-    manager: Optional[AsyncSafeSignalManager] = getattr(
-        AsyncSafeSignalManager, '_AsyncSafeSignalManager__current')
+    name = '_AsyncSafeSignalManager__current'
+    manager: Optional[AsyncSafeSignalManager] = getattr(AsyncSafeSignalManager, name)
     return manager

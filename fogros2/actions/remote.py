@@ -4,20 +4,20 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import signal
 from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext, LaunchDescriptionEntity
+from launch.actions import ExecuteLocal
+from launch.event_handlers import OnProcessIO
+from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
+import launch.logging
 
 from fogros2.actions import node_spec, private
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
-from launch import LaunchContext, LaunchDescriptionEntity
-from launch.actions import ExecuteLocal
-from launch.event_handlers import OnProcessIO
-from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
-import launch.logging
 
 if TYPE_CHECKING:
     from fogros2.actions.session import Session
@@ -75,7 +75,7 @@ class RemoteProcess(ExecuteLocal):
     ) -> Optional[list[LaunchDescriptionEntity]]:
         # launch leaves SIGINT to the terminal where that sends it to the nodes too; not here.
         # The machine itself goes on to SIGTERM and SIGKILL, so a lost link can't keep it from it
-        run = self._subprocess_transport
+        run: Optional[RemoteRun] = private.transport(self)
         if run is not None:
             run.stop()
         return None
@@ -115,9 +115,9 @@ class RemoteRun:
         """Return the exit status, None while there is none."""
         return self._returncode
 
-    def send_signal(self, number: int) -> None:
-        """Send the process a signal."""
-        name = signal.Signals(number).name
+    def send_signal(self, number: Union[int, str]) -> None:
+        """Send the process a signal, by its number or its name."""
+        name = number if isinstance(number, str) else signal.Signals(number).name
         if self.started:
             self._session.signal(self, name)
         else:
@@ -190,8 +190,9 @@ class RemoteRun:
         if self._returncode == 0:
             self._logger.info(f'process has finished cleanly [pid {pid}]')
         else:
-            self._logger.error('process has died [pid {}, exit code {}, cmd \'{}\'].'.format(
-                pid, self._returncode, ' '.join(word for word in self._details['cmd'] if word)))
+            command = ' '.join(word for word in self._details['cmd'] if word)
+            self._logger.error(
+                f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
         self._context.emit_event_sync(
             ProcessExited(returncode=self._returncode, **self._details))
         if not event.get('respawns'):
@@ -218,14 +219,19 @@ def send(action: ExecuteLocal, machine: Union[CloudInstance, str]) -> None:
         action.__class__ = _remote_class(type(action))
     except TypeError as error:
         raise ConfigurationError(
-            f'{type(action).__name__} can\'t run on a machine: {error}',
+            f"{type(action).__name__} can't run on a machine: {error}",
             'take it out of the CloudGroup') from error
     assert isinstance(action, RemoteProcess)
     action._fogros2_machine = machine
 
 
-@functools.lru_cache(maxsize=None)
+_remote_classes: dict[type[ExecuteLocal], type[RemoteProcess]] = {}
+
+
 def _remote_class(cls: type[ExecuteLocal]) -> type[RemoteProcess]:
-    # ExecuteLocal itself can't stand before a class derived from it
-    bases = (RemoteProcess,) if cls is ExecuteLocal else (cls, RemoteProcess)
-    return type(cls.__name__, bases, {'__module__': cls.__module__, '__doc__': cls.__doc__})
+    if cls not in _remote_classes:
+        # ExecuteLocal itself can't stand before a class derived from it
+        bases = (RemoteProcess,) if cls is ExecuteLocal else (cls, RemoteProcess)
+        _remote_classes[cls] = type(
+            cls.__name__, bases, {'__module__': cls.__module__, '__doc__': cls.__doc__})
+    return _remote_classes[cls]

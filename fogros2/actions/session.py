@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 import functools
 from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 
+import launch.logging
+
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec, NodeSpec
-import launch.logging
 
 if TYPE_CHECKING:
     from fogros2.deploy import RunningMachine

@@ -9,10 +9,11 @@ import threading
 from types import FrameType
 from typing import Any, Optional
 
-from fogros2.actions import private
 from launch import LaunchContext
 from launch.events import Shutdown
 import launch.logging
+
+from fogros2.actions import private
 
 
 def _noticed(number: int, frame: Optional[FrameType]) -> None:

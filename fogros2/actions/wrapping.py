@@ -79,18 +79,18 @@ def _wrap_result(handles: Any, apply: Apply) -> None:
 @contextlib.contextmanager
 def _handlers_wrapped(context: LaunchContext, apply: Apply) -> Iterator[None]:
     """Wrap what the event handlers will yield that are registered meanwhile."""
-    outer = context.__dict__.get('register_event_handler')
+    outer = vars(context).get('register_event_handler')
     register = context.register_event_handler
 
     def wrapping(event_handler: Any, append: bool = False) -> None:
         _wrap_result(event_handler, apply)
         register(event_handler, append=append)
 
-    context.register_event_handler = wrapping
+    vars(context)['register_event_handler'] = wrapping
     try:
         yield
     finally:
         if outer is None:
-            del context.register_event_handler
+            del vars(context)['register_event_handler']
         else:
-            context.register_event_handler = outer
+            vars(context)['register_event_handler'] = outer

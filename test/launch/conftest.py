@@ -7,6 +7,7 @@ import os
 import stat
 import threading
 from types import SimpleNamespace
+
 import pytest
 
 from fogros2.errors import Cancelled
@@ -23,6 +24,7 @@ class FakeMachine:
         self.vpn_address = '10.99.0.2'
         self.callback = None
         self.nodes = {}
+        self.all = []
         self.stops = []
         self.signals = []
         self.answers = True
@@ -32,6 +34,7 @@ class FakeMachine:
     def start(self, nodes):
         for node in nodes:
             self.launch.note('start', self.spec.name, node.name)
+            self.all.append(node)
             self.nodes[node.executable or node.arguments[0]] = node
             if self.answers:
                 self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
@@ -43,7 +46,7 @@ class FakeMachine:
         self.stops.append(list(ids))
         self.launch.note('stop', self.spec.name, *ids)
         if self.exits_on_stop:
-            for node in self.nodes.values():
+            for node in self.all:
                 if node.id in ids:
                     self.say('exited', node, returncode=-2, respawns=False)
 
@@ -101,7 +104,7 @@ class FakeLaunch:
         self.note('expect', *names)
 
     def robot_environment(self):
-        return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': 'file:///dds.xml'}
+        return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
     def prepare(self, specs, programs):
         self.note('prepare', [spec.name for spec in specs], programs)
@@ -153,9 +156,10 @@ def fake():
 @pytest.fixture
 def run(fake, package, monkeypatch, tmp_path):
     """Return a function that runs a launch description on the fake and returns its status."""
-    from fogros2.actions.coordinator import Coordinator
     from launch import LaunchService
     import launch.logging
+
+    from fogros2.actions.coordinator import Coordinator
 
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     before = dict(os.environ)

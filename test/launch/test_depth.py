@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cloud node runs on its machine wherever in the launch it stands, and nowhere else."""
+
+from __future__ import annotations
+
+from launch import LaunchDescription, LaunchDescriptionSource
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    ExecuteProcess,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetLaunchConfiguration,
+    TimerAction,
+)
+from launch.conditions import IfCondition, UnlessCondition
+from launch.event_handlers import OnProcessExit, OnProcessStart
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node, PushROSNamespace, SetParameter
+import pytest
+
+from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
+
+
+def ends(machine, node):
+    """Have each node exit as soon as it started, so that the launch ends."""
+    machine.say('exited', node, returncode=0, respawns=False)
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='')
+
+
+def cloud_node(planner, **kwargs):
+    return CloudNode(machine=planner, package='demo', executable='talker', **kwargs)
+
+
+def node(planner=None, **kwargs):
+    return Node(package='demo', executable='talker', **kwargs)
+
+
+def included(make, planner):
+    return IncludeLaunchDescription(
+        LaunchDescriptionSource(LaunchDescription([make(planner)]), location='included'))
+
+
+DEPTHS = {
+    'directly': lambda make, planner: make(planner),
+    'group': lambda make, planner: GroupAction([make(planner)]),
+    'condition': lambda make, planner: GroupAction(
+        [GroupAction([make(planner)], condition=IfCondition('true'))],
+        condition=UnlessCondition('false')),
+    'include': lambda make, planner: included(make, planner),
+    'function': lambda make, planner: OpaqueFunction(
+        function=lambda context: [make(planner)]),
+    'timer': lambda make, planner: TimerAction(period=0.01, actions=[make(planner)]),
+    'timer in function': lambda make, planner: OpaqueFunction(
+        function=lambda context: [TimerAction(period=0.01, actions=[
+            GroupAction([make(planner)])])]),
+    'handler': lambda make, planner: GroupAction([
+        RegisterEventHandler(OnProcessExit(
+            target_action=lambda action: 'robot' in action.name, on_exit=[make(planner)])),
+    ]),
+    'handler with a function': lambda make, planner: RegisterEventHandler(OnProcessExit(
+        target_action=lambda action: 'robot' in action.name,
+        on_exit=lambda event, context: [make(planner)])),
+}
+
+
+def robot_process():
+    return ExecuteProcess(cmd=['true'], name='robot')
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+@pytest.mark.parametrize('depth', DEPTHS)
+def test_cloud_node(run, fake, planner, depth, description):
+    fake.on_start = ends
+    entity = DEPTHS[depth](cloud_node, planner)
+    assert run(description([entity, robot_process()])) == 0
+    assert fake.noted('up') == [('planner',)]
+    assert len(fake.noted('start')) == 1
+    assert len(fake.noted('down')) == 1
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+@pytest.mark.parametrize('depth', DEPTHS)
+def test_cloud_group(run, fake, planner, depth, description, capfd):
+    fake.on_start = ends
+    entity = DEPTHS[depth](node, planner)
+    assert run(description([CloudGroup(planner, [entity]), robot_process()])) == 0
+    assert len(fake.noted('start')) == 1
+    assert 'here' not in capfd.readouterr().out
+
+
+def test_false_conditions_cost_nothing(run, fake, planner):
+    description = FogROSLaunchDescription([
+        DeclareLaunchArgument('cloud', default_value='false'),
+        cloud_node(planner, condition=IfCondition(LaunchConfiguration('cloud'))),
+        CloudGroup(planner, [node()], condition=IfCondition(LaunchConfiguration('cloud'))),
+        ExecuteProcess(cmd=['true']),
+    ])
+    assert run(description) == 0
+    assert fake.notes == []
+
+
+def test_on_exit_of_a_group_process_stays_on_the_machine(run, fake, planner):
+    fake.on_start = ends
+    first = node(on_exit=[node()], exec_name='first')
+    assert run(LaunchDescription([CloudGroup(planner, [first])])) == 0
+    assert [name.split('-')[0] for _, name in fake.noted('start')] == ['first', 'talker']
+
+
+def test_a_timer_of_the_robot_is_not_drawn_into_a_group(run, fake, planner, capfd):
+    """The timers of a launch share an event handler, whoever of them registered it."""
+    fake.on_start = ends
+    assert run(LaunchDescription([
+        CloudGroup(planner, [TimerAction(period=0.01, actions=[node()])]),
+        TimerAction(period=0.02, actions=[ExecuteProcess(
+            cmd=['echo', 'on', 'the', 'robot'], output='screen')]),
+    ])) == 0
+    assert len(fake.noted('start')) == 1
+    assert 'on the robot' in capfd.readouterr().out
+
+
+def test_nested_machines_are_kept(run, fake, planner):
+    fake.on_start = ends
+    other = ContainerInstance(name='other', ros_workspace='')
+    third = ContainerInstance(name='third', ros_workspace='')
+    assert run(LaunchDescription([CloudGroup(planner, [
+        node(exec_name='a'), cloud_node(other, exec_name='b'),
+        GroupAction([CloudGroup(third, [TimerAction(
+            period=0.01, actions=[node(exec_name='c')])])]),
+    ])])) == 0
+    assert sorted((machine, name[0]) for machine, name in fake.noted('start')) == [
+        ('other', 'b'), ('planner', 'a'), ('third', 'c')]
+
+
+def test_what_a_group_sets_reaches_its_nodes(run, fake, planner):
+    fake.on_start = ends
+    assert run(LaunchDescription([
+        CloudGroup(planner, [
+            PushROSNamespace('arm'), SetParameter('use_sim_time', True),
+            SetLaunchConfiguration('speed', '3'),
+            node(name='mover', parameters=[{'speed': LaunchConfiguration('speed')}],
+                 remappings=[('in', 'out')], arguments=['--fast'])]),
+    ])) == 0
+    spec = fake.machines['planner'].nodes['talker']
+    words = [word for word in spec.arguments if isinstance(word, str)]
+    assert words[0] == '--fast'
+    assert '__node:=mover' in words and '__ns:=/arm' in words
+    assert 'use_sim_time:=True' in words and 'in:=out' in words
+    (key, content), = spec.files.items()
+    assert spec.arguments[words_index(spec.arguments, '--params-file') + 1] == ({'file': key},)
+    assert 'speed: 3' in content
+
+
+def words_index(arguments, word):
+    return [index for index, argument in enumerate(arguments) if argument == word][0]
+
+
+def test_the_users_handlers_work_with_cloud_nodes(run, fake, planner):
+    seen = []
+    fake.on_start = ends
+    talker = cloud_node(planner)
+
+    def note(event, context):
+        seen.append((type(event).__name__, event.action, event.pid))
+
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessStart(target_action=talker, on_start=note)),
+        RegisterEventHandler(OnProcessExit(target_action=talker, on_exit=note)),
+        talker,
+    ])) == 0
+    assert seen == [('ProcessStarted', talker, 4001), ('ProcessExited', talker, 4001)]
+
+
+def test_emitting_an_include_is_not_lost(run, fake, planner):
+    from launch.events import IncludeLaunchDescription as Include
+    fake.on_start = ends
+    later = LaunchDescription([cloud_node(planner)])
+    assert run(LaunchDescription([EmitEvent(event=Include(later))])) == 0
+    assert len(fake.noted('start')) == 1

@@ -1,0 +1,541 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order of things: up, events while it runs, failure, shutdown."""
+
+from __future__ import annotations
+
+import threading
+
+from launch import LaunchDescription
+from launch.actions import (
+    EmitEvent,
+    ExecuteProcess,
+    LogInfo,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
+    Shutdown,
+    TimerAction,
+)
+from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
+from launch.events import matches_action
+from launch.events.process import ProcessStdin, ShutdownProcess, SignalProcess
+from launch_ros.actions import Node
+import pytest
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2.actions import remote
+from fogros2.errors import AgentError, ConfigurationError, ProviderError, VpnError
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='')
+
+
+def talker(machine, **kwargs):
+    return CloudNode(machine=machine, package='demo', executable='talker', **kwargs)
+
+
+def ends(machine, node):
+    machine.say('exited', node, returncode=0, respawns=False)
+
+
+def robot(fake, *cmd, **kwargs):
+    """Return a process of the robot's, and what notes its start and end."""
+    process = ExecuteProcess(cmd=cmd or ['true'], **kwargs)
+    return [
+        RegisterEventHandler(OnProcessStart(
+            target_action=process, on_start=lambda event, context: fake.note('robot starts'))),
+        RegisterEventHandler(OnProcessExit(
+            target_action=process, on_exit=lambda event, context: fake.note('robot ends'))),
+        process,
+    ]
+
+
+def order(fake, *whats):
+    return [note[0] for note in fake.notes if note[0] in whats]
+
+
+# -- up ------------------------------------------------------------------------------------------
+
+
+def test_robot_nodes_wait_for_the_cloud(run, fake, planner):
+    fake.on_start = ends
+    fake.waits['planner'] = go = threading.Event()
+    description = FogROSLaunchDescription([
+        *robot(fake), talker(planner),
+        # timers of the robot count from when the cloud is up; this runs at once
+        OpaqueFunction(function=lambda context: context.asyncio_loop.call_later(0.2, go.set)
+                       and None),
+    ])
+    assert run(description) == 0
+    assert order(fake, 'up', 'start', 'robot starts', 'down') == [
+        'up', 'start', 'robot starts', 'down']
+
+
+def test_robot_nodes_start_immediately_if_so_wanted(run, fake, planner):
+    fake.on_start = ends
+    # the machine comes up only when the robot's process has started
+    fake.waits['planner'] = go = threading.Event()
+    process = ExecuteProcess(cmd=['true'])
+    assert run(FogROSLaunchDescription([
+        RegisterEventHandler(OnProcessStart(
+            target_action=process, on_start=lambda event, context: go.set())),
+        process, talker(planner),
+    ], robot_nodes='immediately')) == 0
+    assert fake.noted('is up')
+
+
+def test_robot_nodes_alone_do_not_wait(run, fake):
+    assert run(FogROSLaunchDescription(robot(fake))) == 0
+    assert [note[0] for note in fake.notes] == ['robot starts', 'robot ends']
+
+
+def test_an_unknown_order_of_robot_nodes():
+    with pytest.raises(ConfigurationError, match='robot_nodes'):
+        FogROSLaunchDescription(robot_nodes='soon')
+
+
+def test_order_of_what_the_robot_executes_is_kept(run, fake, planner, capfd):
+    """A held process has the configuration of its place, not of the moment it starts."""
+    from launch.actions import SetLaunchConfiguration
+    from launch.substitutions import LaunchConfiguration
+    fake.on_start = ends
+    entities = []
+    for value in ('one', 'two'):
+        entities += [
+            SetLaunchConfiguration('x', value),
+            ExecuteProcess(cmd=['echo', 'x is', LaunchConfiguration('x')], output='screen')]
+    assert run(FogROSLaunchDescription([*entities, talker(planner)])) == 0
+    output = capfd.readouterr().out
+    assert 'x is one' in output and 'x is two' in output
+
+
+def test_machines_come_up_in_parallel_and_once(run, fake, planner):
+    fake.on_start = ends
+    other = ContainerInstance(name='other', ros_workspace='')
+
+    class Both:
+        def wait(self, timeout):
+            return len(fake.noted('up')) == 2
+
+    fake.waits = {'planner': Both(), 'other': Both()}
+    assert run(LaunchDescription([talker(planner), talker(other), talker(planner)])) == 0
+    assert fake.noted('prepare') == [(
+        ['planner', 'other'],
+        {'planner': [('demo', 'talker')], 'other': [('demo', 'talker')]})]
+    assert sorted(machine for machine, _ in fake.noted('start')) == ['other', 'planner', 'planner']
+
+
+def test_a_later_node_joins_a_running_machine(run, fake, planner):
+    fake.on_start = ends
+    first, second = talker(planner), talker(planner)
+    assert run(LaunchDescription([
+        first,
+        RegisterEventHandler(OnProcessExit(target_action=first, on_exit=[second])),
+    ])) == 0
+    assert len(fake.noted('up')) == 1 and len(fake.noted('start')) == 2
+
+
+def test_a_machine_can_be_named(run, fake, planner):
+    fake.on_start = ends
+    assert run(FogROSLaunchDescription([talker('planner'), talker(planner)])) == 0
+    assert fake.noted('up') == [('planner',)]
+
+
+def test_an_unknown_name(run, fake, planner, capfd):
+    assert run(LaunchDescription([talker(planner), talker('planer')])) == 1
+    assert "no machine of this launch is called 'planer' (did you mean 'planner'?)" in (
+        capfd.readouterr().out)
+    assert not fake.noted('up')
+
+
+def test_one_name_for_two_machines(run, fake, planner, capfd):
+    twin = ContainerInstance(name='planner', ros_workspace='', memory='1g')
+    assert run(LaunchDescription([talker(planner), talker(twin)])) == 1
+    assert "two machines of this launch are called 'planner'" in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_what_a_machine_says_of_itself(run, fake, planner):
+    told = []
+
+    def look(machine, node):
+        told.append(planner.is_created)
+        ends(machine, node)
+
+    fake.on_start = look
+    assert (planner.is_created, planner.ip, planner.vpn_ip) == (False, None, None)
+    assert run(LaunchDescription([talker(planner)])) == 0
+    assert told == [True]
+    assert (planner.ip, planner.vpn_ip) == ('192.0.2.7', '10.99.0.2')
+    assert planner.info()['public_ip'] == '192.0.2.7'
+
+
+def test_steps_are_shown_and_summed_up(run, fake, planner, capfd):
+    fake.on_start = ends
+    assert run(LaunchDescription([talker(planner)])) == 0
+    output = capfd.readouterr().out
+    assert '[INFO] [fogros2]: planner: machine 0.' in output and '(made of air)' in output
+    assert 'machine  step     seconds' in output
+    assert '\r' not in output and '\x1b' not in output
+
+
+# -- the environment -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+@pytest.mark.parametrize('place', ['before', 'after'])
+def test_robot_nodes_have_the_dds_environment(run, fake, planner, capfd, description, place):
+    fake.on_start = ends
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
+    entities = [process, talker(planner)]
+    assert run(description(entities if place == 'before' else entities[::-1])) == 0
+    assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
+
+
+def test_a_launch_without_cloud_keeps_its_dds_environment(run, fake, monkeypatch, capfd):
+    monkeypatch.setenv('CYCLONEDDS_URI', 'mine')
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
+    assert run(FogROSLaunchDescription([process])) == 0
+    assert 'dds is mine' in capfd.readouterr().out
+
+
+def test_a_node_that_runs_already_is_warned_about(run, fake, planner, capfd):
+    fake.on_start = ends
+    process = ExecuteProcess(cmd=['sleep', '60'], name='early')
+    cloud = talker(planner, on_exit=[Shutdown()])
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessStart(target_action=process, on_start=[cloud])), process,
+    ])) == 0
+    assert f'{process.name} runs already' in capfd.readouterr().out
+
+
+def test_the_launch_files_environment_travels(run, fake, planner, monkeypatch):
+    fake.on_start = ends
+    monkeypatch.setenv('FROM_THE_SHELL', 'stays')
+    monkeypatch.setenv('SAME', 'as here')
+    assert run(LaunchDescription([
+        SetEnvironmentVariable('SET', 'by the launch file'),
+        SetEnvironmentVariable('PATH', '/robot/bin:/usr/bin:/bin'),
+        talker(planner, additional_env={'MORE': '1', 'SAME': 'as here'}),
+    ])) == 0
+    assert fake.machines['planner'].nodes['talker'].environment == {
+        'SET': 'by the launch file', 'MORE': '1', 'SAME': 'as here'}
+
+
+# -- while it runs -------------------------------------------------------------------------------
+
+
+def test_output_is_prefixed_by_machine_and_process(run, fake, planner, capfd):
+    def speaks(machine, node):
+        machine.say('output', node, stream='stdout', text='half a ')
+        machine.say('output', node, stream='stdout', text='line\nand another\n')
+        machine.say('output', node, stream='stderr', text='trouble\n')
+        ends(machine, node)
+
+    fake.on_start = speaks
+    texts = []
+    node = talker(planner, output='screen', exec_name='speaker')
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessIO(
+            target_action=node, on_stderr=lambda event: texts.append(event.text))),
+        node,
+    ])) == 0
+    lines = capfd.readouterr().out.splitlines()
+    name = node.name
+    for text in ('half a line', 'and another', 'trouble'):
+        assert f'[planner.{name}] {text}' in lines
+    assert texts == [b'trouble\n']
+
+
+def test_output_for_the_log_alone(run, fake, planner, capfd):
+    def speaks(machine, node):
+        machine.say('output', node, stream='stdout', text='for the log\n')
+        machine.say('output', node, stream='stderr', text='for the screen too\n')
+        ends(machine, node)
+
+    fake.on_start = speaks
+    assert run(LaunchDescription([talker(planner, output='log')])) == 0
+    output = capfd.readouterr().out
+    assert 'for the log' not in output and 'for the screen too' in output
+
+
+def test_cached_output(run, fake, planner):
+    def speaks(machine, node):
+        machine.say('output', node, stream='stdout', text='remember me\n')
+        ends(machine, node)
+
+    fake.on_start = speaks
+    node = talker(planner, cached_output=True)
+    assert run(LaunchDescription([node])) == 0
+    assert node.get_stdout() == 'remember me\n'
+
+
+def test_exit_status(run, fake, planner, capfd):
+    """A node that dies is reported; the launch's own status is as with local nodes."""
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=3, respawns=False)
+    codes = []
+    node = talker(planner, on_exit=lambda event, context: codes.append(event.returncode))
+    assert run(LaunchDescription([node])) == 0
+    assert codes == [3] and node.return_code == 3
+    assert "process has died [pid 4001, exit code 3, cmd '/there/program']" in (
+        capfd.readouterr().out)
+
+
+def test_on_exit_shutdown(run, fake, planner):
+    fake.on_start = ends
+    assert run(LaunchDescription([
+        *robot(fake, 'sleep', '60'), talker(planner, on_exit=[Shutdown()])])) == 0
+    assert order(fake, 'robot ends', 'down') == ['robot ends', 'down']
+
+
+def test_respawn_is_the_machines_and_is_seen_here(run, fake, planner):
+    starts, exits = [], []
+
+    def dies_twice(machine, node):
+        assert node.respawn and node.respawn_delay == 0.5 and node.respawn_max_retries == 2
+        machine.say('exited', node, returncode=1, respawns=True)
+        machine.say('started', node, pid=4990, cmd=['/there/program'])
+        machine.say('exited', node, returncode=0, respawns=False)
+
+    fake.on_start = dies_twice
+    node = talker(planner, respawn=True, respawn_delay=0.5, respawn_max_retries=2)
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessStart(
+            target_action=node, on_start=lambda event, context: starts.append(event.pid))),
+        RegisterEventHandler(OnProcessExit(
+            target_action=node,
+            on_exit=lambda event, context: exits.append(event.returncode))),
+        node,
+    ])) == 0
+    assert starts == [4001, 4990] and exits == [1, 0]
+
+
+def test_signals_reach_the_node(run, fake, planner, capfd):
+    node = talker(planner)
+    early = EmitEvent(event=SignalProcess(
+        signal_number='SIGUSR1', process_matcher=matches_action(node)))
+    assert run(LaunchDescription([
+        node, early,
+        RegisterEventHandler(OnProcessStart(target_action=node, on_start=[
+            EmitEvent(event=SignalProcess(
+                signal_number='SIGUSR2', process_matcher=matches_action(node))),
+            TimerAction(period=0.05, actions=[Shutdown()])])),
+    ])) == 0
+    machine = fake.machines['planner']
+    assert machine.signals == [(machine.nodes['talker'].id, 'SIGUSR2')]
+    assert "'SIGUSR1' not sent: the process hasn't started yet" in capfd.readouterr().out
+
+
+def test_shutdown_process_ends_one_node(run, fake, planner):
+    first, second = talker(planner, exec_name='first'), talker(planner, exec_name='second')
+    fake.on_start = lambda machine, node: 'second' in node.name and ends(machine, node)
+    assert run(LaunchDescription([
+        first, second,
+        RegisterEventHandler(OnProcessExit(target_action=second, on_exit=[EmitEvent(
+            event=ShutdownProcess(process_matcher=matches_action(first)))])),
+    ])) == 0
+    (_, name), = fake.noted('stop')
+    assert 'first' in name and first.return_code == -2
+
+
+def test_input_is_refused(run, fake, planner, capfd):
+    node = talker(planner)
+    assert run(LaunchDescription([
+        node,
+        RegisterEventHandler(OnProcessStart(target_action=node, on_start=[
+            OpaqueFunction(function=lambda context: context.emit_event_sync(
+                ProcessStdin(text=b'hello', **node.process_details))),
+            TimerAction(period=0.05, actions=[Shutdown()])])),
+    ])) == 0
+    assert 'takes no input' in capfd.readouterr().out
+
+
+def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
+    def refuses(machine, node):
+        machine.say('refused', node, error='no such program')
+
+    fake.on_start = refuses
+    node = talker(planner)
+    original = remote.RemoteRun._on_started
+    try:
+        remote.RemoteRun._on_started = lambda self, event: None
+        assert run(LaunchDescription([node])) == 0
+    finally:
+        remote.RemoteRun._on_started = original
+    assert "process can't be started: no such program" in capfd.readouterr().out
+
+
+def test_the_agents_launch_may_end(run, fake, planner, capfd):
+    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9)
+    node = talker(planner)
+    assert run(LaunchDescription([node])) == 0
+    assert node.return_code == -9
+    assert 'planner: the launch on the machine ended with exit status -9' in (
+        capfd.readouterr().out)
+
+
+# -- failure -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+def test_a_failure_ends_the_launch_with_status_1(run, fake, planner, description, capfd):
+    fake.errors['planner'] = ProviderError('no room for planner', 'take a smaller one')
+    assert run(description([
+        talker(planner), talker(planner), *robot(fake, 'sleep', '60')])) == 1
+    output = capfd.readouterr().out
+    assert 'no room for planner (take a smaller one)' in output
+    assert 'Traceback' not in output
+    assert len(fake.noted('down')) == 1 and not fake.noted('start')
+    if description is FogROSLaunchDescription:
+        assert not fake.noted('robot starts')
+
+
+def test_a_failure_cancels_the_other_machines(run, fake, planner):
+    other = ContainerInstance(name='other', ros_workspace='')
+    fake.errors['planner'] = ProviderError('no room')
+    fake.waits['other'] = threading.Event()
+    assert run(LaunchDescription([talker(planner), talker(other)])) == 1
+    assert not fake.noted('is up') and len(fake.noted('down')) == 1
+
+
+def test_checks_come_before_any_machine(run, fake, planner, capfd):
+    fake.prepare_error = ConfigurationError('this will not do', 'do otherwise')
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert not fake.noted('up')
+    assert 'this will not do (do otherwise)' in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(('where', 'what', 'message'), [
+    ('dmo', 'talker', "no package is called 'dmo' (did you mean 'demo'?)"),
+    ('demo', 'taker', "package 'demo' has no executable 'taker' (did you mean 'talker'?)"),
+])
+def test_unknown_programs_are_found_before_any_machine(
+    run, fake, planner, capfd, where, what, message,
+):
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(LaunchDescription([
+        talker(other), CloudNode(machine=planner, package=where, executable=what),
+    ])) == 1
+    assert message in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_a_program_may_be_in_the_image_alone(run, fake):
+    fake.on_start = ends
+    planner = ContainerInstance(name='planner', ros_workspace='', image='mine')
+    assert run(LaunchDescription([
+        CloudNode(machine=planner, package='theirs', executable='program')])) == 0
+    assert fake.machines['planner'].nodes['program'].package == 'theirs'
+
+
+def test_an_agent_that_refuses_to_start_nodes(run, fake, planner, monkeypatch, capfd):
+    def start(self, nodes):
+        raise AgentError('the agent is gone')
+
+    fake.notes.append(('x',))
+    from types import MethodType
+    original = fake.up
+
+    def up(spec):
+        machine = original(spec)
+        machine.start = MethodType(start, machine)
+        return machine
+
+    fake.up = up
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert 'the agent is gone' in capfd.readouterr().out
+
+
+def test_an_undo_that_fails_gives_status_1(run, fake, planner, capfd):
+    fake.on_start = ends
+    fake.down_errors = [VpnError('the interface would not go', 'ip link delete fog1')]
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert 'the interface would not go (ip link delete fog1)' in capfd.readouterr().out
+
+
+def test_an_unknown_image_transport(run, fake, planner, capfd):
+    assert run(LaunchDescription([talker(planner, stream_topics=[('/camera', 'h256')])])) == 1
+    assert "no image transport is called 'h256'" in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_an_error_of_ours_is_not_hidden(run, fake, planner, capfd):
+    fake.errors['planner'] = ZeroDivisionError('a bug')
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert 'a bug' in capfd.readouterr().out
+    assert fake.noted('down')
+
+
+# -- down ----------------------------------------------------------------------------------------
+
+
+def test_down_comes_last(run, fake, planner):
+    """Cloud nodes are stopped, the robot's nodes exit, then the VPN goes."""
+    node = talker(planner)
+    assert run(FogROSLaunchDescription([
+        node, *robot(fake, 'sleep', '60'),
+        RegisterEventHandler(OnProcessStart(
+            target_action=lambda action: action.name.startswith('sleep'),
+            on_start=[Shutdown()])),
+    ])) == 0
+    assert order(fake, 'stop', 'robot ends', 'down')[-1] == 'down'
+    assert set(order(fake, 'stop', 'robot ends', 'down')) == {'stop', 'robot ends', 'down'}
+    assert len(fake.noted('down')) == 1
+
+
+def test_stops_of_several_nodes_travel_together(run, fake, planner):
+    nodes = [talker(planner) for _ in range(5)]
+    assert run(LaunchDescription([
+        *nodes,
+        RegisterEventHandler(OnProcessStart(target_action=nodes[-1], on_start=[Shutdown()])),
+    ])) == 0
+    (ids,) = fake.machines['planner'].stops
+    assert len(ids) == 5
+    assert len(fake.noted('start')) == 5
+
+
+def test_shutdown_while_a_machine_comes_up(run, fake, planner):
+    fake.waits['planner'] = threading.Event()
+    assert run(FogROSLaunchDescription([
+        talker(planner), *robot(fake, 'sleep', '60'),
+        RegisterEventHandler(OnProcessStart(
+            target_action=lambda action: False, on_start=[LogInfo(msg='')])),
+        OpaqueFunction(function=lambda context: context.asyncio_loop.call_later(
+            0.1, context.emit_event_sync, shutdown_event()) and None),
+    ])) == 0
+    assert order(fake, 'is up', 'start', 'robot starts', 'down') == ['down']
+
+
+def shutdown_event():
+    from launch.events import Shutdown
+    return Shutdown(reason='a test')
+
+
+def test_a_machine_that_does_not_answer_is_given_up(run, fake, planner, monkeypatch, capfd):
+    monkeypatch.setattr(remote, 'GRACE', 0.0)
+    node = talker(planner, sigterm_timeout='0.05', sigkill_timeout='0.05')
+
+    def mute(machine, spec):
+        machine.exits_on_stop = False
+
+    fake.on_start = mute
+    assert run(LaunchDescription([
+        node, RegisterEventHandler(OnProcessStart(target_action=node, on_start=[Shutdown()])),
+    ])) == 0
+    assert "machine 'planner' doesn't say that the process ended" in capfd.readouterr().out
+    assert fake.noted('down')
+
+
+def test_a_lifecycle_node_in_a_group(run, fake, planner):
+    from launch_ros.actions import LifecycleNode
+
+    from fogros2 import CloudGroup
+    fake.on_start = ends
+    node = LifecycleNode(package='demo', executable='talker', name='arm', namespace='')
+    assert run(LaunchDescription([CloudGroup(planner, [node])])) == 0
+    assert isinstance(node, LifecycleNode) and isinstance(node, Node)
+    assert node.node_name == '/arm'
+    assert len(fake.noted('start')) == 1

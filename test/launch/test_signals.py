@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals to a launch of its own process: each ends it in order, with everything taken down."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+SCRIPT = """
+import sys, threading
+sys.path.insert(0, {folder!r})
+from conftest import FakeLaunch
+from launch import LaunchDescription, LaunchService
+from launch.actions import ExecuteProcess
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2.actions.coordinator import Coordinator
+
+class Fake(FakeLaunch):
+    def note(self, *what):
+        super().note(*what)
+        print('note:', what[0], flush=True)
+    def down(self):
+        self.note('down')
+        if {slow_down}:
+            # until the test has seen 'down' and sent its second signal
+            sys.stdin.readline()
+        self.note('all is gone')
+        return []
+
+fake = Fake()
+if {never_up}:
+    fake.waits['planner'] = threading.Event()
+service = LaunchService()
+Coordinator(service.context, make_launch=fake)
+planner = ContainerInstance(name='planner', ros_workspace='')
+service.include_launch_description(FogROSLaunchDescription([
+    CloudNode(machine=planner, package='demo', executable='talker'),
+    ExecuteProcess(cmd=['sleep', '600'], name='robot'),
+]))
+status = service.run()
+print('note: status', status, flush=True)
+sys.exit(status)
+"""
+
+
+class Program:
+    """A launch in a process of its own whose lines are awaited."""
+
+    def __init__(self, package, tmp_path, *, ignore=(), **settings):
+        text = SCRIPT.format(folder=str(Path(__file__).parent), **{
+            'never_up': False, 'slow_down': False, **settings})
+
+        def defaults():
+            os.setsid()
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_DFL)
+            for number in ignore:
+                signal.signal(number, signal.SIG_IGN)
+
+        self.process = subprocess.Popen(
+            [sys.executable, '-c', text], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, preexec_fn=defaults,
+            env={**os.environ, 'PYTHONUNBUFFERED': '1', 'ROS_LOG_DIR': str(tmp_path / 'log')})
+        self.lines = []
+        self.killer = threading.Timer(60, self.process.kill)
+        self.killer.start()
+
+    def wait_for(self, text):
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip('\n'))
+            if text in line:
+                return line
+        raise AssertionError(f'no {text!r} in:\n' + '\n'.join(self.lines))
+
+    def end(self):
+        self.lines += self.process.stdout.read().splitlines()
+        status = self.process.wait(30)
+        self.close()
+        return status
+
+    def close(self):
+        self.killer.cancel()
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+        self.process.stdout.close()
+        if not self.process.stdin.closed:
+            self.process.stdin.close()
+
+    def notes(self):
+        return [line.split()[1] for line in self.lines if line.startswith('note:')]
+
+
+@pytest.fixture
+def program(package, tmp_path):
+    programs = []
+
+    def start(**settings):
+        programs.append(Program(package, tmp_path, **settings))
+        return programs[-1]
+
+    yield start
+    for one in programs:
+        one.close()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_while_it_runs(program, number):
+    launch = program()
+    launch.wait_for('[robot-')
+    launch.process.send_signal(number)
+    assert launch.end() == 0
+    text = '\n'.join(launch.lines)
+    assert launch.notes()[-4:] == ['stop', 'down', 'all', 'status'], text
+    assert 'Traceback' not in text and 'orphaned' not in text
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_while_a_machine_comes_up(program, number):
+    launch = program(never_up=True)
+    launch.wait_for('note: up')
+    launch.process.send_signal(number)
+    assert launch.end() == 0
+    assert launch.notes()[-3:] == ['down', 'all', 'status'], '\n'.join(launch.lines)
+
+
+@pytest.mark.parametrize('second', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize('first', [signal.SIGINT, signal.SIGTERM])
+def test_a_second_one_does_not_cut_the_rollback_short(program, first, second):
+    launch = program(slow_down=True)
+    launch.wait_for('[robot-')
+    launch.process.send_signal(first)
+    launch.wait_for('note: down')
+    launch.process.send_signal(second)
+    launch.wait_for('again' if second == signal.SIGINT == first else 'shutting down already'
+                    if second != signal.SIGINT else '')
+    launch.process.stdin.write('\n')
+    launch.process.stdin.flush()
+    assert launch.end() == 0
+    assert launch.notes()[-2:] == ['all', 'status']
+
+
+def test_a_signal_ignored_from_the_start_stays_ignored(program):
+    launch = program(ignore=[signal.SIGHUP])
+    launch.wait_for('[robot-')
+    launch.process.send_signal(signal.SIGHUP)
+    launch.process.send_signal(signal.SIGTERM)
+    assert launch.end() == 0
+    text = '\n'.join(launch.lines)
+    assert 'SIGTERM: shutting down' in text and 'SIGHUP' not in text
