@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts, watches and stops processes as a launch description says: ROS 2 Jazzy's API."""
 from . import logging  # isort: skip
-from . import actions
-from . import conditions
-from . import descriptions
-from . import event_handlers
-from . import events
-from . import frontend
-from . import launch_description_sources
-from . import substitutions
+from . import (
+    actions,
+    conditions,
+    descriptions,
+    event_handlers,
+    events,
+    frontend,
+    launch_description_sources,
+    substitutions,
+)
 from ._aliases import missing
 from .action import Action
 from .condition import Condition

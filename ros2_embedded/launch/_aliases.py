@@ -31,7 +31,7 @@ class _AliasLoader:
             setattr(module, name, getattr(package, name))
 
 
-sys.meta_path.append(_AliasFinder)  # type: ignore[arg-type]
+sys.meta_path.append(_AliasFinder)
 
 
 def alias_submodules(

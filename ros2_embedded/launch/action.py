@@ -32,15 +32,15 @@ class Action(LaunchDescriptionEntity):
         :raises RuntimeError: for both ``if`` and ``unless``.
         """
         from .conditions import IfCondition, UnlessCondition
-        expressions = {
-            kind: entity.get_attr(name, optional=True)
-            for name, kind in (('if', IfCondition), ('unless', UnlessCondition))}
-        given = [(kind, text) for kind, text in expressions.items() if text is not None]
-        if len(given) > 1:
-            raise RuntimeError("if and unless conditions can't be used simultaneously")
-        return Action, {
-            'condition': kind(predicate_expression=parser.parse_substitution(text))
-            for kind, text in given}
+        kwargs: Dict[str, Any] = {}
+        for name, kind in (('if', IfCondition), ('unless', UnlessCondition)):
+            expression = entity.get_attr(name, optional=True)
+            if expression is None:
+                continue
+            if kwargs:
+                raise RuntimeError("if and unless conditions can't be used simultaneously")
+            kwargs['condition'] = kind(parser.parse_substitution(expression))
+        return Action, kwargs
 
     @property
     def condition(self) -> Optional[Condition]:

@@ -51,8 +51,11 @@ class LaunchDescription(LaunchDescriptionEntity):
         self, conditional_inclusion: bool = False
     ) -> List[Tuple[DeclareLaunchArgument, Optional[List[IncludeLaunchDescription]]]]:
         """Return the arguments, each with the includes on the way to it."""
-        from .actions import DeclareLaunchArgument, IncludeLaunchDescription
-        from .actions import ResetLaunchConfigurations
+        from .actions import (
+            DeclareLaunchArgument,
+            IncludeLaunchDescription,
+            ResetLaunchConfigurations,
+        )
         Includes = Optional[List[IncludeLaunchDescription]]
         found: List[Tuple[DeclareLaunchArgument, Includes]] = []
 

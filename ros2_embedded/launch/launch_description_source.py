@@ -39,7 +39,7 @@ class LaunchDescriptionSource:
         try:
             return self._get_launch_description(
                 perform_substitutions(LaunchContext(), self.__location))
-        except Exception as exc:  # A launch file can raise anything.
+        except Exception as exc:  # noqa: BLE001 - A launch file can raise anything.
             self.__logger.debug(traceback.format_exc())
             self.__logger.debug(f'Failed to load the launch file without a context: {exc}')
         return None

@@ -20,8 +20,11 @@ from .events import IncludeLaunchDescription, Shutdown
 from .launch_context import LaunchContext
 from .launch_description import LaunchDescription
 from .launch_description_entity import LaunchDescriptionEntity
-from .utilities import AsyncSafeSignalManager, is_a_subclass
-from .utilities import visit_all_entities_and_collect_futures
+from .utilities import (
+    AsyncSafeSignalManager,
+    is_a_subclass,
+    visit_all_entities_and_collect_futures,
+)
 
 Loop = asyncio.AbstractEventLoop
 
@@ -207,7 +210,7 @@ class LaunchService:
                 except asyncio.CancelledError:
                     self.__logger.error('run task was canceled')
                     return 1
-                except Exception as exc:  # Any action or handler may raise anything.
+                except Exception as exc:  # noqa: BLE001 - Any action or handler may raise anything.
                     text = f'Caught exception in launch (see debug for traceback): {exc}'
                     self.__logger.debug(traceback.format_exc())
                     self.__logger.error(text)

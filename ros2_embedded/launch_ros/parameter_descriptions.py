@@ -10,10 +10,17 @@ from typing import Any, cast, Optional, Tuple, Union
 from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.frontend.parse_substitution import parse_substitution
 from launch.substitutions import SubstitutionFailure
-from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
-from launch.utilities import perform_substitutions
-from launch.utilities.type_utils import AllowedTypesType, normalize_typed_substitution
-from launch.utilities.type_utils import perform_typed_substitution, SomeValueType
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
+from launch.utilities.type_utils import (
+    AllowedTypesType,
+    normalize_typed_substitution,
+    perform_typed_substitution,
+    SomeValueType,
+)
 
 
 class ParameterValue:

@@ -3,8 +3,7 @@
 import pathlib
 from typing import Any, Dict, Mapping, Sequence, Tuple, Union
 
-from launch.some_substitutions_type import SomeSubstitutionsType
-from launch.some_substitutions_type import SomeSubstitutionsType_types_tuple
+from launch.some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.substitution import Substitution
 
 from .parameter_descriptions import Parameter as ParameterDescription

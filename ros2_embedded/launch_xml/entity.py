@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from typing import Any, cast, List, Optional, Set
-import xml.etree.ElementTree as ET  # noqa: N817
+import xml.etree.ElementTree as ET
 
 from launch.frontend import Entity as BaseEntity
 from launch.frontend.type_utils import check_is_list_entity

@@ -19,7 +19,7 @@ class Parser(frontend.Parser):
 
         :raises xml.etree.ElementTree.ParseError: with line and column.
         """
-        import xml.etree.ElementTree as ET  # noqa: N817
+        import xml.etree.ElementTree as ET
         root = ET.parse(file).getroot()
         assert root is not None
         return Entity(root), cls()

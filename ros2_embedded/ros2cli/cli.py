@@ -68,7 +68,7 @@ def main(
         except RuntimeError as exc:
             return str(exc)
     if os.environ.get('_ARGCOMPLETE') == '1':
-        from argcomplete import autocomplete
+        from argcomplete import autocomplete  # type: ignore[import-not-found, unused-ignore]
         autocomplete(parser, exclude=['-h', '--help'])
     args = parser.parse_args(args=argv)
     if not args.use_python_default_buffering and hasattr(sys.stdout, 'reconfigure'):

@@ -113,7 +113,7 @@ def load_entry_points(
             continue
         try:
             loaded[name] = entry_point.load()
-        except Exception as exc:  # Whatever another's module raises must not end this command.
+        except Exception as exc:  # noqa: BLE001 - Another's module must not end this command.
             logger.warning(f"Failed to load entry point '{name}': {exc}")
     return loaded
 

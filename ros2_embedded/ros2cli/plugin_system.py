@@ -39,7 +39,7 @@ def instantiate_extensions(
             except PluginException as exc:
                 logger.warning(f"Failed to instantiate '{group_name}' extension '{name}': {exc}")
                 continue
-            except Exception as exc:  # Another's code must not end this command.
+            except Exception as exc:  # noqa: BLE001 - Another's code must not end this command.
                 logger.error(f"Failed to instantiate '{group_name}' extension '{name}': {exc}")
                 continue
             if not unique_instance:

@@ -20,8 +20,13 @@ from ..launch_context import LaunchContext
 from ..launch_description_entity import LaunchDescriptionEntity
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
-from ..utilities import ensure_argument_type, is_a_subclass, normalize_to_list_of_entities
-from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
+from ..utilities import (
+    ensure_argument_type,
+    is_a_subclass,
+    normalize_to_list_of_entities,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
 if TYPE_CHECKING:
     from ..frontend import Entity, Parser

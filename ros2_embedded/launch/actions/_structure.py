@@ -5,16 +5,11 @@ from __future__ import annotations
 import asyncio
 import collections.abc
 import os
-from typing import Any, cast, Dict, Iterable, List, Optional, Sequence, Tuple, TYPE_CHECKING
-from typing import Union
+from typing import Any, cast, Dict, Iterable, List, Optional, Sequence, Tuple, TYPE_CHECKING, Union
 import warnings
 
 import launch.logging
 
-from ._environment import parse_keeps, PopEnvironment, PopLaunchConfigurations
-from ._environment import PushEnvironment, PushLaunchConfigurations, ResetEnvironment
-from ._environment import ResetLaunchConfigurations, SetLaunchConfiguration, SomeConfigurations
-from ._simple import OpaqueFunction
 from ..action import Action, ParsedAction
 from ..event_handler import EventHandler
 from ..events import Shutdown, TimerEvent
@@ -25,9 +20,25 @@ from ..launch_description_entity import LaunchDescriptionEntity
 from ..launch_description_source import LaunchDescriptionSource
 from ..some_entities_type import SomeEntitiesType
 from ..some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
-from ..utilities import ensure_argument_type, is_a_subclass
-from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
+from ..utilities import (
+    ensure_argument_type,
+    is_a_subclass,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
+from ._environment import (
+    parse_keeps,
+    PopEnvironment,
+    PopLaunchConfigurations,
+    PushEnvironment,
+    PushLaunchConfigurations,
+    ResetEnvironment,
+    ResetLaunchConfigurations,
+    SetLaunchConfiguration,
+    SomeConfigurations,
+)
+from ._simple import OpaqueFunction
 
 if TYPE_CHECKING:
     from ..frontend import Parser
@@ -160,7 +171,7 @@ class IncludeLaunchDescription(Action):
     def _try_get_arguments_names_without_context(self) -> Optional[List[str]]:
         try:
             return self.__argument_names(LaunchContext())
-        except Exception as exc:  # A substitution may raise anything.
+        except Exception as exc:  # noqa: BLE001 - A substitution may raise anything.
             self.__logger.debug(
                 'Failed to get launch arguments names for launch description '
                 f"'{self.__launch_description_source.location}', with exception: {exc}")
@@ -278,13 +289,13 @@ class TimerAction(Action):
                 f'timer {self} not waiting because it was canceled before being executed')
             self._completed_future.set_result(None)
             return None
-        if not hasattr(context, '_TimerAction__event_handler_has_been_installed'):
+        if '_TimerAction__event_handler_has_been_installed' not in context.__dict__:
             # One handler does for all timers of a launch.
             context.register_event_handler(EventHandler(
                 matcher=lambda event: is_a_subclass(event, TimerEvent),
                 entities=OpaqueFunction(function=lambda context: cast(
                     TimerEvent, context.locals.event).timer_action.handle(context))))
-            setattr(context, '_TimerAction__event_handler_has_been_installed', True)
+            context.__dict__['_TimerAction__event_handler_has_been_installed'] = True
         self.__context_locals = dict(context.get_locals_as_dict())
         context.asyncio_loop.create_task(self._wait_to_fire_event(context))
         if perform_typed_substitution(context, self.__cancel_on_shutdown, bool):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 from typing import Any, Callable, cast, Dict, List, Optional, Tuple
 
@@ -82,7 +83,7 @@ async def start_process(
         for slave in slaves:
             os.close(slave)
     for fd, master in enumerate(masters, 1):
-        on_data = protocol.on_data[fd]
         await loop.connect_read_pipe(
-            lambda: _TerminalReader(on_data), os.fdopen(master, 'rb', 0))
+            functools.partial(_TerminalReader, protocol.on_data[fd]),
+            os.fdopen(master, 'rb', 0))
     return transport, protocol

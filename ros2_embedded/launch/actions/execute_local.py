@@ -12,9 +12,6 @@ from typing import Any, Callable, cast, Dict, Iterator, List, Optional, Union
 
 import launch.logging
 
-from ._simple import EmitEvent, OpaqueFunction
-from ._structure import TimerAction
-from ._subprocess import Protocol, start_process
 from ..action import Action
 from ..conditions import evaluate_condition_expression
 from ..descriptions import Executable
@@ -22,20 +19,32 @@ from ..event import Event
 from ..event_handler import BaseEventHandler, EventHandler
 from ..event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown
 from ..events import matches_action, Shutdown
-from ..events.process import ProcessExited, ProcessIO, ProcessStarted, ProcessStderr
-from ..events.process import ProcessStdout, ShutdownProcess, SignalProcess
+from ..events.process import (
+    ProcessExited,
+    ProcessIO,
+    ProcessStarted,
+    ProcessStderr,
+    ProcessStdout,
+    ShutdownProcess,
+    SignalProcess,
+)
 from ..launch_context import LaunchContext
 from ..launch_description_entity import LaunchDescriptionEntity
 from ..some_entities_type import SomeEntitiesType
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
 from ..substitutions import LaunchConfiguration, PythonExpression
-from ..utilities import is_a_subclass, normalize_to_list_of_substitutions
-from ..utilities import perform_substitutions
+from ..utilities import is_a_subclass, normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
+from ._simple import EmitEvent, OpaqueFunction
+from ._structure import TimerAction
+from ._subprocess import Protocol, start_process
 
 OnExit = Union[
     SomeEntitiesType, Callable[[ProcessExited, LaunchContext], Optional[SomeEntitiesType]], None]
+
+_SIGTERM_TIMEOUT = LaunchConfiguration('sigterm_timeout', default=5)
+_SIGKILL_TIMEOUT = LaunchConfiguration('sigkill_timeout', default=5)
 
 
 class _Output:
@@ -96,10 +105,8 @@ class ExecuteLocal(Action):
 
     def __init__(
         self, *, process_description: Executable, shell: bool = False,
-        sigterm_timeout: SomeSubstitutionsType = LaunchConfiguration(
-            'sigterm_timeout', default=5),
-        sigkill_timeout: SomeSubstitutionsType = LaunchConfiguration(
-            'sigkill_timeout', default=5),
+        sigterm_timeout: SomeSubstitutionsType = _SIGTERM_TIMEOUT,
+        sigkill_timeout: SomeSubstitutionsType = _SIGKILL_TIMEOUT,
         emulate_tty: bool = False, output: Any = 'log',
         output_format: str = '[{this.process_description.final_name}] {line}',
         cached_output: bool = False, log_cmd: bool = False, on_exit: OnExit = None,
@@ -321,7 +328,7 @@ class ExecuteLocal(Action):
             transport, protocol = await start_process(
                 make_protocol, cmd=cmd, cwd=cwd, env=env, shell=self.__shell,
                 emulate_tty=emulate_tty)
-        except Exception:  # Whatever it is, the launch goes on without this process.
+        except Exception:  # noqa: BLE001 - The launch goes on without this process.
             self.__logger.error(
                 f'exception occurred while executing process:\n{traceback.format_exc()}')
             self.__cleanup()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import shlex
 from typing import Any, Dict, Iterable, List, Optional, TYPE_CHECKING
 
-from ._simple import Shutdown
-from .execute_local import ExecuteLocal
 from ..action import ParsedAction
 from ..descriptions import Executable
 from ..frontend.entity import Entity
@@ -14,6 +12,8 @@ from ..frontend.expose import expose_action
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
 from ..substitutions import TextSubstitution
+from ._simple import Shutdown
+from .execute_local import ExecuteLocal
 
 if TYPE_CHECKING:
     from ..frontend import Parser

@@ -84,7 +84,7 @@ class LaunchConfigurationEquals(Condition):
             " deprecated. Use the 'EqualsSubstitution' and 'NotEqualsSubstitution' substitutions "
             'instead! E.g.:\n  IfCondition(\n  '
             "\tEqualsSubstitution(LaunchConfiguration('some_launch_arg'), "
-            '"some_equality_check")\n  )', UserWarning)
+            '"some_equality_check")\n  )', UserWarning, stacklevel=2)
         self.__name = launch_configuration_name
         self.__expected = None if expected_value is None else (
             normalize_to_list_of_substitutions(expected_value))

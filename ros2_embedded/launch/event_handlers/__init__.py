@@ -65,7 +65,7 @@ class OnActionEventBase(BaseEventHandler):
         def matches(event: Event) -> bool:
             if not isinstance(event, target_event_cls):
                 return False
-            action = getattr(event, 'action')
+            action: Action = event.action  # type: ignore[attr-defined]
             if callable(action_matcher):
                 return bool(action_matcher(action))
             return action_matcher is None or action is action_matcher

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Callable, TYPE_CHECKING
 
-from . import process
 from .._aliases import alias_submodules
 from ..event import Event
+from . import process
 
 if TYPE_CHECKING:
     from ..action import Action

@@ -7,11 +7,11 @@ import inspect
 from typing import Any, Callable, Dict, Iterable, Optional, TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from .entity import Entity
-    from .parser import Parser
     from ..action import Action
     from ..some_substitutions_type import SomeSubstitutionsType
     from ..substitution import Substitution
+    from .entity import Entity
+    from .parser import Parser
 
 T = TypeVar('T')
 

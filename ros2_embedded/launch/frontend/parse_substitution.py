@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 from typing import Any, List, Optional
 
-from .expose import instantiate_substitution
 from ..substitution import Substitution
 from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
+from .expose import instantiate_substitution
 
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_-]*')
 # Plain text: anything but the start of a substitution; an escaped $ starts none.

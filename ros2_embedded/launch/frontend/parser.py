@@ -8,13 +8,16 @@ import traceback
 from typing import Any, Dict, Iterable, List, Optional, Set, Tuple, Type, TYPE_CHECKING
 import warnings
 
-from .entity import Entity
-from .expose import instantiate_action
-from .parse_substitution import parse_if_substitutions, parse_substitution
-from .parse_substitution import replace_escaped_characters
 from ..invalid_launch_file_error import InvalidLaunchFileError
 from ..substitution import Substitution
 from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
+from .entity import Entity
+from .expose import instantiate_action
+from .parse_substitution import (
+    parse_if_substitutions,
+    parse_substitution,
+    replace_escaped_characters,
+)
 
 if TYPE_CHECKING:
     from ..action import Action
@@ -31,10 +34,10 @@ def _load_entry_points(group: str, kind: str) -> Dict[str, Any]:
     for entry_point in get_entry_points(group).values():
         try:
             loaded[entry_point.name] = entry_point.load()
-        except Exception:  # Whatever another's module raises must not end this launch.
+        except Exception:  # noqa: BLE001 - Another's module must not end this launch.
             warnings.warn(
                 f'Failed to load the {kind} extension: {entry_point.name}\n'
-                f'{traceback.format_exc()}')
+                f'{traceback.format_exc()}', stacklevel=2)
     return loaded
 
 
@@ -148,7 +151,7 @@ class Parser:
         for parser in [*claiming, *(p for p in cls._parsers().values() if p not in claiming)]:
             try:
                 return parser.load(stream)
-            except Exception as exc:  # Each format's own library has its own errors.
+            except Exception as exc:  # noqa: BLE001 - Each format has its own errors.
                 errors.append(exc)
                 stream.seek(0)
         extension = os.path.splitext(name)[1][1:] if claiming else ''

@@ -2,8 +2,8 @@
 """Types as launch files name them."""
 from typing import Any, List
 
-from .entity import Entity
 from ..utilities.type_utils import is_typing_list
+from .entity import Entity
 
 _TYPES = {
     'str': str,

@@ -91,7 +91,7 @@ def get_launch_description_from_any_launch_file(
     for load in loaders:
         try:
             return load(launch_file_path)
-        except Exception as exc:  # A launch file can raise anything.
+        except Exception as exc:  # noqa: BLE001 - A launch file can raise anything.
             errors.append(exc)
     raise InvalidLaunchFileError(extension, likely_errors=errors)
 

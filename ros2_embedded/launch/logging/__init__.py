@@ -56,7 +56,7 @@ def _point_latest_to(directory: str) -> None:
             os.unlink(latest)
         os.symlink(directory, latest, target_is_directory=True)
     except OSError as exc:
-        warnings.warn(f'Cannot create a symlink to latest log directory: {exc}')
+        warnings.warn(f'Cannot create a symlink to latest log directory: {exc}', stacklevel=2)
 
 
 class _Formats:
@@ -120,7 +120,7 @@ class LaunchConfig:
             if self.file_handlers:
                 warnings.warn(
                     'Loggers have been already configured to output to log files below '
-                    f'{self._log_dir}. Proceed at your own risk.')
+                    f'{self._log_dir}. Proceed at your own risk.', stacklevel=2)
             if not os.path.isdir(new_log_dir):
                 raise ValueError(f'{new_log_dir} is not a directory')
         self._log_dir = new_log_dir

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The handlers of :mod:`logging`, each able to format some loggers' records differently."""
-import functools
 import logging
 import logging.handlers
 from typing import Any, Dict, Type, Union
+
+_classes: Dict[Type[logging.Handler], Any] = {}
 
 
 class _PerLoggerFormatting:
@@ -11,13 +12,13 @@ class _PerLoggerFormatting:
 
     _formatters: Dict[str, logging.Formatter]
 
-    def setFormatterFor(  # noqa: N802
+    def setFormatterFor(
         self, logger: Union[str, logging.Logger], formatter: logging.Formatter
     ) -> None:
         """Format records of this logger, and of no other, with this formatter."""
         self.__dict__.setdefault('_formatters', {})[_name(logger)] = formatter
 
-    def unsetFormatterFor(self, logger: Union[str, logging.Logger]) -> None:  # noqa: N802
+    def unsetFormatterFor(self, logger: Union[str, logging.Logger]) -> None:
         """Format records of this logger like all others."""
         self.__dict__.setdefault('_formatters', {}).pop(_name(logger), None)
 
@@ -33,10 +34,12 @@ def _name(logger: Union[str, logging.Logger]) -> str:
     return logger if isinstance(logger, str) else logger.name
 
 
-@functools.lru_cache(maxsize=None)
 def with_per_logger_formatting(cls: Type[logging.Handler]) -> Any:
     """Return the handler class with ``setFormatterFor`` and ``unsetFormatterFor``."""
-    return type(cls.__name__, (_PerLoggerFormatting, cls), {'__doc__': cls.__doc__})
+    if cls not in _classes:
+        _classes[cls] = type(
+            cls.__name__, (_PerLoggerFormatting, cls), {'__doc__': cls.__doc__})
+    return _classes[cls]
 
 
 def __getattr__(name: str) -> Any:

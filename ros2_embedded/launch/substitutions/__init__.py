@@ -1,12 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Texts that are only known when the launch runs."""
-from ._logic import AllSubstitution, AndSubstitution, AnySubstitution, EqualsSubstitution
-from ._logic import IfElseSubstitution, NotEqualsSubstitution, NotSubstitution, OrSubstitution
-from ._system import Command, FileContent, FindExecutable, PythonExpression
-from ._values import AnonName, EnvironmentVariable, LaunchConfiguration, LaunchLogDir
-from ._values import LocalSubstitution, PathJoinSubstitution, SubstitutionFailure
-from ._values import TextSubstitution, ThisLaunchFile, ThisLaunchFileDir
 from .._aliases import alias_submodules, missing
+from ._logic import (
+    AllSubstitution,
+    AndSubstitution,
+    AnySubstitution,
+    EqualsSubstitution,
+    IfElseSubstitution,
+    NotEqualsSubstitution,
+    NotSubstitution,
+    OrSubstitution,
+)
+from ._system import Command, FileContent, FindExecutable, PythonExpression
+from ._values import (
+    AnonName,
+    EnvironmentVariable,
+    LaunchConfiguration,
+    LaunchLogDir,
+    LocalSubstitution,
+    PathJoinSubstitution,
+    SubstitutionFailure,
+    TextSubstitution,
+    ThisLaunchFile,
+    ThisLaunchFileDir,
+)
 
 __all__ = [
     'AllSubstitution',

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any, cast, Iterable, List, Sequence
 
-from ._values import arguments, Parsed, SubstitutionFailure
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import is_substitution, perform_typed_substitution
+from ._values import arguments, Parsed, SubstitutionFailure
 
 
 def _truth(context: LaunchContext, value: List[Substitution]) -> bool:
@@ -127,7 +127,8 @@ class AnySubstitution(_OfMany):
     """Whether one of the values is true."""
 
     def perform(self, context: LaunchContext) -> str:
-        return _text(any([_truth(context, arg) for arg in self.args]))
+        truths = [_truth(context, arg) for arg in self.args]
+        return _text(any(truths))
 
 
 @expose_substitution('all')
@@ -135,7 +136,8 @@ class AllSubstitution(_OfMany):
     """Whether all of the values are true."""
 
     def perform(self, context: LaunchContext) -> str:
-        return _text(all([_truth(context, arg) for arg in self.args]))
+        truths = [_truth(context, arg) for arg in self.args]
+        return _text(all(truths))
 
 
 def _comparable(side: Any) -> SomeSubstitutionsType:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, Dict, List, Sequence
 
-from ._values import arguments, described, Parsed, SubstitutionFailure
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
-from ..utilities import ensure_argument_type, normalize_to_list_of_substitutions
-from ..utilities import perform_substitutions
+from ..utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
+from ._values import arguments, described, Parsed, SubstitutionFailure
 
 
 @expose_substitution('command')
@@ -149,7 +152,7 @@ class PythonExpression(Substitution):
 
     def __init__(
         self, expression: SomeSubstitutionsType,
-        python_modules: SomeSubstitutionsType = ['math']
+        python_modules: SomeSubstitutionsType = ('math',)
     ) -> None:
         super().__init__()
         types = (str, Substitution, collections.abc.Iterable)
@@ -189,4 +192,4 @@ class PythonExpression(Substitution):
             if module.__name__ == 'math':
                 names.update(vars(module))
             names[module.__name__] = module
-        return str(eval(perform_substitutions(context, self.expression), {}, names))
+        return str(eval(perform_substitutions(context, self.expression), {}, names))  # noqa: S307

@@ -10,8 +10,11 @@ from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
-from ..utilities import ensure_argument_type, normalize_to_list_of_substitutions
-from ..utilities import perform_substitutions
+from ..utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
 Parsed = Tuple[Type[Any], Dict[str, Any]]
 
@@ -173,7 +176,7 @@ class LocalSubstitution(Substitution):
         return f"LocalVar('{self.description or self.expression}')"
 
     def perform(self, context: LaunchContext) -> str:
-        value: str = eval('context.locals.' + self.expression)
+        value: str = eval('context.locals.' + self.expression)  # noqa: S307
         return value
 
 

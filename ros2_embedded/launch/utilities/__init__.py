@@ -7,12 +7,12 @@ import collections.abc
 import inspect
 from typing import Any, cast, Iterable, List, Optional, Tuple, TYPE_CHECKING, Union
 
-from .signal_management import AsyncSafeSignalManager
 from .._aliases import alias_submodules
 from ..launch_description_entity import LaunchDescriptionEntity
 from ..some_entities_type import SomeEntitiesType
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
+from .signal_management import AsyncSafeSignalManager
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext

@@ -45,7 +45,7 @@ class AsyncSafeSignalManager:
         self.__outer = AsyncSafeSignalManager.__current
         AsyncSafeSignalManager.__current = self
         if self.__outer is None:
-            signal.set_wakeup_fd = self.__replace_next_fd  # type: ignore[assignment]
+            signal.set_wakeup_fd = self.__replace_next_fd
         return self
 
     def __exit__(

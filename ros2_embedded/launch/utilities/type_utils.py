@@ -5,9 +5,9 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, cast, List, Optional, Sequence, Set, Tuple, Type, TYPE_CHECKING, Union
 
-from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
 from ..some_substitutions_type import SomeSubstitutionsType
 from ..substitution import Substitution
+from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
@@ -223,7 +223,7 @@ def normalize_typed_substitution(
             f"Got a list of '{found}', expected a list of '{kind}'. value='{value}'")
     return [
         normalize_to_list_of_substitutions(item) if is_substitution(item)
-        else float(item) if found is float else item  # type: ignore[arg-type]
+        else float(item) if found is float else item
         for item in cast(Sequence[Any], value)]
 
 
@@ -260,7 +260,7 @@ def perform_typed_substitution(
                 'The input value is a list, cannot convert it to a scalar. '
                 f"Got value='{value}', expected type {kind}.")
     output = [
-        coerce_to_type(perform_substitutions(context, item), kind)
+        coerce_to_type(perform_substitutions(context, cast(List[Substitution], item)), kind)
         if is_normalized_substitution(item) else item for item in value]
     if not is_instance_of(output, data_type):
         raise ValueError(

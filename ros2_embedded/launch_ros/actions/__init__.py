@@ -2,13 +2,18 @@
 """What a launch can do with nodes."""
 from launch._aliases import alias_submodules, missing
 
-from ._composition import ComposableNodeContainer
+from ._composition import ComposableNodeContainer, LoadComposableNodes
 from ._composition import get_composable_node_load_request as get_composable_node_load_request
-from ._composition import LoadComposableNodes
 from ._lifecycle import LifecycleNode, LifecycleTransition
 from ._ros_timer import ROSTimer
-from ._settings import PushROSNamespace, SetParameter, SetParametersFromFile, SetRemap
-from ._settings import SetROSLogDir, SetUseSimTime
+from ._settings import (
+    PushROSNamespace,
+    SetParameter,
+    SetParametersFromFile,
+    SetRemap,
+    SetROSLogDir,
+    SetUseSimTime,
+)
 from .node import Node
 
 # The names of ROS 2 before Jazzy.

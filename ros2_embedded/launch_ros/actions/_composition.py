@@ -11,17 +11,26 @@ from launch.frontend import Entity, expose_action, Parser
 from launch.launch_description_entity import LaunchDescriptionEntity
 import launch.logging
 from launch.some_substitutions_type import SomeSubstitutionsType_types_tuple
-from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
-from launch.utilities import perform_substitutions
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
-from ._services import call_service
-from .node import Node
 from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import get_ros_node
-from ..utilities import add_node_name, evaluate_parameters, get_node_name_count
-from ..utilities import make_namespace_absolute, prefix_namespace, to_parameters_list
+from ..utilities import (
+    add_node_name,
+    evaluate_parameters,
+    get_node_name_count,
+    make_namespace_absolute,
+    prefix_namespace,
+    to_parameters_list,
+)
 from ..utilities.normalize_parameters import normalize_parameter_dict
+from ._services import call_service
+from .node import Node
 
 
 def _parse_nodes(entities: List[Entity], parser: Parser) -> List[ComposableNode]:

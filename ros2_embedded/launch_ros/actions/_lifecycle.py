@@ -11,11 +11,11 @@ from launch.launch_description_entity import LaunchDescriptionEntity
 import launch.logging
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
-from ._services import call_service
-from .node import Node
 from ..events.lifecycle import ChangeState, StateTransition
 from ..events.matchers import matches_node_name
 from ..ros_adapters import get_ros_node
+from ._services import call_service
+from .node import Node
 
 
 class LifecycleNode(Node):

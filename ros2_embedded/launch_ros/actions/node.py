@@ -16,16 +16,26 @@ from launch.launch_description_entity import LaunchDescriptionEntity
 import launch.logging
 from launch.some_substitutions_type import SomeSubstitutionsType
 from launch.substitutions import LocalSubstitution
-from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
-from launch.utilities import perform_substitutions
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
 from ..parameters_type import Parameters, SomeParameters
 from ..remap_rule_type import RemapRule, SomeRemapRules
 from ..substitutions import ExecutableInPackage
-from ..utilities import add_node_name, evaluate_parameters, get_node_name_count
-from ..utilities import make_namespace_absolute, normalize_parameters, normalize_remap_rules
-from ..utilities import plugin_support, prefix_namespace
+from ..utilities import (
+    add_node_name,
+    evaluate_parameters,
+    get_node_name_count,
+    make_namespace_absolute,
+    normalize_parameters,
+    normalize_remap_rules,
+    plugin_support,
+    prefix_namespace,
+)
 from ..utilities.namespace_utils import check_namespace, check_node_name
 
 

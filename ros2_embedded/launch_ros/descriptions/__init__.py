@@ -2,8 +2,8 @@
 """What nodes are made of."""
 from launch._aliases import missing
 
-from .composable_node import ComposableNode
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from .composable_node import ComposableNode
 
 __all__ = ['ComposableNode', 'Parameter', 'ParameterFile', 'ParameterValue']
 

@@ -12,8 +12,12 @@ from launch.utilities import ensure_argument_type, perform_substitutions
 from ..parameter_descriptions import Parameter as ParameterDescription
 from ..parameter_descriptions import ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValueDescription
-from ..parameters_type import EvaluatedParameters, EvaluatedParameterValue
-from ..parameters_type import Parameters, ParametersDict
+from ..parameters_type import (
+    EvaluatedParameters,
+    EvaluatedParameterValue,
+    Parameters,
+    ParametersDict,
+)
 
 _WRAP = ('If the parameter is meant to be a string, try wrapping it in '
          'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')

@@ -5,7 +5,7 @@ from typing import Optional, TypeVar
 
 OptionalText = TypeVar('OptionalText', str, None)
 
-_TOKEN = '[A-Za-z_][A-Za-z0-9_]*'
+_NAME = '[A-Za-z_][A-Za-z0-9_]*'
 
 
 def is_root_namespace(ns: str) -> bool:
@@ -44,7 +44,7 @@ def check_node_name(name: str) -> None:
 
     :raises rclpy.exceptions.InvalidNodeNameException: saying why.
     """
-    if len(name) > 255 or not re.fullmatch(_TOKEN, name):
+    if len(name) > 255 or not re.fullmatch(_NAME, name):
         # Only its error is needed: importing rclpy takes longer than all else here.
         from rclpy.validate_node_name import validate_node_name
         validate_node_name(name)
@@ -56,6 +56,6 @@ def check_namespace(namespace: str) -> None:
 
     :raises rclpy.exceptions.InvalidNamespaceException: saying why.
     """
-    if len(namespace) > 245 or not re.fullmatch(f'/|(/{_TOKEN})+', namespace):
+    if len(namespace) > 245 or not re.fullmatch(f'/|(/{_NAME})+', namespace):
         from rclpy.validate_namespace import validate_namespace
         validate_namespace(namespace)

@@ -21,7 +21,7 @@ def get_extensions(group_name: str, logger: logging.Logger) -> Dict[str, Any]:
     for name, extension_class in _types[group_name].items():
         try:
             extension = extension_class()
-        except Exception as exc:  # Whatever another's code raises must not end this launch.
+        except Exception as exc:  # noqa: BLE001 - Another's code must not end this launch.
             logger.error(f"Failed to instantiate '{group_name}' extension '{name}': {exc}")
             continue
         extension.NAME = name

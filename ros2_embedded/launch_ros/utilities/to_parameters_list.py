@@ -7,9 +7,9 @@ from typing import Any, Dict, Iterator, List, Optional, Tuple, TYPE_CHECKING
 
 from launch.launch_context import LaunchContext
 
+from ..parameters_type import EvaluatedParameters
 from .evaluate_parameters import evaluate_parameter_dict
 from .normalize_parameters import normalize_parameter_dict
-from ..parameters_type import EvaluatedParameters
 
 if TYPE_CHECKING:
     import rclpy.parameter

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, Iterable, List, Tuple
+from typing import Any, Dict, Iterable, List, Optional, Tuple
 
 from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 
@@ -100,7 +100,7 @@ def parse_launch_arguments(launch_arguments: List[str]) -> Iterable[Tuple[str, s
 
 def launch_a_launch_file(
     *, launch_file_path: str, launch_file_arguments: List[str], noninteractive: bool = False,
-    args: Any = None, option_extensions: Dict[str, Any] = {}, debug: bool = False
+    args: Any = None, option_extensions: Optional[Dict[str, Any]] = None, debug: bool = False
 ) -> int:
     """
     Launch it, until all is done or the user interrupts.
@@ -111,7 +111,7 @@ def launch_a_launch_file(
     import launch
     from launch.actions import IncludeLaunchDescription
     from launch.launch_description_sources import AnyLaunchDescriptionSource
-    extensions = [extension for _, extension in sorted(option_extensions.items())]
+    extensions = [extension for _, extension in sorted((option_extensions or {}).items())]
     for extension in extensions:
         extension.prestart(args)
     for name in ('launch_prefix', 'launch_prefix_filter'):

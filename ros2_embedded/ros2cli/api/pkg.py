@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from typing import Any, Iterable, List, Optional
 
-from ament_index_python.packages import get_package_prefix, get_packages_with_prefixes
-from ament_index_python.packages import PackageNotFoundError
+from ament_index_python.packages import (
+    get_package_prefix,
+    get_packages_with_prefixes,
+    PackageNotFoundError,
+)
 
 
 class PackageNotFound(Exception):

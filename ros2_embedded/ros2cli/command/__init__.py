@@ -8,8 +8,7 @@ import os
 from typing import Any, Dict, Iterable, Iterator, List, Optional, Set
 
 from ros2cli.entry_points import get_entry_points, get_first_line_doc
-from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION
-from ros2cli.plugin_system import satisfies_version
+from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION, satisfies_version
 
 
 class CommandExtension:

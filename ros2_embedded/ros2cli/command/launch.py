@@ -7,9 +7,14 @@ import sys
 from typing import Any, List, Optional, Union
 
 from ament_index_python.packages import PackageNotFoundError
-from ros2cli.api.launch import get_share_file_path_from_package, launch_a_launch_file
-from ros2cli.api.launch import LaunchFileNameCompleter, MultipleLaunchFilesError
-from ros2cli.api.launch import print_a_launch_file, print_arguments_of_launch_file
+from ros2cli.api.launch import (
+    get_share_file_path_from_package,
+    launch_a_launch_file,
+    LaunchFileNameCompleter,
+    MultipleLaunchFilesError,
+    print_a_launch_file,
+    print_arguments_of_launch_file,
+)
 from ros2cli.api.pkg import package_name_completer
 from ros2cli.command import CommandExtension, get_command_extensions
 from ros2cli.plugin_system import satisfies_version

@@ -8,8 +8,13 @@ import signal
 import subprocess
 from typing import Any, List, Optional, Union
 
-from ros2cli.api.pkg import ExecutableNameCompleter, get_executable_path, MultipleExecutables
-from ros2cli.api.pkg import package_name_completer, PackageNotFound
+from ros2cli.api.pkg import (
+    ExecutableNameCompleter,
+    get_executable_path,
+    MultipleExecutables,
+    package_name_completer,
+    PackageNotFound,
+)
 from ros2cli.command import CommandExtension
 
 ROS2RUN_MSG_PREFIX = '[ros2run]:'

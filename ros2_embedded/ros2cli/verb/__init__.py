@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Dict, Optional
 
-from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION
-from ros2cli.plugin_system import satisfies_version
+from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION, satisfies_version
 
 
 class VerbExtension:

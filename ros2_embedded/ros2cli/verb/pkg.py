@@ -5,8 +5,13 @@ from __future__ import annotations
 import os
 from typing import Any, Optional
 
-from ros2cli.api.pkg import get_executable_paths, get_package_names, get_prefix_path
-from ros2cli.api.pkg import package_name_completer, PackageNotFound
+from ros2cli.api.pkg import (
+    get_executable_paths,
+    get_package_names,
+    get_prefix_path,
+    package_name_completer,
+    PackageNotFound,
+)
 from ros2cli.verb import VerbExtension
 
 PACKAGE_NOT_FOUND = 'Package not found'
@@ -71,7 +76,7 @@ class XmlVerb(VerbExtension):
             '-t', '--tag', help="The XML tag to output (e.g. 'version')")
 
     def main(self, *, args: Any) -> Optional[str]:
-        import xml.etree.ElementTree as ET  # noqa: N817
+        import xml.etree.ElementTree as ET
         prefix = get_prefix_path(args.package_name)
         if prefix is None:
             return PACKAGE_NOT_FOUND

@@ -123,7 +123,7 @@ def matches_node_name(node_name: str) -> Callable[[LifecycleNode], bool]:
     """Return a matcher, see :func:`launch_ros.events.matches_node_name`."""
     warnings.warn(
         "'matches_node_name' has been moved into the 'launch.events' module and will be removed "
-        "from the 'lifecycle' module in the future")
+        "from the 'lifecycle' module in the future", stacklevel=2)
     return _matches_node_name(node_name)
 
 
