@@ -517,7 +517,7 @@ class Agent:
         finally:
             os.umask(mask)
             os.close(folder)
-        listener.listen(16)
+        listener.listen(2 * CLIENTS)
         return listener
 
     def path(self, name: str) -> str:

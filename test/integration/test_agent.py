@@ -5,14 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
+import io
 import json
 import os
 from pathlib import Path
 import pwd
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from typing import Any, Optional
@@ -56,7 +59,6 @@ class PipeStream:
     @property
     def _lines(self) -> Any:
         if not hasattr(self, '_buffered'):
-            import io
             self._buffered = io.BufferedReader(self.child.stdout)  # type: ignore[arg-type]
         return self._buffered
 
@@ -208,3 +210,766 @@ def test_a_node_runs_and_its_output_and_exit_status_arrive(rig):
         'restarts': 0}]
     assert status['rss_kb'] < 30_000
     assert [e['seq'] for e in rig.events] == list(range(1, len(rig.events) + 1))
+
+
+def test_signals_and_negative_exit_statuses(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[
+        rig.node('asked', (
+            'import signal, sys, time\n'
+            'signal.signal(signal.SIGUSR1, lambda *_: sys.exit(42))\n'
+            'print("up")\ntime.sleep(600)\n')),
+        rig.node('killed', SLEEP)])
+    for name in ('asked', 'killed'):
+        rig.wait('output', node=name)
+    client.request('signal', node='asked', signal='SIGUSR1')
+    client.request('signal', node='killed', signal='SIGKILL')
+    assert rig.wait('exited', node='asked')['returncode'] == 42
+    assert rig.wait('exited', node='killed')['returncode'] == -9
+    with pytest.raises(AgentError, match="isn't running"):
+        client.request('signal', node='killed', signal='SIGINT')
+    with pytest.raises(AgentError, match="no signal 'SIGNONSENSE'"):
+        client.request('signal', node='killed', signal='SIGNONSENSE')
+
+
+def test_a_signal_that_comes_before_the_process_reaches_it(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    client.request('signal', node='n', signal='SIGKILL')
+    assert rig.wait('exited', node='n')['returncode'] == -9
+
+
+def test_stop_goes_from_sigint_to_sigkill(rig):
+    rig.serve()
+    client = rig.client()
+    stubborn = (
+        'import signal, time\n'
+        'for number in (signal.SIGINT, signal.SIGTERM):\n'
+        '    signal.signal(number, lambda n, _: print("not", n))\n'
+        'print("up")\n'
+        'while True:\n'
+        '    time.sleep(0.05)\n')
+    client.request('start', nodes=[
+        rig.node('stubborn', stubborn, sigterm_timeout=0.2, sigkill_timeout=0.2, respawn=True),
+        rig.node('polite', SLEEP)])
+    for name in ('stubborn', 'polite'):
+        rig.wait('output', node=name)
+    client.request('stop', nodes=['stubborn'])
+    exited = rig.wait('exited', node='stubborn')
+    assert (exited['returncode'], exited['respawns']) == (-9, False)
+    assert 'not 2\n' in rig.text('stubborn') and 'not 15\n' in rig.text('stubborn')
+    states = {n['id']: n['state'] for n in client.request('status')['nodes']}
+    assert states == {'stubborn': 'exited', 'polite': 'running'}
+    client.request('stop', nodes=None)
+    assert rig.wait('exited', node='polite')['returncode'] == -2
+
+
+def test_respawn_is_launchs(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node(
+        'n', 'import sys\nsys.exit(1)\n', respawn=True, respawn_max_retries=2)])
+    rig.wait('exited', node='n', respawns=False)
+    assert [e['respawns'] for e in rig.events if e['event'] == 'exited'] == [True, True, False]
+    assert client.request('status')['nodes'][0]['restarts'] == 2
+
+
+def test_what_the_machine_does_not_have_is_refused_by_name(rig):
+    rig.serve()
+    client = rig.client()
+    (rig.folder / 'plain').write_text('no program')
+    (rig.folder / 'broken').write_bytes(b'\x7fELFnot')
+    (rig.folder / 'broken').chmod(0o700)
+    client.request('start', nodes=[
+        NodeSpec('package', 'p-1', package='no_such_package', executable='x'),
+        NodeSpec('executable', 'e-1', package='launch', executable='nothing'),
+        NodeSpec('near', 'n-1', package='launchh', executable='x'),
+        NodeSpec('program', 'f-1', arguments=('/no/such/program',)),
+        NodeSpec('word', 'w-1', arguments=('no-such-word',)),
+        NodeSpec('plain', 'd-1', arguments=(str(rig.folder / 'plain'),)),
+        NodeSpec('broken', 'b-1', arguments=(str(rig.folder / 'broken'),)),
+        NodeSpec('folder', 'c-1', arguments=('true',), cwd='/no/such/folder'),
+        NodeSpec('empty', 'n-1'),
+        NodeSpec('good', 'g-1', arguments=('true',)),
+    ])
+    assert rig.wait('exited', node='good')['returncode'] == 0
+    reasons = {name: rig.wait('refused', node=name) for name in (
+        'package', 'executable', 'near', 'program', 'word', 'plain', 'broken', 'folder', 'empty')}
+    assert "package 'no_such_package' not found" in reasons['package']['error']
+    assert "'nothing' not found in package 'launch'" in reasons['executable']['error']
+    assert "did you mean 'launch'?" in reasons['near']['hint']
+    assert "'/no/such/program' not found" in reasons['program']['error']
+    assert "'no-such-word' not found" in reasons['word']['error']
+    assert "isn't executable" in reasons['plain']['error']
+    assert 'could not be executed' in reasons['broken']['error']
+    assert "'/no/such/folder' isn't there" in reasons['folder']['error']
+    assert 'nothing to run' in reasons['empty']['error']
+    states = {n['id']: n['state'] for n in client.request('status')['nodes']}
+    assert states.pop('good') == 'exited' and set(states.values()) == {'refused'}
+
+
+def test_files_travel_and_markers_become_paths_of_the_machine(rig):
+    agent = rig.serve()
+    client = rig.client()
+    script = rig.node('k', (
+        'import os, stat, sys\n'
+        'path, share = sys.argv[1:]\n'
+        'mode = stat.S_IMODE(os.stat(path).st_mode), stat.S_IMODE(\n'
+        '    os.stat(os.path.dirname(path)).st_mode)\n'
+        'print(mode == (0o600, 0o700), open(path).read(), os.environ["SHARE"] == share, path)\n'))
+    client.request('start', nodes=[NodeSpec(
+        'k', 'k-1', arguments=(*script.arguments, ({'file': 'params.yaml'},),
+                               ({'share': 'launch'}, '/x')),
+        files={'params.yaml': ('rate: ', {'prefix': 'launch'})},
+        environment={'SHARE': ({'share': 'launch'}, '/x')})])
+    assert rig.wait('exited', node='k')['returncode'] == 0
+    same, _, prefix, share, path = rig.text('k').split()
+    assert (same, share) == ('True', 'True') and os.path.isabs(prefix)
+    assert path.startswith(str(rig.directory)) and path.endswith('params.yaml')
+    client.request('release', exit=True)
+    rig.ended(agent)
+    assert not rig.directory.exists()
+
+
+def test_output_arrives_within_20_ms(rig):
+    rig.serve()
+    client = rig.client(follow=False)
+    delays: list[float] = []
+
+    def note(event):
+        if event['event'] == 'output' and event['text'].strip():
+            delays.append(time.time() - float(event['text'].split()[0]))
+    client.subscribe(note, since=1)
+    client.request('start', nodes=[rig.node('n', (
+        'import time\n'
+        'for _ in range(40):\n'
+        '    print(time.time())\n'
+        '    time.sleep(0.02)\n'))])
+    wait_until(lambda: len(delays) >= 40, timeout=20, what='40 lines')
+    assert sorted(delays)[20] < 0.02, delays
+
+
+def test_binary_output_and_lines_without_an_end(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', (
+        'import os, time\n'
+        'os.write(1, b"\\xff\\xfe\\x00ok \\xc3")\n'
+        'time.sleep(0.1)\n'  # splits a character in two
+        'os.write(1, b"\\xa9 no newline \\xe2\\x82")\n'))])
+    rig.wait('exited', node='n')
+    assert rig.text('n') == '\ufffd\ufffd\0ok \u00e9 no newline \ufffd'
+
+
+def test_much_output_fills_neither_memory_nor_disk(rig):
+    agent = rig.serve(log_bytes=2 << 20)
+    client = rig.client(follow=False)
+    client.request('launch')
+    client.request('start', nodes=[rig.node('n', (
+        'import sys\n'
+        'block = b"x" * 99 + b"\\n"\n'
+        'for _ in range(3000):\n'
+        '    sys.stdout.buffer.write(block * 100)\n'))])  # 30 MB
+    def state():
+        return client.request('status')['nodes'][0]['state'] == 'exited'
+    wait_until(state, timeout=60, what='the node')
+    assert client.request('status')['rss_kb'] < 30_000
+    sizes = [path.stat().st_size for path in rig.directory.glob('events*.jsonl')]
+    assert len(sizes) == 2 and sum(sizes) < 5 << 20
+    status = client.request('status')
+    assert status['first'] > 1
+    client.subscribe(rig.events.append, since=1)
+    rig.wait('exited', node='n')
+    assert rig.events[0] == {'event': 'lost', 'count': status['first'] - 1}
+    assert [e['seq'] for e in rig.events[1:]] == list(range(status['first'], status['next']))
+    assert agent.poll() is None
+
+
+def test_a_lost_connection_comes_back_with_nothing_missing_and_nothing_twice(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', (
+        'import time\n'
+        'for n in range(150):\n'
+        '    print(n)\n'
+        '    time.sleep(0.01)\n'))])
+    for count in (20, 60, 100):
+        wait_until(lambda count=count: len(rig.text('n').split()) > count, timeout=20,
+                   what='lines', longest=0.02)
+        rig.shell.cut()
+    rig.wait('exited', node='n')
+    assert rig.text('n').split() == [str(n) for n in range(150)]
+    seqs = [e['seq'] for e in rig.events if 'seq' in e]
+    assert seqs == list(range(1, len(seqs) + 1))
+    states = [e['state'] for e in rig.events if e['event'] == 'connection']
+    assert states.count('lost') == 3 and states.count('back') == 3
+
+
+def test_requests_outlive_a_lost_connection(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('status')
+    rig.shell.down = True
+    rig.shell.cut()
+    rig.wait('connection', state='lost')
+    answers: list[dict[str, Any]] = []
+    thread = threading.Thread(target=lambda: answers.append(client.request('status')))
+    thread.start()
+    rig.shell.down = False
+    thread.join(20)
+    assert answers and answers[0]['machine'] == 'planner'
+
+
+def test_an_agent_that_has_gone_is_told_from_a_lost_connection(rig):
+    agent = rig.serve()
+    client = rig.client()
+    client.request('status')
+    agent.send_signal(signal.SIGTERM)
+    rig.wait('connection', state='absent')
+    with pytest.raises(AgentError, match='no agent serves'):
+        client.request('status')
+
+
+class Raw:
+    """A connection without manners."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.link = socket.socket(socket.AF_UNIX)
+        self.link.settimeout(10)
+        self.link.connect(str(rig.directory / 'agent.sock'))
+        self.lines = self.link.makefile('rb')
+
+    def ask(self, data: bytes) -> dict[str, Any]:
+        self.link.sendall(data)
+        answer: dict[str, Any] = json.loads(self.lines.readline())
+        return answer
+
+    def close(self) -> None:
+        self.lines.close()
+        self.link.close()
+
+
+@pytest.mark.parametrize('line, answer', [
+    (b'nonsense\n', 'malformed request'),
+    (b'[1]\n', 'a request is a JSON object'),
+    (b'{}\n', 'no such command: null'),
+    (b'{"command": "fly"}\n', 'no such command: "fly"'),
+    (b'{"command": {"x": 1}}\n', 'no such command'),
+    (b'\xff\xfe\n', 'malformed request'),
+    (b'[' * 100_000 + b'\n', 'malformed request'),
+    (b'{"command": "start"}\n', "'nodes' is missing"),
+    (b'{"command": "start", "nodes": 7}\n', "'nodes' is a list"),
+    (b'{"command": "start", "nodes": [{"id": 1}]}\n', "'nodes' is a list"),
+    (b'{"command": "stop", "nodes": ["x"]}\n', "no node 'x'"),
+    (b'{"command": "configure", "lifetime": -1}\n', "'lifetime' has to be above 0"),
+    (b'{"command": "configure", "lifetime": NaN}\n', "'lifetime' has to be above 0"),
+    (b'{"command": "configure", "lifetime": "x"}\n', "'lifetime' can't be"),
+    (b'{"command": "configure", "on_exit": "explode"}\n', "'on_exit' can't be 'explode'"),
+    (b'{"command": "configure", "environment": {"A=B": "x"}}\n', "can't set"),
+    (b'{"command": "configure", "environment": {"A": 1}}\n', "can't set"),
+    (b'{"command": "configure", "end_command": [1]}\n', 'list of words'),
+    (b'{"command": "configure", "heartbeat": {"port": 1}}\n', 'needs bind and peer'),
+    (b'{"command": "configure", "heartbeat": {"bind": "x", "peer": "y", "port": 1}}\n',
+     'needs bind and peer'),
+    (b'{"command": "keep", "what": "x", "alive": "ls"}\n', 'no list of words'),
+    (b'{"command": "log", "from": "x"}\n', 'malformed request'),
+])
+def test_bad_requests_get_one_clear_answer_and_the_connection_stays(rig, line, answer):
+    agent = rig.serve()
+    raw = Raw(rig)
+    reply = raw.ask(line)
+    assert reply['ok'] is False and answer in reply['error']
+    assert raw.ask(b'{"id": 5, "command": "status"}\n')['id'] == 5
+    raw.close()
+    assert agent.poll() is None
+
+
+def test_clients_that_vanish_or_never_read_harm_nobody(rig):
+    rig.serve(log_bytes=1 << 20)
+    silent = Raw(rig)
+    silent.ask(b'{"id": 1, "command": "log", "follow": true}\n')
+    for data in (b'{"id": 1, "comm', b'', b'{"id": 1, "command": "status"}\n' * 50):
+        raw = Raw(rig)
+        raw.link.sendall(data)
+        raw.close()
+    crowd = [Raw(rig) for _ in range(100)]  # beyond what is kept open
+    assert crowd[-1].ask(b'{"id": 1, "command": "status"}\n')['ok']
+    for raw in crowd:
+        raw.close()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', 'for _ in range(30000): print("x" * 99)\n')])
+    assert rig.wait('exited', node='n')['returncode'] == 0
+    assert client.request('status')['rss_kb'] < 30_000
+    silent.close()
+
+
+def test_a_request_too_long_is_refused(rig):
+    rig.serve()
+    raw = Raw(rig)
+    block = b'x' * (1 << 20)
+    with contextlib.suppress(BrokenPipeError):
+        for _ in range(17):
+            raw.link.sendall(block)
+    assert 'longer than' in json.loads(raw.lines.readline())['error']
+    with contextlib.suppress(ConnectionResetError):
+        assert raw.lines.readline() == b''
+    raw.close()
+    raw = Raw(rig)
+    assert raw.ask(b'{"id": 1, "command": "status"}\n')['ok']
+    raw.close()
+
+
+def test_what_is_asked_on_a_pipe_that_ends_is_answered(rig):
+    rig.serve()
+    done = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'connect', '--directory',
+         str(rig.directory)],
+        input=b'{"id": 9, "command": "log", "from": 1}\n{"id": 8, "command": "status"}\n',
+        capture_output=True, timeout=10)
+    assert [json.loads(line)['id'] for line in done.stdout.splitlines()] == [9, 8]
+    assert done.returncode == 0
+
+
+def test_connecting_where_no_agent_is(tmp_path):
+    done = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'connect', '--directory', str(tmp_path)],
+        capture_output=True, timeout=10)
+    assert done.returncode == 3
+    assert json.loads(done.stdout)['kind'] == 'absent'
+
+
+def test_a_second_agent_is_refused_and_a_stale_socket_replaced(rig):
+    first = rig.serve()
+    second = rig.serve()
+    assert second.wait(10) == 1
+    assert second.stderr is not None
+    line = second.stderr.read().decode()
+    assert f'another agent (process {first.pid}) serves' in line and line.count('\n') == 1
+    first.kill()
+    first.wait(10)
+    assert (rig.directory / 'agent.sock').exists()
+    third = rig.serve()
+    assert rig.client().request('status')['pid'] == third.pid
+
+
+@pytest.mark.parametrize('config, reason', [
+    ({'directory': '/proc/nothing/here'}, "can't be used"),
+    ({'directory': '/'}, "can't have the directory '/'"),
+    ({'directory': 'relative'}, "can't have the directory 'relative'"),
+    ({'user': 'nobody-of-that-name'}, "no user 'nobody-of-that-name'"),
+    ({'lifetime': 0}, "'lifetime' has to be above 0"),
+])
+def test_what_an_agent_can_not_start_with_is_one_line(rig, config, reason):
+    path = rig.config(**config)
+    done = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'serve', '--config', str(path)],
+        capture_output=True, timeout=10, cwd=rig.folder)
+    assert done.returncode == 1
+    assert reason in done.stderr.decode() and done.stderr.count(b'\n') == 1
+    detached = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'serve', '--detach', '--config', str(path)],
+        capture_output=True, timeout=10, cwd=rig.folder)
+    assert detached.returncode == 1
+    assert reason in json.loads(detached.stdout)['error']
+
+
+def test_a_damaged_configuration_is_one_line(rig):
+    path = rig.config()
+    path.write_text('{')
+    done = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'serve', '--config', str(path)],
+        capture_output=True, timeout=10)
+    assert done.returncode == 1 and b"can't be read" in done.stderr
+    assert done.stderr.count(b'\n') == 1
+
+
+def test_detached_it_answers_when_it_serves(rig):
+    done = subprocess.run(
+        [sys.executable, '-IS', str(agent_source()), 'serve', '--detach', '--config',
+         str(rig.config())], capture_output=True, timeout=10)
+    ready = json.loads(done.stdout)
+    assert ready['ready'] is True and ready['socket'] == str(rig.directory / 'agent.sock')
+    client = rig.client()
+    assert client.request('status')['pid'] == ready['pid']
+    client.request('release', exit=True)
+    wait_until(gone(ready['pid']), timeout=10, what='the agent to leave')
+    assert not rig.directory.exists()
+
+
+def test_a_launch_process_that_dies_takes_its_nodes_along_and_comes_back(rig):
+    rig.serve()
+    client = rig.client()
+    pid = client.request('launch')['pid']
+    client.request('start', nodes=[rig.node('n', (
+        'import os, subprocess, sys, time\n'
+        'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
+        'print(child.pid)\n'
+        'time.sleep(600)\n'))])
+    node = rig.wait('started', node='n')['pid']
+    wait_until(lambda: '\n' in rig.text('n'), timeout=10, what='the child')
+    child = int(rig.text('n'))
+    os.kill(pid, signal.SIGKILL)
+    assert rig.wait('launch_exited')['returncode'] == -9
+    assert rig.wait('exited', node='n')['returncode'] == -2
+    assert gone(node)() and gone(child)()
+    client.request('start', nodes=[rig.node('again', 'print("here")\n')])
+    assert rig.wait('exited', node='again')['returncode'] == 0
+
+
+def test_starting_twice_runs_once(rig):
+    rig.serve()
+    client = rig.client()
+    spec = rig.node('n', SLEEP)
+    assert client.request('start', nodes=[spec])['known'] == []
+    assert client.request('start', nodes=[spec])['known'] == ['n']
+    rig.wait('output', node='n')
+    assert [e['event'] for e in rig.events].count('started') == 1
+
+
+def test_variables_that_come_after_the_launch_process_reach_the_nodes(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('launch')
+    client.request('configure', environment={'LATE': 'yes'})
+    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LATE"])\n')])
+    rig.wait('exited', node='n')
+    assert rig.text('n') == 'yes\n'
+
+
+def test_setup_files_are_sourced(rig):
+    setup = rig.folder / "it's a setup.bash"
+    setup.write_text('export SOURCED="from ${BASH_SOURCE[0]##*/} $#"\n')
+    rig.serve(setup=[str(setup)])
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n')])
+    rig.wait('exited', node='n')
+    assert rig.text('n') == "from it's a setup.bash 0\n"
+    client.request('configure', setup=['/no/such/setup.bash'])  # restarts the launch process
+    with pytest.raises(AgentError, match='setup.bash to be sourced is not there'):
+        client.request('launch')
+
+
+def test_a_ros_command_that_is_not_there_is_refused(rig):
+    rig.serve(ros_command=['/no/such/ros2'])
+    client = rig.client()
+    with pytest.raises(AgentError, match="/no/such/ros2 can't be started"):
+        client.request('launch')
+    client.request('configure', ros_command=[])
+    with pytest.raises(AgentError, match="no 'ros_command'"):
+        client.request('start', nodes=[rig.node('n', SLEEP)])
+    assert client.request('status')['nodes'] == []
+
+
+def ends(rig: Rig) -> list[str]:
+    """Return an end_command that leaves a mark instead of ending this computer."""
+    return ['touch', str(rig.folder / 'ended')]
+
+
+def test_a_robot_that_has_gone_ends_the_machine(rig, free_udp_port):
+    rig.serve(robot_timeout=1.0, end_command=ends(rig))
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    node = rig.wait('started', node='n')['pid']
+    client.request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', interval=0.1)
+    begin = time.monotonic()
+    wait_until(lambda: time.monotonic() - begin > 1.5, timeout=5, what='longer than the timeout')
+    assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 0.1
+    assert heartbeat.age is not None and heartbeat.age < 1.0
+    assert client.request('status')['heartbeat_age'] < 1.0
+    heartbeat.close()
+    gone_at = time.monotonic()
+    watchdog = rig.wait('watchdog')
+    assert (watchdog['reason'], watchdog['action']) == ('robot gone', 'end the machine')
+    assert 0.5 < time.monotonic() - gone_at < 2.5
+    wait_until((rig.folder / 'ended').exists, timeout=10, what='the end of the machine')
+    assert gone(node)()
+    with pytest.raises(AgentError, match='stopping|ending'):
+        client.request('start', nodes=[rig.node('late', SLEEP)])
+
+
+@pytest.mark.parametrize('wrong', ['launch', 'peer', 'nonsense'])
+def test_only_the_launchs_own_heartbeats_count(rig, free_udp_port, wrong):
+    rig.serve(robot_timeout=0.8, end_command=ends(rig), heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port,
+        'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1'})
+    client = rig.client()
+    client.request('configure')
+    heartbeat = Heartbeat(
+        '127.0.0.1', free_udp_port, 'other' if wrong == 'launch' else 'abc123', interval=0.05)
+    if wrong == 'nonsense':
+        heartbeat.close()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            for data in (b'', b'x', b'[]', b'7', b'\xff', b'{"launch": 1}'):
+                link.sendto(data, ('127.0.0.1', free_udp_port))
+    assert rig.wait('watchdog')['reason'] == 'robot gone'
+    assert heartbeat.round_trip is None
+    heartbeat.close()
+
+
+def test_a_kept_machine_lets_go_of_the_nodes_and_stays_until_its_lifetime(rig, free_udp_port):
+    rig.serve(robot_timeout=0.5, lifetime=3.0, on_exit='keep', end_command=ends(rig))
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    rig.wait('started', node='n')
+    client.request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+    assert rig.wait('watchdog', reason='robot gone')['action'] == 'stop the nodes'
+    rig.wait('exited', node='n')
+    rig.wait('launch_exited')
+    assert not (rig.folder / 'ended').exists()
+    assert client.request('status')['heartbeat_age'] is None
+    # the next launch takes it over without being asked whether it may
+    client.request('configure', launch='def456')
+    assert client.request('status')['nodes'] == []
+    assert rig.wait('watchdog', reason='lifetime')['action'] == 'end the machine'
+    wait_until((rig.folder / 'ended').exists, timeout=10, what='the end of the machine')
+
+
+def test_a_machine_that_no_launch_came_to_ends(rig):
+    rig.serve(boot_timeout=0.5, end_command=ends(rig))
+    rig.client()
+    assert rig.wait('watchdog')['reason'] == 'no launch came'
+    wait_until((rig.folder / 'ended').exists, timeout=10, what='the end of the machine')
+
+
+def test_a_computer_that_is_not_ours_stays_on_and_gets_clean(rig):
+    mark = rig.folder / 'down'
+    agent = rig.serve(boot_timeout=2.0)
+    (rig.directory / 'agent.py').write_text('put there by the robot')
+    (rig.directory / 'more').mkdir()
+    (rig.directory / 'more' / 'file').write_text('')
+    client = rig.client()
+    client.request('keep', what='vpn', alive=['true'], repair=[], down=[['touch', str(mark)]])
+    assert rig.wait('watchdog')['action'] == 'leave'
+    assert rig.ended(agent) == 0
+    assert mark.exists() and not rig.directory.exists()
+
+
+def test_an_end_command_that_fails_is_told(rig):
+    rig.serve(boot_timeout=0.2, end_command=['false'])
+    rig.client()
+    assert rig.wait('end_failed')['returncode'] == 1
+
+
+def test_a_launch_with_a_heartbeat_is_not_robbed_of_its_machine(rig, free_udp_port):
+    rig.serve()
+    client = rig.client()
+    client.request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    rig.wait('output', node='n')
+    with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
+        client.request('configure', launch='def456')
+    client.request('configure', launch='def456', force=True)
+    assert rig.wait('exited', node='n')['returncode'] == -2
+    status = client.request('status')
+    assert (status['launch'], status['nodes'], status['heartbeat_age']) == ('def456', [], None)
+    client.request('start', nodes=[rig.node('n', 'print("mine")\n')])
+    wait_until(lambda: 'mine' in rig.text('n'), timeout=10, what='the new node')
+
+
+def test_a_busy_heartbeat_port_is_refused(rig):
+    rig.serve()
+    client = rig.client()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('127.0.0.1', 0))
+        with pytest.raises(AgentError, match='no heartbeats at 127.0.0.1:'):
+            client.request('configure', heartbeat={
+                'bind': '127.0.0.1', 'port': other.getsockname()[1], 'peer': '127.0.0.1'})
+
+
+def test_what_is_kept_is_repaired_and_taken_down(rig):
+    thing = rig.folder / 'thing'
+    agent = rig.serve()
+    client = rig.client()
+    client.request(
+        'keep', what='vpn', interval=0.05, alive=['test', '-e', str(thing)],
+        repair=[['true'], ['touch', str(thing)]], down=[['rm', str(thing)]])
+    for _ in range(2):
+        wait_until(thing.exists, timeout=10, what='the repair')
+        count = sum(e['event'] == 'vpn_repaired' for e in list(rig.events))
+        thing.unlink()
+        wait_until(lambda count=count: sum(
+            e['event'] == 'vpn_repaired' for e in list(rig.events)) > count,
+            timeout=10, what='the event')
+    wait_until(thing.exists, timeout=10, what='the repair')
+    kept, = client.request('status')['kept']
+    assert kept['what'] == 'vpn' and kept['repairs'] >= 2
+    client.request('release', exit=True)
+    assert rig.ended(agent) == 0
+    assert not thing.exists()
+
+
+def test_a_repair_that_fails_is_tried_again_with_growing_pauses(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('keep', what='vpn', interval=0.05, alive=['false'],
+                   repair=[['/no/such/program']])
+    wait_until(lambda: client.request('status')['kept'][0]['ok'] is False, timeout=10,
+               what='the failure')
+    client.request('keep', what='vpn', interval=0.05, alive=['true'])
+    wait_until(lambda: client.request('status')['kept'][0]['ok'] is True, timeout=10,
+               what='its replacement')
+    assert all(e['event'] != 'vpn_repaired' for e in rig.events)
+
+
+def test_release_stops_the_nodes_before_it_answers(rig):
+    rig.serve(on_exit='delete')
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    node = rig.wait('started', node='n')['pid']
+    client.request('release', on_exit='keep')
+    assert gone(node)()
+    status = client.request('status')
+    assert (status['on_exit'], status['launch_running']) == ('keep', False)
+    # and is ready for the next one
+    client.request('start', nodes=[rig.node('next', 'print("here")\n')])
+    rig.wait('exited', node='next')
+
+
+STUBBORN = (
+    'import os, signal, subprocess, sys, time\n'
+    'for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):\n'
+    '    signal.signal(number, signal.SIG_IGN)\n'
+    'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
+    'print(os.getpid(), child.pid)\n'
+    'time.sleep(600)\n')
+
+
+def test_told_to_end_it_is_gone_within_two_seconds_with_all_it_started(rig):
+    agent = rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', STUBBORN)])
+    wait_until(lambda: '\n' in rig.text('n'), timeout=10, what='the node')
+    pids = [int(word) for word in rig.text('n').split()]
+    begin = time.monotonic()
+    agent.send_signal(signal.SIGTERM)
+    assert rig.ended(agent) == 0
+    assert time.monotonic() - begin < 2.2
+    assert all(gone(pid)() for pid in pids)
+
+
+def test_nodes_do_not_outlive_a_killed_agent(rig):
+    agent = rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    node = rig.wait('started', node='n')['pid']
+    agent.kill()
+    wait_until(gone(node), timeout=10, what='the node to end')
+
+
+def test_its_log_goes_on_after_a_restart(rig):
+    first = rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', 'print("one")\n')])
+    rig.wait('exited', node='n')
+    first.kill()
+    first.wait(10)
+    last = rig.events[-1].get('seq', 0)
+    rig.serve()
+    again = rig.client(follow=False)
+    seen: list[dict[str, Any]] = []
+    again.subscribe(seen.append, since=1)
+    again.request('start', nodes=[rig.node('m', 'print("two")\n')])
+    wait_until(lambda: any(e['event'] == 'exited' and e['node'] == 'm' for e in list(seen)),
+               timeout=20, what='the second node')
+    assert [e['seq'] for e in seen] == list(range(1, len(seen) + 1)) and len(seen) > last
+
+
+@pytest.fixture
+def login(root: None) -> Iterator[Path]:
+    """Give a folder that the user nobody can reach, and skip where we can't become that user."""
+    if os.geteuid() != 0:
+        pytest.skip('needs to run as root')
+    folder = Path(tempfile.mkdtemp(prefix='agent-test-', dir='/run'))
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def test_as_root_it_runs_nodes_as_the_login_user_and_commands_as_root(login, tmp_path):
+    rig = Rig(tmp_path)
+    rig.directory = login / 'agent'
+    record = login / 'record'
+    record.mkdir(mode=0o777)
+    record.chmod(0o777)
+    script = (f'id -u > {record}/id; id -G >> {record}/id; pwd >> {record}/id; '
+              f'echo $USER $HOME >> {record}/id; '
+              f'grep -E "Uid|Groups" /proc/self/status >> {record}/id; '
+              f'echo ${{LC_SECRET:-unset}} >> {record}/id; mv {record}/id {record}/done; cat')
+    os.environ['LC_SECRET'] = 'of the agent'
+    try:
+        agent = rig.serve(user='nobody', ros_command=['sh', '-c', script], environment={})
+    finally:
+        del os.environ['LC_SECRET']
+    nobody = pwd.getpwnam('nobody')
+    for path in [rig.directory, *rig.directory.iterdir()]:
+        assert path.stat().st_uid == nobody.pw_uid
+        assert path.stat().st_mode & 0o077 == 0
+    client = rig.client()
+    client.request('launch')
+    wait_until((record / 'done').exists, timeout=10, what='the record')
+    lines = (record / 'done').read_text().splitlines()
+    assert lines[0] == str(nobody.pw_uid)
+    assert lines[1].split() == [str(g) for g in os.getgrouplist('nobody', nobody.pw_gid)]
+    assert lines[2] == (nobody.pw_dir if os.path.isdir(nobody.pw_dir) else '/')
+    assert lines[3] == f'nobody {nobody.pw_dir}'
+    assert lines[4].split()[1:] == [str(nobody.pw_uid)] * 4
+    assert lines[-1] == 'unset'
+    client.request('keep', what='vpn', alive=['sh', '-c', f'id -u > {record}/root'],
+                   repair=[], interval=0.1)
+    wait_until(lambda: (record / 'root').exists() and (record / 'root').read_text() == '0\n',
+               timeout=10, what='a command as root')
+    client.request('release', exit=True)
+    assert rig.ended(agent) == 0
+    assert not rig.directory.exists()
+    rig.close()
+
+
+def test_as_root_it_takes_no_directory_that_belongs_to_somebody_else(login, tmp_path):
+    rig = Rig(tmp_path)
+    rig.directory = login / 'agent'
+    rig.directory.mkdir()
+    (login / 'link').symlink_to(tmp_path)
+    for directory in (rig.directory, login / 'link'):
+        rig.directory = directory
+        agent = rig.serve(user='nobody')
+        assert agent.wait(10) == 1
+        assert agent.stderr is not None
+        assert 'belongs to somebody else' in agent.stderr.read().decode()
+    rig.close()
+
+
+def test_as_process_1_it_reaps_orphans_and_ends_when_told(root, tmp_path):
+    if os.geteuid() != 0:
+        pytest.skip('needs to run as root')
+    if subprocess.run(['unshare', '--pid', '--fork', '--mount-proc', 'true'],
+                      capture_output=True).returncode != 0:
+        pytest.skip('needs process namespaces')
+    rig = Rig(tmp_path)
+    agent = subprocess.Popen(
+        ['unshare', '--pid', '--fork', '--kill-child', '--mount-proc', sys.executable, '-IS',
+         str(agent_source()), 'serve', '--config', str(rig.config())], stderr=subprocess.PIPE)
+    rig.agents.append(agent)
+    wait_until(rig.can_connect, timeout=10, what='the agent')
+    client = rig.client()
+    assert client.request('status')['pid'] == 1
+    client.request('start', nodes=[rig.node('n', (
+        'import subprocess, time\n'
+        'for _ in range(5):\n'
+        '    subprocess.run(["sh", "-c", "sleep 0.1 & exit"])\n'
+        'time.sleep(0.5)\n'
+        'stat = subprocess.run("cat /proc/[0-9]*/stat", shell=True, capture_output=True).stdout\n'
+        'print(stat.count(b") Z 1 "))\n'))])
+    rig.wait('exited', node='n')
+    assert rig.text('n') == '0\n'
+    inner = int(Path(f'/proc/{agent.pid}/task/{agent.pid}/children').read_text())
+    begin = time.monotonic()
+    os.kill(inner, signal.SIGTERM)
+    assert rig.ended(agent) == 0
+    assert time.monotonic() - begin < 2.2
+    rig.close()
