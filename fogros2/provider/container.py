@@ -16,15 +16,29 @@ from typing import Any, ClassVar, Optional
 
 from fogros2 import process
 from fogros2.errors import (
-    CommandError, ConfigurationError, MachineNotFound, NameTaken, PrerequisiteError,
-    ProviderError, Unsupported)
-from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState, Result
+    CommandError,
+    ConfigurationError,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Result,
+)
 from fogros2.provider import container_engine, container_entry, container_root, Provider
 from fogros2.provider.container_engine import Engine
 from fogros2.waiting import wait_until
 
 #: Labels beside the core's tags.
-TOKEN = 'fogros2-token'
+ATTEMPT = 'fogros2-token'
 LOGIN = 'fogros2-login'
 MACHINE = 'fogros2-machine'
 DIRECTORY = 'fogros2-directory'
@@ -180,7 +194,7 @@ class ContainerProvider(Provider):
     """Containers of podman or docker on this computer."""
 
     name: ClassVar[str] = 'container'
-    agent_directory: ClassVar[str] = '/run/fogros2'
+    agent_directory: ClassVar[str] = f'/{container_entry.AGENT_DIRECTORY}'
     agent_program: ClassVar[str] = f'/{container_entry.FOLDER}/agent.py'
 
     def __init__(self) -> None:
@@ -203,6 +217,7 @@ class ContainerProvider(Provider):
             check_root()
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Create the container and start it; returns when the engine has started it."""
         options = Options.parse(spec.options)
         engine = container_engine.select(options.engine, options.image or None)
         try:
@@ -214,7 +229,7 @@ class ContainerProvider(Provider):
             taken = self._by_name(engine, container_name(spec.name))
             if taken is None:
                 raise
-            if labels_of(taken).get(TOKEN) != request.token:
+            if labels_of(taken).get(ATTEMPT) != request.token:
                 raise NameTaken(
                     f"there is a container machine '{spec.name}' already",
                     f'ros2 fog delete {spec.name}') from error
@@ -288,6 +303,7 @@ class ContainerProvider(Provider):
         return found[0] if found else None
 
     def describe(self, machine_id: str) -> Machine:
+        """Return what the engine knows of a container now."""
         engine, identity, _ = parse_id(machine_id)
         found = engine.inspect([identity])
         if not found:
@@ -295,15 +311,17 @@ class ContainerProvider(Provider):
         return self._machine(engine, found[0], complain=True)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """Yield the containers that carry all of ``tags`` as labels, of both engines."""
         filters = [f'--filter=label={key}={value}' for key, value in tags.items()]
         for engine in container_engine.installed():
-            listed = engine.call('ps', '-aq', f'--filter=label={TOKEN}', *filters,
+            listed = engine.call('ps', '-aq', f'--filter=label={ATTEMPT}', *filters,
                                  what='listing containers').stdout.split()
             if listed:
                 for entry in engine.inspect(listed):
                     yield self._machine(engine, entry, complain=False)
 
     def destroy(self, machine_id: str) -> None:
+        """Remove a container and its root; returns when both are gone."""
         engine, identity, token = parse_id(machine_id)
         result = process.run(
             Command(('sh', '-c', _DESTROY, 'sh', engine.name, identity, str(directory(token))),
@@ -321,6 +339,7 @@ class ContainerProvider(Provider):
             self._host_keys.pop(identity, None)
 
     def stop(self, machine_id: str) -> None:
+        """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
         engine, identity, _ = parse_id(machine_id)
         found = engine.inspect([identity])
         if not found:
@@ -331,6 +350,7 @@ class ContainerProvider(Provider):
         engine.call('stop', '-t', '3', identity, what=f'stopping container {identity}')
 
     def start(self, machine_id: str) -> None:
+        """Start a stopped container again."""
         engine, identity, _ = parse_id(machine_id)
         if not engine.inspect([identity]):
             raise MachineNotFound(f'container {identity} does not exist any more')
@@ -339,7 +359,7 @@ class ContainerProvider(Provider):
     def _machine(self, engine: Engine, entry: Mapping[str, Any], *, complain: bool) -> Machine:
         labels = labels_of(entry)
         identity = str(entry['Id'])[:12]
-        token = labels[TOKEN]
+        token = labels[ATTEMPT]
         state = _STATES.get(str(entry['State']['Status']), MachineState.PENDING)
         address = address_of(entry)
         shell = None
@@ -354,7 +374,7 @@ class ContainerProvider(Provider):
             provider=self.name, state=state, created=timestamp(str(entry['Created'])),
             shell=shell, vpn_host=address,
             tags={k: v for k, v in labels.items() if k not in (
-                TOKEN, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED)},
+                ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED)},
             end_command=container_entry.END_COMMAND)
 
     def _host_key(self, engine: Engine, identity: str, token: str, own: bool) -> Optional[str]:
@@ -455,7 +475,7 @@ def common_flags(spec: MachineSpec, request: CreateRequest, options: Options) ->
     """Yield the engine's words for what a spec asks, with an image or without."""
     yield from ('--name', container_name(spec.name), '--hostname', spec.name)
     labels = {
-        **request.tags, TOKEN: request.token, LOGIN: options.user, MACHINE: spec.name,
+        **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
         DIRECTORY: '' if options.image else 'root',
     }
     if spec.on_exit == 'stop':

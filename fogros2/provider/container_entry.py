@@ -13,6 +13,8 @@ from fogros2.provider.container_root import Archive
 
 #: Where the machine finds what FogROS2 brought, without the leading slash.
 FOLDER = 'opt/fogros2'
+#: The agent's own folder, the login user's.
+AGENT_DIRECTORY = 'run/fogros2'
 HOST_KEY = 'etc/ssh/fogros2_host_ed25519_key'
 #: The first process takes this for its end, and with it the container's.
 END_COMMAND = ('kill', '-TERM', '1')
@@ -47,7 +49,8 @@ if [ "$user" != root ] && ! grep -q "^$user .*NOPASSWD: ALL" /etc/sudoers; then
     echo "$user ALL=(ALL:ALL) NOPASSWD: ALL" > /etc/sudoers.d/fogros2
     chmod 440 /etc/sudoers.d/fogros2
 fi
-mkdir -p /run/sshd /etc/ssh
+mkdir -p /run/sshd /etc/ssh /{agent_directory}
+chown "$user" /{agent_directory} && chmod 700 /{agent_directory}
 grep -qw "$(hostname)" /etc/hosts 2>/dev/null \\
     || printf '127.0.0.1 localhost\\n127.0.1.1 %s\\n' "$(hostname)" >> /etc/hosts
 [ -s $key.pub ] || {{
@@ -124,7 +127,8 @@ def add(
     agent = agent_file() if agent_config else None
     names = {
         'user': user, 'folder': FOLDER, 'host_key': HOST_KEY, 'error_mark': ERROR_MARK,
-        'host_key_mark': HOST_KEY_MARK, 'root': 'prohibit-password' if user == 'root' else 'no',
+        'host_key_mark': HOST_KEY_MARK, 'agent_directory': AGENT_DIRECTORY,
+        'root': 'prohibit-password' if user == 'root' else 'no',
     }
     guard = _IDLE if agent is None else _GUARD.format(**names) + _IDLE
     archive.folder(FOLDER)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands as one line for a remote shell; pure."""
+
+from __future__ import annotations
+
+import shlex
+
+from fogros2.model import Command
+
+
+def words(command: Command, *, root: bool) -> list[str]:
+    """
+    Return the words that run a command: with sudo and the environment in front as needed.
+
+    :param root: whether the login user is root already.
+    """
+    line = [f'{name}={value}' for name, value in command.environment.items()]
+    found = ['env', *line, *command.argv] if line else list(command.argv)
+    return ['sudo', '-n', '--', *found] if command.sudo and not root else found
+
+
+def remote_line(command: Command, *, user: str) -> str:
+    """Return the line that the login shell of ``user`` has to run."""
+    return ' '.join(shlex.quote(word) for word in words(command, root=user == 'root'))
+
+
+def remote_path(path: str) -> str:
+    """Return a path for a remote shell; a leading ``~/`` is the login user's home."""
+    if path == '~':
+        return '"$HOME"'
+    if path.startswith('~/'):
+        return f'"$HOME"/{shlex.quote(path[2:])}'
+    return shlex.quote(path)
+
+
+def write_script(target: str, mode: int) -> str:
+    """Return a script that puts its standard input into a file: aside first, then in place."""
+    path = remote_path(target)
+    return (
+        f'umask 077; target={path}; mkdir -p -- "$(dirname -- "$target")"; '
+        'aside="$target.$$.new"; trap \'rm -f -- "$aside"\' EXIT; '
+        f'cat > "$aside"; chmod {mode:o} "$aside"; mv -f -- "$aside" "$target"')
+
+
+def hint_for(returncode: int, stderr: str, where: str) -> str:
+    """Return the remedy for a failure that many commands share, or ''."""
+    if 'No space left on device' in stderr or 'Disk quota exceeded' in stderr:
+        return f'the disk of {where} is full'
+    if 'password is required' in stderr or 'a terminal is required' in stderr:
+        return f'let the login user of {where} use sudo without a password'
+    if 'not in the sudoers file' in stderr or 'may not run sudo' in stderr:
+        return f'the login user of {where} needs the right to use sudo'
+    if returncode == 127 and 'not found' in stderr:
+        return f'install what is missing on {where}'
+    return ''

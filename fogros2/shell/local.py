@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""This computer's own command line as a Shell, for what runs beside the robot's nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import getpass
+import os
+from pathlib import Path
+import subprocess
+import threading
+from typing import Optional
+
+from fogros2 import process
+from fogros2.errors import ConnectError, PrerequisiteError
+from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.shell import command_line, Stream, sync
+
+
+class LocalShell:
+    """A Shell for endpoints of kind 'local'; nothing to connect, nothing to lose."""
+
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
+        self.endpoint = endpoint
+        self.name = name
+        self.user = endpoint.user or getpass.getuser()
+
+    def run(
+        self, command: Command, *, timeout: float, check: bool = True,
+        cancel: Optional[threading.Event] = None,
+        on_output: Optional[Callable[[str], None]] = None,
+    ) -> Result:
+        """Run a command and wait for it; see the protocol."""
+        return process.run(
+            command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
+
+    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
+        """Write a file (folders made as needed): aside first, then moved into place."""
+        script = command_line.write_script(target, mode)
+        process.run(Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
+                    timeout=timeout)
+
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
+        on_progress: Optional[Callable[[int, int], None]] = None,
+    ) -> SyncReport:
+        """Make the folder ``target`` equal ``source``; see the protocol."""
+        return sync.to_folder(
+            source, target, excludes=excludes, includes=includes, timeout=timeout,
+            cancel=cancel, on_progress=on_progress)
+
+    def open(self, command: Command) -> Stream:
+        """Start a program and return its streams; it ends with the stream."""
+        try:
+            child = subprocess.Popen(
+                process.argv(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL, env={**os.environ, **command.environment},
+                start_new_session=True)
+        except FileNotFoundError as error:
+            raise PrerequisiteError(f'{error.filename} not found on this computer') from error
+        stream = LocalStream(child)
+        if command.input:
+            stream.write(command.input)
+        return stream
+
+    def interactive(self, command: Optional[Command] = None) -> int:
+        """Run the user's shell, or ``command``, in this terminal."""
+        words = [os.environ.get('SHELL', '/bin/sh')] if command is None else process.argv(command)
+        environment = {**os.environ, **(command.environment if command else {})}
+        return subprocess.call(words, env=environment)
+
+    def close(self) -> None:
+        """There is no connection to drop."""
+
+
+class LocalStream:
+    """Both ends of a program on this computer, line by line."""
+
+    def __init__(self, child: subprocess.Popen[bytes]) -> None:
+        self._child = child
+
+    def write(self, data: bytes) -> None:
+        """Send to its standard input."""
+        assert self._child.stdin is not None
+        try:
+            self._child.stdin.write(data)
+            self._child.stdin.flush()
+        except (OSError, ValueError) as error:
+            raise ConnectError(f'the program has ended: {error}') from error
+
+    def readline(self) -> bytes:
+        """Return its next line of output with the newline, b'' at the end."""
+        assert self._child.stdout is not None
+        return self._child.stdout.readline()
+
+    def close(self) -> None:
+        """End it; a ``readline`` in another thread returns b''."""
+        self._child.terminate()
+        if self._child.stdin is not None:
+            try:
+                self._child.stdin.close()
+            except BrokenPipeError:
+                pass  # it ended without reading all
+        try:
+            self._child.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The other end of ``rsh.py``: rsync's streams over a channel of a connection that is open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import os
+from pathlib import Path
+import secrets
+import socket
+import struct
+import sys
+import threading
+from typing import TYPE_CHECKING
+
+from fogros2.errors import FogError
+
+if TYPE_CHECKING:
+    import paramiko
+
+_HELPER = Path(__file__).with_name('rsh.py')
+
+
+@contextlib.contextmanager
+def remote_shell(start: Callable[[str], paramiko.Channel]) -> Iterator[tuple[str, list[FogError]]]:
+    """
+    Yield the value of rsync's ``-e``, and a list that takes what fails on our side.
+
+    :param start: starts a command line on the machine.
+    """
+    failures: list[FogError] = []
+    name = f'fogros2-{secrets.token_hex(16)}'
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind('\0' + name)
+    listener.listen(1)
+    thread = threading.Thread(
+        target=_serve, args=(listener, start, failures), name='fog-rsync', daemon=True)
+    thread.start()
+    try:
+        yield f"'{sys.executable}' -I -S '{_HELPER}' {name}", failures
+    finally:
+        with contextlib.suppress(OSError):
+            listener.shutdown(socket.SHUT_RDWR)  # wakes an accept that nobody came to
+        listener.close()
+        thread.join(5.0)
+
+
+def _serve(
+    listener: socket.socket, start: Callable[[str], paramiko.Channel], failures: list[FogError],
+) -> None:
+    try:
+        link, _ = listener.accept()
+    except OSError:
+        return  # rsync never got that far
+    with link:
+        peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
+        if struct.unpack('3i', peer)[1] != os.geteuid():
+            return
+        line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
+        try:
+            if len(streams) == 3:
+                link.sendall(bytes([_relay(start(line.decode()), *streams)]))
+        except FogError as error:
+            failures.append(error)
+        except OSError:
+            pass  # rsync has gone; its own exit status says why
+        finally:
+            for stream in streams:
+                os.close(stream)
+
+
+def _relay(channel: paramiko.Channel, stdin: int, stdout: int, stderr: int) -> int:
+    """Move bytes until the machine's side ends; return its exit status (255: lost)."""
+
+    def up() -> None:
+        with contextlib.suppress(OSError, EOFError):
+            # more than a packet at once: sendall cuts it, and a read is a system call
+            while data := os.read(stdin, 1 << 18):
+                channel.sendall(data)
+            channel.shutdown_write()
+
+    def errors() -> None:
+        with contextlib.suppress(OSError):
+            while data := channel.recv_stderr(1 << 15):
+                os.write(stderr, data)
+
+    threads = [threading.Thread(target=up, name='fog-rsync-up', daemon=True),
+               threading.Thread(target=errors, name='fog-rsync-errors', daemon=True)]
+    channel.settimeout(None)
+    with contextlib.closing(channel):
+        for thread in threads:
+            thread.start()
+        while data := channel.recv(1 << 18):
+            _write(stdout, data)
+        threads[1].join(5.0)
+        status = int(channel.recv_exit_status())
+    return status if 0 <= status < 256 else 255
+
+
+def _write(target: int, data: bytes) -> None:
+    while data:
+        data = data[os.write(target, data):]

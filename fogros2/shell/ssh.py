@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine's command line by SSH: one connection, many channels, opened again after a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import threading
+import time
+from typing import Optional, TYPE_CHECKING
+
+from fogros2.errors import (
+    Cancelled,
+    CommandError,
+    ConnectError,
+    DeadlineExceeded,
+)
+from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.shell import command_line, ssh_connection, ssh_terminal, Stream, sync
+from fogros2.shell.ssh_connection import warm
+from fogros2.waiting import wait_until
+
+if TYPE_CHECKING:
+    import paramiko
+
+__all__ = ['SSHShell', 'warm']
+
+#: Seconds after a command's end in which something it left behind may hold its output open.
+_DRAIN = 2.0
+#: Input up to this size fits into a channel's window: no thread needed to feed it.
+_INLINE = 1 << 16
+
+
+class SSHShell:
+    """
+    A Shell for endpoints of kind 'ssh'.
+
+    :param name: the machine's name, for messages.
+    :param timeout: seconds one attempt to connect may take.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
+        self.endpoint = endpoint
+        self.name = name
+        self.user = ssh_connection.user_of(endpoint)
+        self._timeout = timeout
+        self._lock = threading.Lock()
+        self._transport: Optional[paramiko.Transport] = None
+
+    # -- connection -----------------------------------------------------------------------------
+
+    def channel(self) -> paramiko.Channel:
+        """
+        Return a new channel of the connection, which is opened as needed.
+
+        :raises ConnectError: the machine can't be reached.
+        :raises DeadlineExceeded: it takes no more channels.
+        """
+        return wait_until(
+            self._try_channel, timeout=self._timeout, what=f"a session on '{self.name}'",
+            hint='raise MaxSessions of its SSH server')
+
+    def _try_channel(self) -> Optional[paramiko.Channel]:
+        transport = self._connected()
+        import paramiko
+        try:
+            return transport.open_session(window_size=1 << 22, timeout=self._timeout)
+        except paramiko.ChannelException:
+            return None  # as many sessions as the server allows: one of ours will end
+        except (paramiko.SSHException, EOFError, OSError):
+            # lost, as we find out only now; nothing has been started yet
+            self._drop(transport)
+            return None
+
+    def _connected(self) -> paramiko.Transport:
+        with self._lock:
+            if self._transport is None or not self._transport.is_active():
+                self._transport = ssh_connection.connect(
+                    self.endpoint, name=self.name, timeout=self._timeout)
+            return self._transport
+
+    def _drop(self, transport: paramiko.Transport) -> None:
+        with self._lock:
+            if self._transport is transport:
+                self._transport = None
+        transport.close()
+
+    def close(self) -> None:
+        """Drop the connection; the next call would open it again."""
+        with self._lock:
+            transport, self._transport = self._transport, None
+        if transport is not None:
+            transport.close()
+
+    # -- commands -------------------------------------------------------------------------------
+
+    def run(
+        self, command: Command, *, timeout: float, check: bool = True,
+        cancel: Optional[threading.Event] = None,
+        on_output: Optional[Callable[[str], None]] = None,
+    ) -> Result:
+        """Run a command there and wait for it; see the protocol."""
+        line = command_line.remote_line(command, user=self.user)
+        return self._run(command, line, timeout=timeout, check=check, cancel=cancel,
+                         on_output=on_output)
+
+    def _run(
+        self, command: Command, line: str, *, timeout: float, check: bool,
+        cancel: Optional[threading.Event] = None,
+        on_output: Optional[Callable[[str], None]] = None,
+    ) -> Result:
+        begin = time.monotonic()
+        if cancel is not None and cancel.is_set():
+            raise Cancelled(_what(command))
+        channel = self.start(line)
+        try:
+            feeder = _feed(channel, command.input)
+            output = _Output(on_output)
+            self._collect(channel, output, begin + timeout, cancel, command)
+            returncode = self._status(channel, command)
+            if feeder is not None:
+                feeder.join(_DRAIN)
+        finally:
+            channel.close()
+        result = Result(returncode, *output.text(), time.monotonic() - begin)
+        if check and returncode != 0:
+            raise CommandError(
+                command, result, f"'{self.name}'",
+                command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
+        return result
+
+    def start(self, line: str) -> paramiko.Channel:
+        """
+        Start a command line there and return its channel.
+
+        :raises ConnectError: the machine can't be reached.
+        """
+        import paramiko
+
+        for attempt in (1, 2):
+            channel = self.channel()
+            try:
+                channel.exec_command(line)
+                return channel
+            except (paramiko.SSHException, EOFError, OSError) as error:
+                transport = channel.get_transport()
+                if attempt == 2 or transport.is_active():
+                    raise ConnectError(f"'{self.name}' can not start a command: {error}") \
+                        from error
+                self._drop(transport)
+        raise AssertionError('the second attempt returns or raises')
+
+    def _collect(
+        self, channel: paramiko.Channel, output: _Output, deadline: float,
+        cancel: Optional[threading.Event], command: Command,
+    ) -> None:
+        """Read until both streams have ended, the time is up, or ``cancel`` is set."""
+        quiet_since = 0.0
+        while True:
+            now = time.monotonic()
+            if cancel is not None and cancel.is_set():
+                _signal(channel, 'TERM')
+                raise Cancelled(_what(command))
+            if now >= deadline:
+                _signal(channel, 'TERM')
+                raise DeadlineExceeded(
+                    f"{_what(command)} took too long on '{self.name}'")
+            channel.settimeout(min(0.05, deadline - now))
+            try:
+                data = channel.recv(1 << 16)
+            except TimeoutError:
+                if output.errors(channel):
+                    quiet_since = 0.0
+                elif channel.exit_status_ready():
+                    # it has ended; what it left in the background holds its output open
+                    quiet_since = quiet_since or now
+                    if now - quiet_since >= _DRAIN:
+                        return
+                continue
+            output.errors(channel)
+            quiet_since = 0.0
+            if data:
+                output.add(data)
+                continue
+            # the end of standard output; standard error ends with the channel
+            channel.settimeout(max(0.05, min(_DRAIN, deadline - now)))
+            try:
+                while more := channel.recv_stderr(1 << 16):
+                    output.stderr += more
+            except TimeoutError:
+                pass
+            lost = channel.closed or not channel.get_transport().is_active()
+            if lost or channel.exit_status_ready():
+                return
+            _pause(channel, min(deadline, now + 0.05))
+
+    def _status(self, channel: paramiko.Channel, command: Command) -> int:
+        if not channel.exit_status_ready():
+            raise ConnectError(f"the connection to '{self.name}' was lost while "
+                               f'{_what(command)} ran there', "check the robot's network")
+        status = channel.recv_exit_status()
+        if status == -1 and not channel.get_transport().is_active():
+            raise ConnectError(f"the connection to '{self.name}' was lost while "
+                               f'{_what(command)} ran there', "check the robot's network")
+        return int(status)
+
+    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
+        """Write a file there (folders made as needed): aside first, then moved into place."""
+        script = command_line.write_script(target, mode)
+        self.run(
+            Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
+            timeout=timeout)
+
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
+        on_progress: Optional[Callable[[int, int], None]] = None,
+    ) -> SyncReport:
+        """Make the folder ``target`` there equal ``source`` here; see the protocol."""
+        return sync.to_machine(
+            self, source, target, excludes=excludes, includes=includes, timeout=timeout,
+            cancel=cancel, on_progress=on_progress)
+
+    def open(self, command: Command) -> Stream:
+        """Start a program there and return its streams; it ends with the stream."""
+        channel = self.start(command_line.remote_line(command, user=self.user))
+        _feed(channel, command.input, end=False)
+        return SSHStream(channel, self.name)
+
+    def interactive(self, command: Optional[Command] = None) -> int:
+        """Give the user's terminal to the login shell there, or to ``command``."""
+        line = None if command is None else command_line.remote_line(command, user=self.user)
+        return ssh_terminal.attach(self.channel(), line, self.name)
+
+
+class SSHStream:
+    """Both ends of a program that runs on a machine, line by line."""
+
+    def __init__(self, channel: paramiko.Channel, name: str) -> None:
+        self._channel = channel
+        self._name = name
+        self._buffer = b''
+        channel.settimeout(None)
+
+    def write(self, data: bytes) -> None:
+        """Send to its standard input."""
+        try:
+            self._channel.sendall(data)
+        except OSError as error:
+            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
+
+    def readline(self) -> bytes:
+        """Return its next line of output with the newline, b'' at the end."""
+        parts = [self._buffer]
+        while b'\n' not in parts[-1]:
+            try:
+                data = self._channel.recv(1 << 16)
+            except OSError:
+                data = b''
+            if not data:
+                self._buffer = b''
+                return b''.join(parts)
+            self._discard_errors()
+            parts.append(data)
+        line, _, self._buffer = b''.join(parts).partition(b'\n')
+        return line + b'\n'
+
+    def _discard_errors(self) -> None:
+        # unread, they would fill the channel's window and stop the program
+        while self._channel.recv_stderr_ready():
+            self._channel.recv_stderr(1 << 16)
+
+    def close(self) -> None:
+        """End it; a ``readline`` in another thread returns b''."""
+        _signal(self._channel, 'TERM')
+        self._channel.close()
+
+
+class _Output:
+    """What a command wrote, and its lines as they become whole."""
+
+    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
+        self._on_output = on_output
+        self._parts: list[bytes] = []
+        self._rest = b''
+        self.stderr = b''
+
+    def add(self, data: bytes) -> None:
+        self._parts.append(data)
+        if self._on_output is not None:
+            *lines, self._rest = (self._rest + data).split(b'\n')
+            for line in lines:
+                self._on_output(line.decode(errors='replace'))
+
+    def errors(self, channel: paramiko.Channel) -> bool:
+        """Take what is there of standard error; return whether there was any."""
+        found = False
+        while channel.recv_stderr_ready():
+            self.stderr += channel.recv_stderr(1 << 16)
+            found = True
+        return found
+
+    def text(self) -> tuple[str, str]:
+        if self._on_output is not None and self._rest:
+            self._on_output(self._rest.decode(errors='replace'))
+            self._rest = b''
+        return (b''.join(self._parts).decode(errors='replace'),
+                self.stderr.decode(errors='replace'))
+
+
+def _what(command: Command) -> str:
+    return command.what or command.argv[0]
+
+
+def _feed(
+    channel: paramiko.Channel, data: bytes, *, end: bool = True,
+) -> Optional[threading.Thread]:
+    def send() -> None:
+        try:
+            if data:
+                channel.sendall(data)
+            if end:
+                channel.shutdown_write()
+        except (OSError, EOFError):
+            pass  # it ended without reading; its exit status says why
+
+    if len(data) <= _INLINE:
+        send()
+        return None
+    thread = threading.Thread(target=send, name='fog-feed', daemon=True)
+    thread.start()
+    return thread
+
+
+def _pause(channel: paramiko.Channel, until: float) -> None:
+    """Wait a little for the exit status, which may come after the output's end."""
+    channel.status_event.wait(max(0.0, until - time.monotonic()))
+
+
+def _signal(channel: paramiko.Channel, name: str) -> None:
+    """Ask the server to send the command a signal (RFC 4254, 6.9); it may not listen."""
+    import paramiko
+
+    message = paramiko.Message()
+    message.add_byte(bytes([98]))  # SSH_MSG_CHANNEL_REQUEST
+    message.add_int(channel.remote_chanid)
+    message.add_string('signal')
+    message.add_boolean(False)
+    message.add_string(name)
+    try:
+        if not channel.closed:
+            # paramiko has no public name for it
+            channel.get_transport()._send_user_message(message)  # type: ignore[attr-defined]
+    except (paramiko.SSHException, EOFError, OSError):
+        pass  # the connection is gone, and with it the command's input and output

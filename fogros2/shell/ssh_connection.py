@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An authenticated SSH connection to a machine whose host key is known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import getpass
+import logging
+import os
+from pathlib import Path
+import socket
+import threading
+from typing import TYPE_CHECKING
+
+from fogros2.errors import AuthenticationError, ConnectError, HostKeyError
+from fogros2.model import Endpoint
+
+if TYPE_CHECKING:
+    import paramiko
+
+#: In this order; what the installed paramiko lacks is left out.
+CIPHERS = ('aes128-gcm@openssh.com', 'aes256-gcm@openssh.com', 'aes128-ctr', 'aes256-ctr')
+KEX = ('curve25519-sha256@libssh.org', 'ecdh-sha2-nistp256', 'diffie-hellman-group14-sha256',
+       'diffie-hellman-group-exchange-sha256')
+KNOWN_HOSTS = (Path('~/.ssh/known_hosts'), Path('/etc/ssh/ssh_known_hosts'))
+OWN_KEYS = ('id_ed25519', 'id_ecdsa', 'id_rsa')
+#: Seconds of silence after which a packet goes out, and after which an unanswered one ends it:
+#: a cut of half a minute is survived, a robot with another address connects anew.
+KEEPALIVE = 15
+USER_TIMEOUT = 60
+
+
+class PromptSocket(socket.socket):
+    """
+    A TCP socket that acknowledges at once.
+
+    While a session is set up, sshd sends small packets with Nagle's algorithm on: each would
+    wait for our delayed acknowledgement, 40 ms by Linux's default.
+    """
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        """Receive, and acknowledge without delay."""
+        data = super().recv(size, flags)
+        if data:
+            self.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        return data
+
+
+def warm() -> threading.Thread:
+    """Import paramiko in a thread, so that the first connection needn't wait for it."""
+    thread = threading.Thread(target=_import, name='fog-warm', daemon=True)
+    thread.start()
+    return thread
+
+
+def _import() -> None:
+    import paramiko
+    # its threads log what we raise; a handler-less logger would print it
+    logger = logging.getLogger(paramiko.__name__)
+    if logger.level == logging.NOTSET:
+        logger.setLevel(logging.CRITICAL)
+
+
+def user_of(endpoint: Endpoint) -> str:
+    """Return the login user: the endpoint's, or this process's."""
+    return endpoint.user or getpass.getuser()
+
+
+def host_label(endpoint: Endpoint) -> str:
+    """Return how ``known_hosts`` names the machine."""
+    if endpoint.port == 22:
+        return endpoint.host
+    return f'[{endpoint.host}]:{endpoint.port}'
+
+
+def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transport:
+    """
+    Return a connection that is encrypted, with the right machine, and logged in.
+
+    :param name: the machine's name, for messages.
+    :param timeout: seconds for each of TCP, key exchange and login.
+    :raises ConnectError: refused, no route, no answer, no SSH server.
+    :raises HostKeyError: another key than the pinned one, or an unknown one.
+    :raises AuthenticationError: no key of ours is accepted.
+    """
+    _import()
+    import paramiko
+
+    known = _known_keys(endpoint)
+    transport = paramiko.Transport(_dial(endpoint, name, timeout))
+    try:
+        transport.daemon = True
+        transport.banner_timeout = transport.handshake_timeout = timeout
+        transport.auth_timeout = timeout
+        _choose(transport, [key.split()[0] for key in known])
+        transport.start_client(timeout=timeout)
+        _verify(endpoint, name, transport.get_remote_server_key(), known)
+        _log_in(transport, endpoint, name)
+        transport.set_keepalive(KEEPALIVE)
+    except (paramiko.SSHException, EOFError, OSError) as error:
+        transport.close()
+        raise _explained(error, endpoint, name, bool(known)) from error
+    except BaseException:
+        transport.close()
+        raise
+    return transport
+
+
+def _dial(endpoint: Endpoint, name: str, timeout: float) -> PromptSocket:
+    where = f"'{name}' ({endpoint.host} port {endpoint.port})"
+    try:
+        plain = socket.create_connection((endpoint.host, endpoint.port), timeout=timeout)
+    except socket.gaierror as error:
+        raise ConnectError(f"'{name}': there is no host called '{endpoint.host}'",
+                           'check host=') from error
+    except ConnectionRefusedError as error:
+        raise ConnectError(f'{where} refuses connections', 'does its SSH server run?') from error
+    except TimeoutError as error:
+        raise ConnectError(f'{where} does not answer within {timeout:g} s',
+                           'is it on, and is the port open for this robot?') from error
+    except OSError as error:
+        raise ConnectError(f'{where} can not be reached: {error.strerror or error}',
+                           "check the robot's network") from error
+    sock = PromptSocket(plain.family, plain.type, plain.proto, fileno=plain.detach())
+    sock.settimeout(timeout)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT * 1000)
+    return sock
+
+
+def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
+    """Restrict what is negotiated to what is fast, safe and, for the host key, known."""
+    options = transport.get_security_options()
+    options.ciphers = [c for c in CIPHERS if c in options.ciphers] or options.ciphers
+    options.kex = [k for k in KEX if k in options.kex] or options.kex
+    if key_types:
+        names = [n for t in key_types for n in (
+            ('rsa-sha2-512', 'rsa-sha2-256') if t == 'ssh-rsa' else (t,))]
+        options.key_types = [n for n in options.key_types if n in names] or options.key_types
+    else:
+        first = [n for n in options.key_types if n == 'ssh-ed25519']
+        options.key_types = first + [n for n in options.key_types if n not in first]
+
+
+def _known_keys(endpoint: Endpoint) -> list[str]:
+    """Return the host keys to accept (``type base64``): the pinned one or known_hosts' ones."""
+    import paramiko
+    if endpoint.host_key is not None:
+        words = endpoint.host_key.split()
+        if len(words) < 2:
+            raise HostKeyError(f"'{endpoint.host_key}' is no host key",
+                               "host_key= takes 'ssh-ed25519 AAAA...'")
+        return [' '.join(words[:2])]
+    found: list[str] = []
+    for path in KNOWN_HOSTS:
+        file = path.expanduser()
+        if file.is_file():
+            hosts = paramiko.HostKeys()
+            try:
+                hosts.load(str(file))
+            except (paramiko.SSHException, OSError) as error:
+                raise HostKeyError(f'{file} can not be read: {error}') from error
+            entry = hosts.lookup(host_label(endpoint))
+            if entry is not None:
+                found += [f'{kind} {entry[kind].get_base64()}' for kind in entry.keys()]
+    return found
+
+
+def _verify(
+    endpoint: Endpoint, name: str, key: paramiko.PKey, known: Sequence[str],
+) -> None:
+    line = f'{key.get_name()} {key.get_base64()}'
+    if line in known:
+        return
+    if endpoint.host_key is not None:
+        raise HostKeyError(
+            f"'{name}' ({endpoint.host}) shows another host key than the pinned one",
+            f'another machine answers there; its key is {line}')
+    if known:
+        raise HostKeyError(
+            f"'{name}' ({endpoint.host}) shows another host key than known_hosts has",
+            f"if the machine was set up anew: ssh-keygen -R '{host_label(endpoint)}'")
+    raise HostKeyError(
+        f"the host key of '{name}' ({endpoint.host}) is unknown",
+        'if it is right, add this line to ~/.ssh/known_hosts: '
+        f'{host_label(endpoint)} {line}')
+
+
+def _log_in(transport: paramiko.Transport, endpoint: Endpoint, name: str) -> None:
+    import paramiko
+    user = user_of(endpoint)
+    tried = 0
+    for key in _keys(endpoint, name):
+        tried += 1
+        try:
+            transport.auth_publickey(user, key)
+            return
+        except paramiko.AuthenticationException:
+            if not transport.is_active():
+                break  # the server has had enough of our keys
+    where = endpoint.key_file or "the user's own keys"
+    raise AuthenticationError(
+        f"'{name}' ({user}@{endpoint.host}) does not accept {where}" if tried else
+        f"there is no key to log in to '{name}' with",
+        f'add the public key to ~{user}/.ssh/authorized_keys there' if tried else
+        'give key=, or make one with: ssh-keygen -t ed25519')
+
+
+def _keys(endpoint: Endpoint, name: str) -> Iterator[paramiko.PKey]:
+    import paramiko
+    if endpoint.key_file is not None:
+        yield load_key(Path(endpoint.key_file).expanduser(), name)
+        return
+    try:
+        yield from paramiko.Agent().get_keys()
+    except paramiko.SSHException:
+        pass  # an agent that doesn't speak to us is like none
+    for own in OWN_KEYS:
+        path = Path('~/.ssh', own).expanduser()
+        if path.is_file():
+            try:
+                yield load_key(path, name)
+            except AuthenticationError:
+                continue  # one with a passphrase: the agent's part
+
+
+def load_key(path: Path, name: str) -> paramiko.PKey:
+    """
+    Return a private key.
+
+    :raises AuthenticationError: it can't be read, or has a passphrase.
+    """
+    import paramiko
+    if not os.access(path, os.R_OK):
+        raise AuthenticationError(f"the key {path} for '{name}' can not be read", 'check key=')
+    for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
+        try:
+            key: paramiko.PKey = kind.from_private_key_file(str(path))
+            return key
+        except paramiko.PasswordRequiredException as error:
+            raise AuthenticationError(f'the key {path} has a passphrase',
+                                      f'ssh-add {path}') from error
+        except (paramiko.SSHException, ValueError, IndexError):
+            continue  # of another type
+    raise AuthenticationError(f'{path} is no private key that SSH knows', 'check key=')
+
+
+def _explained(
+    error: Exception, endpoint: Endpoint, name: str, known: bool,
+) -> ConnectError | HostKeyError | AuthenticationError:
+    text = str(error) or type(error).__name__
+    if known and 'host key' in text.lower() or 'ncompatible ssh peer (no acceptable host' in text:
+        return HostKeyError(
+            f"'{name}' ({endpoint.host}) has no host key of the type that is known",
+            'another machine answers there, or it was set up anew')
+    where = f"'{name}' ({endpoint.host} port {endpoint.port})"
+    if 'banner' in text or isinstance(error, EOFError):
+        return ConnectError(f'{where} does not answer as an SSH server',
+                            'it may still be starting, or limit connections')
+    return ConnectError(f'the connection to {where} failed: {text}')

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A folder made equal on a machine, by rsync.
+
+What changed since the last time goes over the connection that is open already: no second
+login, 0.12 s for 10,000 files of which one changed, against 0.24 s with a connection of
+OpenSSH's. A large folder that isn't there yet goes over OpenSSH, whose ciphers take a third of
+the processor time of Python's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import os
+from pathlib import Path
+import re
+import tempfile
+import threading
+import time
+from typing import Optional, Protocol, TYPE_CHECKING
+
+from fogros2 import process
+from fogros2.errors import (
+    CommandError,
+    ConnectError,
+    FogError,
+    PrerequisiteError,
+    ShellError,
+    WorkspaceError,
+)
+from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.shell import command_line, relay, ssh_connection
+
+if TYPE_CHECKING:
+    import paramiko
+
+#: Bytes from which a connection of OpenSSH's own pays.
+BULK = 64 << 20
+#: Exit status of rsync for source files that vanished meanwhile: editors and compilers do that.
+_VANISHED = 24
+
+
+class Connection(Protocol):
+    """What is needed of an SSHShell."""
+
+    endpoint: Endpoint
+    name: str
+
+    def run(self, command: Command, *, timeout: float, check: bool = True,
+            cancel: Optional[threading.Event] = None) -> Result:
+        """Run a command there."""
+
+    def start(self, line: str) -> paramiko.Channel:
+        """Start a command line there."""
+
+
+def to_machine(
+    shell: Connection, source: Path, target: str, *, excludes: Sequence[str],
+    includes: Sequence[str], timeout: float, cancel: Optional[threading.Event],
+    on_progress: Optional[Callable[[int, int], None]],
+) -> SyncReport:
+    """Make the folder ``target`` on a machine equal ``source`` here; see the Shell protocol."""
+    begin = time.monotonic()
+    where = f"'{shell.name}'"
+    process.require(['rsync'])
+    check_source(source)
+    path = command_line.remote_path(target)
+    there = shell.run(
+        Command.script(
+            f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync; '
+            f'ls -A -- {path} | head -n 1', what=f'making {target}'),
+        timeout=timeout, cancel=cancel).stdout.split()
+    if 'no-rsync' in there:
+        raise missing_there(where)
+    with contextlib.ExitStack() as undo:
+        failures: list[FogError] = []
+        if not there and process.which('ssh') and is_large(source, BULK):
+            rsh = undo.enter_context(open_ssh(shell.endpoint))
+        else:
+            rsh, failures = undo.enter_context(relay.remote_shell(shell.start))
+        left = timeout - (time.monotonic() - begin)
+        result = process.run(
+            rsync(source, f'machine:{remote_folder(target)}',
+                  excludes=excludes, includes=includes, rsh=rsh,
+                  progress=on_progress is not None),
+            timeout=max(0.1, left), cancel=cancel, check=False,
+            on_output=None if on_progress is None else Progress(on_progress))
+    if failures:
+        raise failures[0]
+    if result.returncode not in (0, _VANISHED):
+        raise explained(result, source, where)
+    return report(result.stdout, time.monotonic() - begin)
+
+
+def to_folder(
+    source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
+    timeout: float, cancel: Optional[threading.Event],
+    on_progress: Optional[Callable[[int, int], None]],
+) -> SyncReport:
+    """Make the folder ``target`` on this computer equal ``source``."""
+    begin = time.monotonic()
+    process.require(['rsync'])
+    check_source(source)
+    folder = os.path.expanduser(target)
+    process.run(Command(('mkdir', '-p', '--', folder), what=f'making {target}'), timeout=timeout)
+    result = process.run(
+        rsync(source, folder, excludes=excludes, includes=includes,
+              progress=on_progress is not None),
+        timeout=timeout, cancel=cancel, check=False,
+        on_output=None if on_progress is None else Progress(on_progress))
+    if result.returncode not in (0, _VANISHED):
+        raise explained(result, source, process.HERE)
+    return report(result.stdout, time.monotonic() - begin)
+
+
+def check_source(source: Path) -> None:
+    """
+    Look whether a folder can be sent.
+
+    :raises WorkspaceError: it isn't there, or is no folder.
+    """
+    if not source.is_dir():
+        raise WorkspaceError(f'{source} is no folder that could be sent')
+
+
+def is_large(source: Path, limit: int) -> bool:
+    """Return whether a folder's files exceed ``limit`` bytes; stops counting there."""
+    size = 0
+    folders = [str(source)]
+    while folders:
+        with contextlib.suppress(OSError), os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    if entry.name != '.git':
+                        folders.append(entry.path)
+                elif entry.is_file(follow_symlinks=False):
+                    size += entry.stat(follow_symlinks=False).st_size
+                    if size > limit:
+                        return True
+    return False
+
+
+def remote_folder(target: str) -> str:
+    """Return a folder for rsync, which begins in the login user's home."""
+    return f"{target[2:] or '.'}/" if target.startswith('~/') else f'{target}/'
+
+
+def rsync(
+    source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
+    rsh: str = '', progress: bool = False,
+) -> Command:
+    """
+    Return the command that makes ``target`` equal ``source``.
+
+    :param target: a folder here, or ``machine:folder``.
+    :param rsh: program and words that reach ``machine``.
+    :param progress: print how far it is, a line each.
+    """
+    # protected arguments: no shell over there looks into a folder's name
+    words = ['rsync', '-a', '-s', '--delete', '--stats', '--no-human-readable']
+    words += [f'--include={pattern}' for pattern in includes]
+    words += [f'--exclude={pattern}' for pattern in excludes]
+    if progress:
+        words += ['--info=progress2', '--no-inc-recursive']
+    if rsh:
+        words += ['-e', rsh]
+    words += ['--', f'{source}/', target]
+    if progress:
+        # it rewrites one line with carriage returns; ours are lines
+        script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
+        words = ['bash', '-c', script, 'rsync', *words]
+    return Command(tuple(words), environment={'LC_ALL': 'C'}, what='rsync')
+
+
+class Progress:
+    """
+    Takes rsync's lines and hands on bytes done and bytes in all, ten times a second.
+
+    rsync tells whole percents: each line narrows down what the total can be.
+    """
+
+    _LINE = re.compile(r'^\s*(\d+)\s+(\d+)%')
+
+    def __init__(self, report: Callable[[int, int], None], interval: float = 0.1) -> None:
+        self._report = report
+        self._interval = interval
+        self._next = 0.0
+        self._total = 0
+
+    def __call__(self, line: str) -> None:
+        """Take a line of rsync's output."""
+        match = self._LINE.match(line)
+        if not match:
+            return
+        done, percent = int(match[1]), int(match[2])
+        if percent:
+            most = done * 100 // percent
+            self._total = max(done, min(most, self._total or most))
+        now = time.monotonic()
+        if now >= self._next or percent == 100:
+            self._next = now + self._interval
+            self._report(done, self._total)
+
+
+def report(output: str, seconds: float) -> SyncReport:
+    """Return what ``--stats`` says was sent."""
+    return SyncReport(
+        files=_number(output, 'Number of regular files transferred'),
+        bytes=_number(output, 'Total bytes sent'), seconds=seconds)
+
+
+def _number(output: str, label: str) -> int:
+    match = re.search(rf'^{label}: ([\d,.]+)', output, re.MULTILINE)
+    return int(re.sub(r'\D', '', match[1])) if match else 0
+
+
+def missing_there(where: str) -> ShellError:
+    """Return the error for a machine without rsync."""
+    return ShellError(f'{where} has no rsync', 'install it there: sudo apt-get install rsync')
+
+
+def explained(result: Result, source: Path, where: str) -> FogError:
+    """Return what rsync's failure means."""
+    text = result.stderr
+    if 'No space left on device' in text or 'Disk quota exceeded' in text:
+        return ShellError(f'the disk of {where} is full: {source} did not fit',
+                          'make room there, or leave more out')
+    if 'command not found' in text or 'remote command not found' in text:
+        return missing_there(where)
+    if result.returncode == 255 or 'connection unexpectedly closed' in text:
+        return ConnectError(f'the connection to {where} was lost while {source} was sent',
+                            "check the robot's network")
+    lines = [line for line in text.splitlines() if line.startswith('rsync:')] or \
+        text.splitlines()
+    told = Result(result.returncode, '', '\n'.join(lines[:3]))
+    hint = 'give the login user the right to write there' if 'Permission denied' in text else ''
+    return CommandError(Command(('rsync',), what=f'sending {source}'), told, where, hint)
+
+
+@contextlib.contextmanager
+def open_ssh(endpoint: Endpoint) -> Iterator[str]:
+    """
+    Yield the value of rsync's ``-e`` for a connection of OpenSSH's, pinned as ours is.
+
+    :raises PrerequisiteError: the host key can't be handed over.
+    """
+    words = [
+        'ssh', '-F', 'none', '-T', '-p', str(endpoint.port),
+        '-l', ssh_connection.user_of(endpoint),
+        '-o', f'HostName={endpoint.host}', '-o', 'BatchMode=yes', '-o', 'ControlPath=none',
+        '-o', 'StrictHostKeyChecking=yes', '-o', 'UpdateHostKeys=no', '-o', 'LogLevel=ERROR',
+        '-o', 'PreferredAuthentications=publickey', '-o', 'GSSAPIAuthentication=no',
+        '-o', 'Compression=no', '-o', 'ForwardX11=no', '-o', 'ForwardAgent=no',
+        '-o', 'ServerAliveInterval=15', '-o', 'ServerAliveCountMax=4',
+        '-c', ','.join(ssh_connection.CIPHERS),
+    ]
+    if endpoint.key_file is not None:
+        words += ['-o', 'IdentitiesOnly=yes', '-i', os.path.expanduser(endpoint.key_file)]
+    with contextlib.ExitStack() as undo:
+        if endpoint.host_key is not None:
+            try:
+                known = undo.enter_context(
+                    tempfile.NamedTemporaryFile('w', prefix='fogros2-', suffix='.hosts'))
+            except OSError as error:
+                raise PrerequisiteError(
+                    f'no temporary file can be made: {error.strerror}') from error
+            known.write(f'machine {endpoint.host_key}\n')
+            known.flush()
+            words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
+                      '-o', 'GlobalKnownHostsFile=/dev/null']
+        else:
+            words += ['-o', f'HostKeyAlias={ssh_connection.host_label(endpoint)}']
+        yield ' '.join(_word(word) for word in words)
+
+
+def _word(word: str) -> str:
+    """Return a word as rsync's ``-e`` wants it: quoted, with quotes doubled."""
+    return f"'{word}'" if ' ' in word else word
