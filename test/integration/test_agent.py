@@ -20,11 +20,12 @@ import threading
 import time
 from typing import Any, Optional
 
+import pytest
+
 from fogros2.agent_client import agent_source, AgentClient, cloud_launch_source, Heartbeat
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, NodeSpec
 from fogros2.waiting import wait_until
-import pytest
 
 pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
 
