@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything a launch needs of this computer, looked at before it costs anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+from importlib import metadata
+import importlib.util
+import os
+from pathlib import Path
+import re
+import sys
+from typing import Literal
+import xml.etree.ElementTree as ElementTree
+
+from fogros2 import deploy, plan, plugin_system, process
+from fogros2.dds.cyclonedds import RECEIVE_BUFFER
+from fogros2.errors import FogError
+from fogros2.host import DISTRO, RMW
+from fogros2.model import Command
+from fogros2.provider import container, container_engine
+from fogros2.store import state_home
+from fogros2.vpn import addresses
+from ros2fog_cli.api import lan
+
+Verdict = Literal['ok', 'warning', 'failed']
+_OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """
+    What was found of one thing.
+
+    :param remedy: what to do about it, '' where nothing is to be done.
+    """
+
+    name: str
+    verdict: Verdict
+    detail: str
+    remedy: str = ''
+
+
+def examine(*, lan_seconds: float = 1.5) -> list[Check]:
+    """
+    Return all checks, in a fixed order.
+
+    :param lan_seconds: how long to listen for ROS 2 computers on the networks here, 0 for not.
+    """
+    checks: list[Callable[[], Check]] = [
+        python, programs, root, tun, wireguard, engine, overlay, firewall_program, ros, rmw,
+        cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state,
+        lambda: lan_peers(lan_seconds)]
+    with ThreadPoolExecutor(6, 'fog-doctor') as pool:
+        return list(pool.map(lambda check: check(), checks))
+
+
+def python() -> Check:
+    """Look at the interpreter."""
+    version = '.'.join(str(part) for part in sys.version_info[:3])
+    if sys.version_info < (3, 10):
+        return Check('Python', 'failed', version, 'Python 3.10 or newer is needed')
+    return Check('Python', 'ok', f'{version} in {sys.prefix}')
+
+
+def programs() -> Check:
+    """Look for the programs that every launch calls."""
+    missing = [program for program in deploy.ROBOT_PROGRAMS if not process.which(program)]
+    less = [program for program in _OPTIONAL if not process.which(program)]
+    packages = sorted({deploy.ROBOT_PROGRAMS[p] for p in missing} | {_OPTIONAL[p] for p in less})
+    remedy = f"sudo apt-get install {' '.join(packages)}" if packages else ''
+    if missing:
+        return Check('programs', 'failed', f"{', '.join(missing)} not found", remedy)
+    if less:
+        return Check('programs', 'warning', f"{', '.join(less)} not found", remedy)
+    return Check('programs', 'ok', ', '.join(deploy.ROBOT_PROGRAMS))
+
+
+def root() -> Check:
+    """Look whether commands run as root without a question."""
+    if os.geteuid() == 0:
+        return Check('root', 'ok', 'running as root')
+    try:
+        deploy.check_sudo()
+    except FogError as error:
+        return _failed('root', error)
+    return Check('root', 'ok', 'sudo asks nothing')
+
+
+def tun() -> Check:
+    """Look for TUN."""
+    if Path('/dev/net/tun').exists():
+        return Check('TUN', 'ok', '/dev/net/tun')
+    return Check('TUN', 'failed', 'no /dev/net/tun', 'sudo modprobe tun')
+
+
+def wireguard() -> Check:
+    """Look for WireGuard in the kernel, or as a program."""
+    if Path('/sys/module/wireguard').exists() or _succeeds('modprobe', '-nq', 'wireguard'):
+        return Check('WireGuard', 'ok', 'in the kernel')
+    if process.which('wireguard-go'):
+        return Check('WireGuard', 'ok', 'wireguard-go (the kernel has no module)')
+    return Check('WireGuard', 'failed', 'neither in the kernel nor as wireguard-go',
+                 'sudo apt-get install wireguard-go')
+
+
+def engine() -> Check:
+    """Look for a container engine that answers."""
+    name = 'container engine'
+    try:
+        chosen = container_engine.select('auto', None)
+        # the flags may name a runtime or a cgroup manager that doesn't work: ask with them
+        said = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
+                           timeout=20.0)
+    except FogError as error:
+        return Check(name, 'warning', str(error.args[0]),
+                     f'{error.hint} (needed for ContainerInstance alone)')
+    return Check(name, 'ok', f'{chosen.name}, {len(said.stdout.split())} containers run')
+
+
+def overlay() -> Check:
+    """Look whether this computer's own root can serve as an image."""
+    try:
+        container.check_root()
+    except FogError as error:
+        return Check("container on this computer's root", 'warning', str(error.args[0]),
+                     error.hint or "name an image with image='...'")
+    return Check("container on this computer's root", 'ok', 'can be overlaid')
+
+
+def firewall_program() -> Check:
+    """Look whether nftables takes rules: the robot's side of the VPN is filtered."""
+    try:
+        process.run(Command(('nft', 'list', 'tables'), sudo=True, what='ask nftables'),
+                    timeout=10.0)
+    except FogError as error:
+        return Check('nftables', 'failed', str(error.args[0]),
+                     error.hint or 'sudo modprobe nf_tables')
+    return Check('nftables', 'ok', 'takes rules')
+
+
+def ros() -> Check:
+    """Look for ROS 2, or the embedded default."""
+    name = 'ROS 2'
+    if process.which('ros2') is None:
+        return Check(name, 'failed', 'ros2 is not on PATH', "source ROS 2's setup.bash")
+    try:
+        return Check(name, 'ok', f"embedded default {metadata.version('ros2-embedded')}")
+    except metadata.PackageNotFoundError:
+        pass
+    distro = os.environ.get('ROS_DISTRO', '')
+    if importlib.util.find_spec('rclpy') is None:
+        return Check(name, 'failed', 'rclpy is not there', f'source /opt/ros/{DISTRO}/setup.bash')
+    if distro != DISTRO:
+        return Check(name, 'warning', f"ROS_DISTRO is '{distro}'", f'made and tested for {DISTRO}')
+    return Check(name, 'ok', f'{distro}')
+
+
+def rmw() -> Check:
+    """Look whether the middleware is one that can be led over a VPN, and is installed."""
+    try:
+        chosen = plan.choose_rmw(os.environ, plugin_system.names('fogros2.dds'))
+    except FogError as error:
+        return _failed('RMW_IMPLEMENTATION', error)
+    set_here = 'set' if os.environ.get('RMW_IMPLEMENTATION') else 'not set'
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    if any(Path(prefix, 'share', 'rclcpp').is_dir() for prefix in prefixes) \
+            and not any(Path(prefix, 'share', chosen).is_dir() for prefix in prefixes):
+        return Check('RMW_IMPLEMENTATION', 'failed', f'{chosen} is not installed',
+                     f"sudo apt-get install ros-{DISTRO}-{RMW.replace('_', '-')}")
+    return Check('RMW_IMPLEMENTATION', 'ok', f'{set_here}: launches use {chosen}')
+
+
+def cyclone_uri() -> Check:
+    """Look whether the user's own Cyclone configuration can be read; ours comes after it."""
+    name, uri = 'CYCLONEDDS_URI', os.environ.get('CYCLONEDDS_URI', '').strip()
+    if not uri:
+        return Check(name, 'ok', 'not set')
+    for part in _fragments(uri):
+        path = part.removeprefix('file://')
+        try:
+            text = part if part.startswith('<') else Path(path).read_text()
+            ElementTree.fromstring(text)
+        except OSError as error:
+            return Check(name, 'failed', f'{path}: {error.strerror}', 'correct it, or unset it')
+        except ElementTree.ParseError as error:
+            return Check(name, 'failed', f'{part[:60]} is no XML: {error}',
+                         'correct it, or unset it')
+    return Check(name, 'ok', 'readable; ours is appended')
+
+
+def _fragments(uri: str) -> Iterator[str]:
+    """Yield the comma-separated parts of the variable; XML in it may hold commas itself."""
+    if uri.startswith('<'):
+        end = uri.rfind('>') + 1
+        yield uri[:end]
+        uri = uri[end:].lstrip(',')
+    for part in uri.split(','):
+        if part.strip():
+            yield part.strip()
+
+
+def receive_buffer() -> Check:
+    """Look how large a receive buffer the kernel gives: raw images need one."""
+    name = 'receive buffer'
+    try:
+        most = int(Path('/proc/sys/net/core/rmem_max').read_text())
+    except (OSError, ValueError):
+        return Check(name, 'warning', 'net.core.rmem_max can not be read here')
+    if most < RECEIVE_BUFFER:
+        return Check(
+            name, 'warning', f'net.core.rmem_max is {most}: large images get lost on their way',
+            f'sudo sysctl -w net.core.rmem_max={RECEIVE_BUFFER}')
+    return Check(name, 'ok', f'net.core.rmem_max is {most}')
+
+
+def udp_port() -> Check:
+    """Look for a free UDP port."""
+    try:
+        return Check('UDP port', 'ok', f'{addresses.choose_port()} is free')
+    except FogError as error:
+        return _failed('UDP port', error)
+    except OSError as error:
+        return Check('UDP port', 'failed', f'none can be opened: {error.strerror}')
+
+
+def ssh_keys() -> Check:
+    """Look whether an SSHInstance could log in with the user's own keys."""
+    folder = Path('~/.ssh').expanduser()
+    keys = [path.name for path in sorted(folder.glob('id_*')) if not path.name.endswith('.pub')] \
+        if folder.is_dir() else []
+    agent = os.environ.get('SSH_AUTH_SOCK', '')
+    if keys or agent:
+        return Check('SSH keys', 'ok', ', '.join([*keys, *(['SSH agent'] if agent else [])]))
+    return Check('SSH keys', 'warning', f'no key in {folder} and no SSH agent',
+                 'ssh-keygen -t ed25519 (needed for SSHInstance without key= alone)')
+
+
+def firewall() -> Check:
+    """Look for a firewall of the user's own that may keep the VPN out."""
+    try:
+        rules = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
+                            check=False).stdout
+    except FogError:
+        return Check('firewall', 'warning', 'can not be looked at without nft')
+    chains = re.findall(r'chain (\S+) \{\s*type filter hook input[^;]*; policy drop;', rules)
+    if not chains:
+        return Check('firewall', 'ok', 'lets in by default')
+    if re.search(r'iifname "fog\*" (counter [^\n]*)?accept', rules):
+        return Check('firewall', 'ok', 'lets in what comes through the VPN')
+    return Check(
+        'firewall', 'warning', f"the chain {', '.join(chains)} drops by default: it has to let in "
+        'DDS and ping from the interfaces fog*', 'nft insert rule inet filter input iifname '
+        '"fog*" accept (or, for ufw: what `ufw allow in on` takes)')
+
+
+def state() -> Check:
+    """Look whether the state folder is ours alone."""
+    folder = state_home()
+    if not folder.exists():
+        parent = next(p for p in folder.parents if p.exists())
+        if os.access(parent, os.W_OK):
+            return Check('state folder', 'ok', f'{folder} will be made')
+        return Check('state folder', 'failed', f'{parent} is not writable',
+                     'FOGROS2_STATE_HOME names another folder')
+    status = folder.stat()
+    if status.st_uid != os.geteuid() or not os.access(folder, os.W_OK):
+        return Check('state folder', 'failed', f'{folder} belongs to somebody else',
+                     f'sudo chown -R {os.geteuid()} {folder}')
+    if status.st_mode & 0o077:
+        return Check('state folder', 'warning', f'{folder} can be read by others',
+                     f'chmod 700 {folder}')
+    return Check('state folder', 'ok', str(folder))
+
+
+def lan_peers(seconds: float) -> Check:
+    """Look for ROS 2 on other computers: a launch's nodes would not talk to them."""
+    name = 'ROS 2 on the LAN'
+    if seconds <= 0:
+        return Check(name, 'ok', 'not looked for')
+    try:
+        domain = int(os.environ.get('ROS_DOMAIN_ID') or 0)
+        found = lan.participants(domain, seconds)
+    except (ValueError, OSError) as error:
+        return Check(name, 'warning', f'can not be looked for: {error}')
+    if not found:
+        return Check(name, 'ok', f'no other computer answers in domain {domain}')
+    hosts = ', '.join(f'{host} ({count})' for host, count in sorted(found.items()))
+    return Check(
+        name, 'warning', f'participants at {hosts}: nodes of a launch with cloud machines prefer '
+        'the VPN and do not exchange messages with them',
+        'run what they need on a machine of the launch, or in a launch without CloudNode')
+
+
+def _succeeds(*words: str) -> bool:
+    try:
+        return process.run(Command(words), timeout=10.0, check=False).returncode == 0
+    except FogError:
+        return False
+
+
+def _failed(name: str, error: FogError) -> Check:
+    return Check(name, 'failed', str(error.args[0]), error.hint)

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ending machines, and taking away what dead launches have left on this robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import json
+from pathlib import Path
+import re
+import shutil
+import time
+from typing import Optional
+
+from fogros2 import deploy, plugin_system, process
+from fogros2 import shell as shells
+from fogros2.agent_client import AgentClient
+from fogros2.errors import (
+    AgentError,
+    ConfigurationError,
+    ConnectError,
+    NameTaken,
+)
+from fogros2.model import Command, MachineState, VpnInterface
+from fogros2.report import Reporter
+from fogros2.store import process_start, Record, Store
+from fogros2.vpn import Vpn
+from fogros2.waiting import Timeouts
+from ros2fog_cli.api import machines
+from ros2fog_cli.api.machines import Entry
+
+#: Seconds that a stopped machine is kept unless gc is told otherwise.
+KEEP_STOPPED = 7 * 86400.0
+#: Seconds after the end of its lifetime in which a machine may still be ending itself.
+GRACE = 60.0
+#: Seconds after which a launch's folder without a word on its process counts as left behind.
+FOLDER_AGE = 86400.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Leftover:
+    """A launch's folder whose launch is gone, with the interface that may still be there."""
+
+    launch: str
+    folder: Path
+
+
+def check_free(entry: Entry, *, force: bool) -> None:
+    """
+    Refuse to end a machine under a launch that runs.
+
+    :raises NameTaken: the launch that has it is alive, and ``force`` isn't set.
+    """
+    if entry.record is not None and entry.record.launch_alive and not force:
+        raise NameTaken(
+            f"the launch with process {entry.record.pid} has the machine '{entry.name}'",
+            'end that launch, or delete with --force')
+
+
+def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False) -> None:
+    """
+    End a machine, and take away what this robot has for it once it has gone; idempotent.
+
+    :param force: also under a launch that runs, and of a computer that can't be reached.
+    :raises FogError: the machine, or something of it, is still there.
+    """
+    check_free(entry, force=force)
+    with _lock(entry, store, force=force):
+        if not entry.asked and not force:
+            raise ConfigurationError(
+                f"the provider '{entry.provider}' of '{entry.name}' can't be asked",
+                '--force forgets the machine here; it may go on by itself')
+        if entry.machine is not None:
+            if not entry.machine.owned and entry.record is not None:
+                _leave(entry.record, force=force)
+            machines.load(entry.machine.provider).destroy(entry.machine.id)
+        record = entry.record
+        if record is None:
+            return
+        if record.damage:
+            store.machine(record.name).delete()
+            return
+        if force and record.launch_alive:
+            # its launch will find the machine gone and take the rest down itself
+            return
+        deploy.cleanup(record, store, report)
+
+
+@contextlib.contextmanager
+def _lock(entry: Entry, store: Store, *, force: bool) -> Iterator[None]:
+    """Hold the machine's name, unless it is another robot's or taken by force."""
+    if entry.record is None or force:
+        yield
+        return
+    with store.machine(entry.name).lock():
+        yield
+
+
+def _leave(record: Record, *, force: bool) -> None:
+    """Take our agent, its nodes and the VPN off a computer that stays."""
+    if record.shell is None:
+        return
+    timeouts = Timeouts()
+    shell = shells.connect(record.shell, name=record.name, timeout=10.0)
+    try:
+        if record.agent and record.agent_program:
+            client = AgentClient(shell, record.agent, agent_path=record.agent_program,
+                                 python=record.python)
+            try:
+                client.request('release', on_exit='delete', exit=True, timeout=30.0)
+            except AgentError:
+                pass  # it left by itself
+            finally:
+                client.close()
+        if record.vpn is not None:
+            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+            for command in vpn.down(record.vpn):
+                shell.run(command, timeout=timeouts.vpn)
+        if record.agent:
+            shell.run(Command(('rm', '-rf', '--', record.agent), sudo=True,
+                              what='remove the agent'), timeout=timeouts.command)
+    except ConnectError:
+        if not force:
+            raise
+    finally:
+        shell.close()
+
+
+def why_end(
+    entry: Entry, now: float, keep_stopped: float, stopped_at: Optional[float] = None,
+) -> str:
+    """
+    Say why gc should end a machine, '' if it should live.
+
+    :param stopped_at: when it was stopped, in seconds since the epoch; None where unknown.
+    """
+    record = entry.record
+    if record is not None and (record.launch_alive or record.damage and entry.machine is None):
+        return ''
+    if not entry.asked or not entry.own:
+        return ''
+    if entry.gone:
+        return 'gone at its provider'
+    assert entry.machine is not None
+    if entry.machine.state is MachineState.STOPPED:
+        since = stopped_at if stopped_at is not None else entry.created
+        if since is not None and now - since > keep_stopped:
+            return f'stopped for more than {keep_stopped / 86400:g} days'
+        return ''
+    if entry.expires is not None and now > entry.expires + GRACE:
+        return 'past its lifetime'
+    if record is not None and record.launch and record.spec.on_exit == 'delete':
+        return 'its launch is gone'
+    return ''
+
+
+def stopped_at(record: Optional[Record], store: Store) -> Optional[float]:
+    """Return when this robot stopped a machine: its record was written last then."""
+    if record is None:
+        return None
+    try:
+        return (store.machine(record.name).path / 'record.json').stat().st_mtime
+    except OSError:
+        return None
+
+
+def let_go(record: Record, store: Store) -> None:
+    """
+    Take away what a dead launch left for a machine that is kept; the machine stays.
+
+    :raises FogError: something could not be taken away.
+    """
+    with store.machine(record.name).lock():
+        if record.robot_vpn is not None:
+            _take_down(record.robot_vpn, record.spec.vpn)
+        shutil.rmtree(store.root / 'launches' / record.launch, ignore_errors=True)
+        store.machine(record.name).save(dataclasses.replace(
+            record, launch='', pid=0, pid_start=0, robot_vpn=None))
+
+
+def leftovers(store: Store, now: Optional[float] = None) -> list[Leftover]:
+    """Return the folders of launches that are dead and that no machine's record names."""
+    now = time.time() if now is None else now
+    named = {record.launch for record in store.machines() if record.launch}
+    folder = store.root / 'launches'
+    found = []
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if path.name not in named and re.fullmatch('[0-9a-f]{6}', path.name) \
+                and _dead(path, now):
+            found.append(Leftover(path.name, path))
+    return found
+
+
+def _dead(folder: Path, now: float) -> bool:
+    """Return whether the launch of a folder is gone, by its process or else by its age."""
+    try:
+        data = json.loads((folder / 'process.json').read_text())
+        return process_start(int(data['pid'])) != int(data['pid_start'])
+    except (OSError, ValueError, KeyError, TypeError):
+        try:
+            return now - folder.stat().st_mtime > FOLDER_AGE
+        except OSError:
+            return False
+
+
+def clear(leftover: Leftover) -> None:
+    """
+    Take away a dead launch's interface, filter, key and folder.
+
+    :raises FogError: something could not be taken away.
+    """
+    interface = VpnInterface(
+        f'fog{leftover.launch}', '127.0.0.1', '127.0.0.1/32', 0,
+        str(leftover.folder / 'vpn.key'), guarded=True)
+    _take_down(interface, 'wireguard')
+    shutil.rmtree(leftover.folder, ignore_errors=True)
+
+
+def _take_down(interface: VpnInterface, kind: str) -> None:
+    vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
+    for command in vpn.down(interface):
+        process.run(command, timeout=Timeouts().vpn)

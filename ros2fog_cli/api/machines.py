@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which machines there are: the providers' word first, the store's where a provider has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+from decimal import Decimal
+import time
+from typing import Any, Optional, Protocol, runtime_checkable
+
+from fogros2 import plugin_system
+from fogros2.errors import ConfigurationError, FogError, MachineNotFound, Unsupported
+from fogros2.model import Machine, MachineState
+from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.store import Record, robot_name, Store
+
+Warn = Callable[[str], None]
+
+
+@runtime_checkable
+class HasRegions(Protocol):
+    """A provider whose machines are in regions."""
+
+    def set_regions(self, regions: Sequence[str]) -> None:
+        """Ask these regions from now on; ``['all']`` stands for every one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """
+    A machine as the provider and this robot know it.
+
+    :param machine: None where the provider doesn't know it (any more), or can't be asked.
+    :param record: None where this robot knows nothing of it: an orphan, or another robot's.
+    :param asked: whether the provider's answer is in ``machine``.
+    """
+
+    name: str
+    provider: str
+    machine: Optional[Machine] = None
+    record: Optional[Record] = None
+    asked: bool = True
+
+    @property
+    def gone(self) -> bool:
+        """Whether only this robot's record is left of it."""
+        return self.asked and (self.machine is None
+                               or self.machine.state is MachineState.DELETED)
+
+    @property
+    def state(self) -> str:
+        """The state in words for people."""
+        if self.record is not None and self.record.damage:
+            state = self.machine.state if self.machine is not None else 'unknown'
+            return f'{state} (record damaged)'
+        if not self.asked:
+            return 'unknown'
+        if self.machine is None or self.gone:
+            return 'gone'
+        text = str(self.machine.state)
+        if self.machine.state is MachineState.STOPPED:
+            return f'{text} (keeps its disk)'
+        if self.record is None:
+            return f'{text} (orphan)' if self.own else f'{text} (robot {self.robot})'
+        if self.record.launch and not self.record.launch_alive:
+            return f'{text} (launch gone)'
+        return text
+
+    @property
+    def robot(self) -> str:
+        """The robot that asked for it, '' where nobody knows."""
+        if self.machine is not None and TAG_ROBOT in self.machine.tags:
+            return self.machine.tags[TAG_ROBOT]
+        return robot_name() if self.record is not None else ''
+
+    @property
+    def own(self) -> bool:
+        """Whether it is this robot's."""
+        return self.robot in ('', robot_name())
+
+    @property
+    def created(self) -> Optional[float]:
+        """When it was made, in seconds since the epoch."""
+        if self.machine is not None and self.machine.created:
+            return self.machine.created
+        return self.record.created or None if self.record is not None else None
+
+    @property
+    def expires(self) -> Optional[float]:
+        """When its lifetime is over, in seconds since the epoch."""
+        tag = self.machine.tags.get(TAG_EXPIRES, '') if self.machine is not None else ''
+        if tag.isdigit():
+            return float(tag)
+        if self.record is not None and self.record.created:
+            return self.record.created + self.record.spec.lifetime
+        return None
+
+    @property
+    def address(self) -> str:
+        """Where its shell is, '' while there is none."""
+        if self.machine is not None and self.machine.shell is not None:
+            return self.machine.shell.host
+        return self.record.shell.host if self.record is not None and self.record.shell else ''
+
+    @property
+    def launch(self) -> str:
+        """The launch that has it, or had it last."""
+        if self.record is not None and self.record.launch:
+            return self.record.launch
+        return self.machine.tags.get(TAG_LAUNCH, '') if self.machine is not None else ''
+
+    @property
+    def cost_per_hour(self) -> Optional[Decimal]:
+        """US dollars an hour, None where unknown."""
+        return self.machine.cost_per_hour if self.machine is not None else None
+
+    @property
+    def machine_id(self) -> Optional[str]:
+        """The provider's id."""
+        if self.machine is not None:
+            return self.machine.id
+        return self.record.machine_id if self.record is not None else None
+
+    def to_json(self, now: Optional[float] = None) -> dict[str, Any]:
+        """Return it as JSON: times in seconds, money in US dollars as a string."""
+        now = time.time() if now is None else now
+        return {
+            'name': self.name, 'provider': self.provider, 'state': self.state,
+            'id': self.machine_id, 'robot': self.robot, 'launch': self.launch,
+            'launch_alive': self.record.launch_alive if self.record is not None else None,
+            'created': self.created,
+            'age': None if self.created is None else max(0.0, now - self.created),
+            'address': self.address, 'expires': self.expires,
+            'time_left': None if self.expires is None else self.expires - now,
+            'cost_per_hour': None if self.cost_per_hour is None else str(self.cost_per_hour),
+        }
+
+
+def survey(
+    warn: Warn, *, name: Optional[str] = None, regions: Optional[Sequence[str]] = None,
+    store: Optional[Store] = None,
+) -> list[Entry]:
+    """
+    Return all machines, or those called ``name``, asking all providers at once.
+
+    A provider that can't be asked (no SDK, no credentials, no engine) costs a warning; what the
+    store knows of its machines is returned all the same.
+    """
+    records = {record.name: record for record in (store or Store()).machines()}
+    if name is not None:
+        records = {key: value for key, value in records.items() if key == name}
+    tags = {} if name is None else {TAG_NAME: name}
+    providers = plugin_system.names('fogros2.provider')
+    with ThreadPoolExecutor(max(1, len(providers)), 'fog-list') as pool:
+        answers = list(pool.map(
+            lambda provider: _ask(provider, tags, regions, records.values(), warn), providers))
+    entries: list[Entry] = []
+    matched: set[str] = set()
+    for machines in answers:
+        for machine in machines or []:
+            record = _record_of(machine, records)
+            if record is not None:
+                matched.add(record.name)
+            entries.append(Entry(machine.name or machine.tags.get(TAG_NAME, ''),
+                                 machine.provider, machine, record))
+    asked = {provider for provider, answer in zip(providers, answers) if answer is not None}
+    for record in records.values():
+        if record.name not in matched:
+            known = record.provider in asked or bool(record.damage)
+            entries.append(Entry(record.name, record.provider or '?', None, record, known))
+    return sorted(entries, key=lambda entry: (entry.name, entry.provider))
+
+
+def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
+    """Return this robot's record of a machine; another robot's of the same name is not it."""
+    record = records.get(machine.name or machine.tags.get(TAG_NAME, ''))
+    if record is None:
+        return None
+    if record.damage:
+        return record if machine.tags.get(TAG_ROBOT, robot_name()) == robot_name() else None
+    return record if record.machine_id == machine.id else None
+
+
+def _ask(
+    name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
+    records: Iterable[Record], warn: Warn,
+) -> Optional[list[Machine]]:
+    """Return a provider's machines, None if it can't be asked."""
+    try:
+        provider = load(name, regions)
+        try:
+            return list(provider.find(tags))
+        except Unsupported:
+            return _described(provider, [r for r in records if r.provider == name])
+    except FogError as error:
+        warn(f'{name}: {error}')
+        return None
+
+
+def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
+    """Return the machines that the store knows, of a provider that keeps no tags."""
+    machines = []
+    for record in records:
+        if record.machine_id is not None:
+            try:
+                machines.append(provider.describe(record.machine_id))
+            except MachineNotFound:
+                continue
+    return machines
+
+
+def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
+    """
+    Return a provider.
+
+    :param regions: asked where the provider has any, ``['all']`` or ``['*']`` for every one.
+    :raises FogError: there is none, or what it needs isn't installed.
+    """
+    provider: Provider = plugin_system.load('fogros2.provider', name)()
+    if regions and isinstance(provider, HasRegions):
+        provider.set_regions(['all'] if {'all', '*'} & set(regions) else list(regions))
+    return provider
+
+
+def one(entries: Sequence[Entry], name: str) -> Entry:
+    """
+    Return the one machine of that name.
+
+    :raises ConfigurationError: there is none, or several robots have one.
+    """
+    own = [entry for entry in entries if entry.own] or list(entries)
+    if not own:
+        raise ConfigurationError(f"there is no machine '{name}'",
+                                 'ros2 fog list shows those there are')
+    if len(own) > 1:
+        places = ', '.join(f'{entry.provider} {entry.machine_id}' for entry in own)
+        raise ConfigurationError(f"there are several machines '{name}': {places}",
+                                 'ros2 fog delete takes all of that name')
+    return own[0]

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reaching a machine by its name: its shell, its agent, its VPN."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import os
+import re
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2 import plan, plugin_system, process
+from fogros2 import shell as shells
+from fogros2.agent_client import AgentClient
+from fogros2.errors import AgentError, ConnectError, FogError
+from fogros2.model import Command, Endpoint
+from fogros2.shell import Shell
+from fogros2.store import Record, Store
+from fogros2.vpn import Vpn
+from ros2fog_cli.api import machines
+from ros2fog_cli.api.machines import Entry
+
+
+def find(
+    name: str, warn: Callable[[str], None], *, regions: Optional[list[str]] = None,
+) -> Entry:
+    """
+    Return the machine of that name; asks one provider where this robot knows which.
+
+    :raises ConfigurationError: there is none, or several.
+    """
+    folder = Store().machine(name)
+    if folder.exists() and not regions:
+        try:
+            record = folder.load()
+            machine = None
+            if record.machine_id is not None:
+                machine = machines.load(record.provider).describe(record.machine_id)
+            return Entry(name, record.provider, machine, record)
+        except FogError as error:
+            warn(f'{name}: {error}')
+    return machines.one(machines.survey(warn, name=name, regions=regions), name)
+
+
+def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
+    """
+    Return where the machine's shell is, with this robot's key if it has one.
+
+    :raises ConnectError: it has none, as it doesn't run.
+    """
+    found = entry.machine.shell if entry.machine is not None else None
+    if entry.record is not None and entry.record.shell is not None:
+        known = entry.record.shell
+        # the provider knows where it is now, the record which key it takes
+        found = dataclasses.replace(
+            found, key_file=known.key_file, user=known.user,
+            host_key=known.host_key or found.host_key) if found is not None else known
+    if found is None:
+        raise ConnectError(f"the machine '{entry.name}' can't be reached: {entry.state}")
+    return dataclasses.replace(found, user=user) if user else found
+
+
+def shell(entry: Entry, user: Optional[str] = None, timeout: float = 15.0) -> Shell:
+    """Return the machine's shell; connects when first used."""
+    return shells.connect(endpoint(entry, user), name=entry.name, timeout=timeout)
+
+
+def agent(entry: Entry, to: Shell) -> AgentClient:
+    """
+    Return a connection to the machine's agent.
+
+    :raises AgentError: this robot doesn't know where it is.
+    """
+    record = entry.record
+    if record is None or not record.agent or not record.agent_program:
+        raise AgentError(f"this robot knows of no agent on '{entry.name}'",
+                         'only the robot that launched it does')
+    return AgentClient(to, record.agent, agent_path=record.agent_program, python=record.python)
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """
+    The VPN to a machine, seen from the robot.
+
+    :param handshake_age: seconds since the last handshake, None before the first.
+    :param received: bytes from the machine, ``sent`` bytes to it.
+    :param latency: median round trip of a ping in milliseconds, None where none came back.
+    """
+
+    address: str
+    interface: str
+    handshake_age: Optional[float] = None
+    received: float = 0.0
+    sent: float = 0.0
+    latency: Optional[float] = None
+
+
+def link(record: Record) -> Optional[Link]:
+    """
+    Return how the VPN to a machine does, None while the robot has none to it.
+
+    :raises FogError: the interface can't be asked.
+    """
+    if record.vpn is None or record.robot_vpn is None:
+        return None
+    vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+    asked = process.run(vpn.status(record.robot_vpn), timeout=10.0)
+    peer = vpn.parse_status(asked.stdout).get(record.public_key, {})
+    handshake = peer.get('handshake', 0.0)
+    return Link(
+        record.vpn.address, record.robot_vpn.name,
+        time.time() - handshake if handshake else None,
+        peer.get('received', 0.0), peer.get('sent', 0.0), ping(record.vpn.address))
+
+
+def ping(address: str, count: int = 5) -> Optional[float]:
+    """Return the median round trip in milliseconds, None where nothing comes back."""
+    try:
+        result = process.run(
+            Command(('ping', '-n', '-c', str(count), '-i', '0.2', '-W', '1', address)),
+            timeout=count + 5.0, check=False)
+    except FogError:
+        return None
+    times = sorted(float(t) for t in re.findall(r'time=([0-9.]+) ms', result.stdout))
+    return times[len(times) // 2] if times else None
+
+
+def follow(
+    client: AgentClient, show: Callable[[dict[str, Any]], None], *, forever: bool,
+) -> bool:
+    """
+    Hand the agent's events to ``show`` from the first on, until the last or for ever.
+
+    Returns False if the agent vanished meanwhile; a Ctrl-C is the way out of for ever.
+    """
+    last = int(client.request('status')['next']) - 1
+    over, absent = threading.Event(), threading.Event()
+
+    def take(event: dict[str, Any]) -> None:
+        if event.get('event') == 'connection':
+            if event.get('state') == 'absent':
+                absent.set()
+                over.set()
+            return
+        show(event)
+        if not forever and int(event.get('seq', 0)) >= last:
+            over.set()
+
+    if last < 1 and not forever:
+        return True
+    client.subscribe(take, since=1)
+    while not over.wait(0.5 if forever else 30.0):
+        if not forever:
+            return False
+    return not absent.is_set()
+
+
+def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
+    """
+    Return the variables with which another terminal's nodes join a launch, None if it is over.
+
+    :raises FogError: the user's RMW_IMPLEMENTATION is one that can't join.
+    """
+    path = store.root / 'launches' / record.launch / 'dds.xml'
+    if not record.launch or not record.launch_alive or not path.exists():
+        return None
+    rmw = plan.choose_rmw(os.environ, plugin_system.names('fogros2.dds'))
+    vendor = plugin_system.load('fogros2.dds', rmw)()
+    return dict(vendor.environment(str(path), os.environ))

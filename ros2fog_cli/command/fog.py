@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, Optional, Union
+
+from ros2cli.command import add_subparsers_on_demand, CommandExtension
+
+
+class FogCommand(CommandExtension):
+    """Look after the cloud machines of launch files."""
+
+    def add_arguments(
+        self, parser: argparse.ArgumentParser, cli_name: str, *, argv: Optional[Any] = None,
+    ) -> None:
+        """Add the verbs; only the chosen one is imported."""
+        self._subparser = parser
+        add_subparsers_on_demand(
+            parser, cli_name, '_verb', 'fogros2.verb', required=False, argv=argv)
+
+    def main(
+        self, *, parser: argparse.ArgumentParser, args: argparse.Namespace,
+    ) -> Union[int, str, None]:
+        """Run the verb, or print the help when there is none; return the exit status."""
+        if not hasattr(args, '_verb'):
+            self._subparser.print_help()
+            return 0
+        status: Union[int, str, None] = args._verb.main(args=args)
+        return status

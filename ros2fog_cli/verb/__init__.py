@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The extension point for verbs of ``ros2 fog``, and what several of them share."""
+
+from __future__ import annotations
+
+import abc
+import argparse
+import sys
+from typing import Optional, Union
+
+from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
+
+
+class VerbExtension(abc.ABC):
+    """
+    A verb of ``ros2 fog``.
+
+    ``NAME`` is set to the entry point's name. ``main`` returns an exit status; a FogError that it
+    raises becomes one line and the exit status 1.
+    """
+
+    NAME: Optional[str] = None
+    EXTENSION_POINT_VERSION = '0.1'
+
+    def __init__(self) -> None:
+        super().__init__()
+        satisfies_version(PLUGIN_SYSTEM_VERSION, '^0.1')
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+
+    @abc.abstractmethod
+    def main(self, *, args: argparse.Namespace) -> Union[int, str, None]:
+        """Run the verb and return its exit status."""
+
+
+def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") -> None:
+    """Add the argument ``name``, completed from the machines that are known here."""
+    argument = parser.add_argument('name', help=text)
+    argument.completer = complete_names  # type: ignore[attr-defined]
+
+
+def complete_names(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Return the names of machines that begin with ``prefix``; asks no provider."""
+    from fogros2.store import Store
+    return [record.name for record in Store().machines() if record.name.startswith(prefix)]
+
+
+def add_region(parser: argparse.ArgumentParser) -> None:
+    """Add FogROS2's own ``--region``."""
+    parser.add_argument(
+        '--region', nargs='*', metavar='REGION',
+        help="regions to ask providers that have some, 'all' for every one (default: the "
+             "configured region)")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    parser.add_argument('--json', action='store_true', help='print JSON for programs to read')
+
+
+def warn(text: str) -> None:
+    """Print a line that is no result."""
+    print(text, file=sys.stderr)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog delete``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from ros2fog_cli.verb import add_region, complete_names, VerbExtension, warn
+
+
+class DeleteVerb(VerbExtension):
+    """End machines and everything made for them."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        name = parser.add_argument('name', help="the machine's name, or 'all' for this robot's")
+        name.completer = (  # type: ignore[attr-defined]
+            lambda prefix, **words: [
+                *complete_names(prefix, **words), *(['all'] if 'all'.startswith(prefix) else [])])
+        add_region(parser)
+        parser.add_argument('--yes', '-y', action='store_true', help="don't ask")
+        parser.add_argument('--dry-run', action='store_true', help='only say what would go')
+        parser.add_argument(
+            '--force', action='store_true',
+            help='also under a launch that runs, or when a computer or provider is out of reach')
+        parser.add_argument('--any-robot', action='store_true',
+                            help="with 'all': other robots' machines too")
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Delete, and return 1 if something is still there."""
+        from fogros2.errors import FogError
+        from fogros2.store import Store
+        from ros2fog_cli.api import endings, machines, progress
+        store = Store()
+        name = None if args.name == 'all' else args.name
+        entries = machines.survey(warn, name=name, regions=args.region, store=store)
+        if name is None and not args.any_robot:
+            others = [entry for entry in entries if not entry.own]
+            entries = [entry for entry in entries if entry.own]
+            if others:
+                warn(f'{len(others)} of other robots left out (--any-robot takes them)')
+        if not entries:
+            if name is None:
+                print('no machines')
+                return 0
+            warn(f"there is no machine '{name}' (ros2 fog list shows those there are)")
+            return 1
+        for entry in entries:
+            whose = '' if entry.own else f' of the robot {entry.robot}'
+            print(f"{'would delete' if args.dry_run else 'delete'} {entry.name}{whose}: "
+                  f"{entry.provider} {entry.machine_id or '-'}, {entry.state}")
+        if args.dry_run:
+            return 0
+        for entry in entries:
+            endings.check_free(entry, force=args.force)
+        if not args.yes and not _agreed(len(entries)):
+            return 1
+        failed = 0
+        with progress.shown() as report:
+            for entry in entries:
+                try:
+                    endings.delete(entry, store, report, force=args.force)
+                    print(f'deleted {entry.name}')
+                except FogError as error:
+                    warn(f'{entry.name}: {error}')
+                    failed = 1
+        return failed
+
+
+def _agreed(number: int) -> bool:
+    if not sys.stdin.isatty():
+        warn('not deleted: nobody is here to ask (--yes answers)')
+        return False
+    machines = 'this machine' if number == 1 else f'these {number} machines'
+    return input(f'Delete {machines}? [y/N] ').strip().lower() in ('y', 'yes')

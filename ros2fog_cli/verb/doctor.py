@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog doctor``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+
+from ros2fog_cli.verb import add_json, VerbExtension
+
+_MARKS = {'ok': ' ok ', 'warning': 'warn', 'failed': 'FAIL'}
+_COLOURS = {'ok': '32', 'warning': '33', 'failed': '31'}
+
+
+class DoctorVerb(VerbExtension):
+    """Look whether this computer has what a launch needs."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        add_json(parser)
+        parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
+                            help='how long to look for ROS 2 on the LAN (0: not at all)')
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Print each check, failures with their remedy; 1 if one failed."""
+        from ros2fog_cli.api import doctor
+        checks = doctor.examine(lan_seconds=args.lan_seconds)
+        if args.json:
+            print(json.dumps([dataclasses.asdict(check) for check in checks], indent=2))
+        else:
+            colour = sys.stdout.isatty()
+            for check in checks:
+                mark = _MARKS[check.verdict]
+                if colour:
+                    mark = f'\x1b[{_COLOURS[check.verdict]}m{mark}\x1b[0m'
+                print(f'[{mark}] {check.name}: {check.detail}')
+                if check.remedy and check.verdict != 'ok':
+                    print(f'       {check.remedy}')
+        return 1 if any(check.verdict == 'failed' for check in checks) else 0

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog logs``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any, Optional
+
+from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
+
+
+class LogsVerb(VerbExtension):
+    """Print what a machine's nodes have printed."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        add_name(parser)
+        add_region(parser)
+        parser.add_argument('-f', '--follow', action='store_true', help='go on until Ctrl-C')
+        parser.add_argument('--node', help='of this node alone (its name in the launch: talker-1)')
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Print the log."""
+        from ros2fog_cli.api import reach
+        entry = reach.find(args.name, warn, regions=args.region)
+        shell = reach.shell(entry)
+        try:
+            client = reach.agent(entry, shell)
+            try:
+                there = reach.follow(
+                    client, lambda event: show(event, args.node), forever=args.follow)
+            except KeyboardInterrupt:
+                return 0
+            finally:
+                client.close()
+        finally:
+            shell.close()
+        if not there:
+            warn(f"the agent of '{args.name}' is gone")
+        return 0 if there else 1
+
+
+def show(event: dict[str, Any], node: Optional[str]) -> None:
+    """Print one event of the agent's log."""
+    text = describe(event)
+    if text is None or (node and event.get('name') not in (node, None)):
+        return
+    name = f"[{event['name']}] " if event.get('name') else ''
+    stream = sys.stderr if event.get('stream') == 'stderr' else sys.stdout
+    for line in text.splitlines() or ['']:
+        print(f'{name}{line}', file=stream, flush=True)
+
+
+def describe(event: dict[str, Any]) -> Optional[str]:
+    """Return an event as text, None for those that people needn't see."""
+    kind = event.get('event')
+    if kind == 'output':
+        return str(event.get('text', ''))
+    if kind == 'started':
+        return f"process started with pid [{event.get('pid')}]"
+    if kind == 'exited':
+        return f"process has finished with exit code {event.get('returncode')}"
+    if kind == 'refused':
+        return f"could not be started: {event.get('error')}"
+    if kind == 'watchdog':
+        return f"watchdog: {event.get('reason')}, {event.get('action')}"
+    if kind == 'lost':
+        return f"{event.get('count')} older events are not kept any more"
+    return None

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog status``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from typing import Any
+
+from ros2fog_cli.verb import add_json, add_name, add_region, VerbExtension, warn
+
+
+class StatusVerb(VerbExtension):
+    """Show a machine's nodes, VPN and agent."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        add_name(parser)
+        add_region(parser)
+        add_json(parser)
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Print it; 1 if the machine doesn't run, or its agent doesn't answer."""
+        from fogros2.errors import FogError
+        from ros2fog_cli.api import reach
+        entry = reach.find(args.name, warn, regions=args.region)
+        status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'agent': None}
+        problems: list[str] = []
+        if entry.record is not None:
+            try:
+                link = reach.link(entry.record)
+                status['vpn'] = dataclasses.asdict(link) if link is not None else None
+            except FogError as error:
+                problems.append(f'VPN: {error}')
+            try:
+                shell = reach.shell(entry)
+                try:
+                    client = reach.agent(entry, shell)
+                    try:
+                        reply = client.request('status', timeout=15.0)
+                        status['agent'] = {
+                            key: value for key, value in reply.items() if key not in ('id', 'ok')}
+                    finally:
+                        client.close()
+                finally:
+                    shell.close()
+            except FogError as error:
+                problems.append(f'agent: {error}')
+        if args.json:
+            print(json.dumps({**status, 'problems': problems}, indent=2))
+        else:
+            show(status)
+        for problem in problems:
+            warn(problem)
+        return 0 if status['agent'] is not None and not problems else 1
+
+
+def show(status: dict[str, Any]) -> None:
+    """Print a status for people."""
+    from ros2fog_cli.api.table import duration, size, table
+    now = time.time()
+    lines = [
+        ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
+        ('state', status['state']),
+        ('address', status['address'] or '-'),
+        ('age', duration(status['age'])),
+        ('time left', duration(status['time_left'])),
+        ('launch', status['launch'] or '-'),
+    ]
+    vpn, agent = status['vpn'], status['agent']
+    if vpn is not None:
+        latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"
+        handshake = 'none yet' if vpn['handshake_age'] is None \
+            else f"{duration(vpn['handshake_age'])} ago"
+        lines += [
+            ('VPN', f"{vpn['address']} on {vpn['interface']}"),
+            ('handshake', handshake),
+            ('round trip', latency),
+            ('traffic', f"{size(vpn['received'])} received, {size(vpn['sent'])} sent"),
+        ]
+    if agent is not None:
+        heartbeat = agent.get('heartbeat_age')
+        lines += [
+            ('agent', f"since {duration(max(0.0, now - float(agent.get('since') or now)))}, "
+                      f"{size(1000 * float(agent.get('rss_kb') or 0))}"),
+            ('heartbeat', '-' if heartbeat is None else f'{duration(heartbeat)} ago'),
+        ]
+    width = max(len(name) for name, _ in lines)
+    for name, value in lines:
+        print(f'{name.ljust(width)}  {value}')
+    nodes = (agent or {}).get('nodes') or []
+    if nodes:
+        print()
+        print(table(('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS'), [
+            (str(node.get('name', '')), str(node.get('state', '')),
+             str(node['pid']) if node.get('pid') else '-',
+             '-' if node.get('returncode') is None else str(node['returncode']),
+             str(node.get('restarts', 0))) for node in nodes]))
