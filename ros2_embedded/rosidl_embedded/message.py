@@ -281,6 +281,17 @@ def message_class(name: str) -> type:
     return type(short, (), body)
 
 
+class _Service(type):
+    """The class of services' classes: builds Request, Response and Event when asked for."""
+
+    def __getattr__(cls, name: str) -> Any:
+        if name in ('Request', 'Response', 'Event') and '_service' in vars(cls):
+            part = message_class(f'{cls._service}_{name}')
+            setattr(cls, name, part)
+            return part
+        raise AttributeError(f"type object '{cls.__name__}' has no attribute '{name}'")
+
+
 @lru_cache(maxsize=None)
 def service_class(name: str) -> type:
     """
@@ -290,18 +301,16 @@ def service_class(name: str) -> type:
     :raises KeyError: if there is no such service.
     """
     package, kind, short = name.split('/')
+    definition(f'{name}_Request')
 
     def refuse(self: Any) -> None:
         raise NotImplementedError('Service classes can not be instantiated')
 
-    return type(short, (), {
+    return _Service(short, (), {
         '__module__': f'{package}.{kind}',
         '__doc__': f"Service class '{short}'.",
         '__init__': refuse,
         '_service': name,
-        'Request': message_class(f'{name}_Request'),
-        'Response': message_class(f'{name}_Response'),
-        'Event': message_class(f'{name}_Event'),
     })
 
 

@@ -39,12 +39,12 @@ def _describe(described: Definition, found: dict[str, Any]) -> dict[str, Any]:
     return {'type_name': described.name, 'fields': [_field(field) for field in fields]}
 
 
-@lru_cache(maxsize=None)
-def type_hash(name: str) -> str:
+def describe(name: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """
-    Hash a message or a part of a service (``package/srv/Name_Request``), or a whole service.
+    Describe a message, a service or a part of one, and the messages it refers to.
 
-    :returns: ``RIHS01_`` and 64 hexadecimal digits.
+    :param name: ``package/msg/Name``, ``package/srv/Name`` or ``package/srv/Name_Request``.
+    :raises KeyError: if there is no such type.
     """
     found: dict[str, Any] = {}
     package, kind, short = name.split('/')
@@ -55,6 +55,16 @@ def type_hash(name: str) -> str:
     else:
         described = definition(name)
     top = _describe(described, found)
-    others = [found[other] for other in sorted(found) if other != name]
+    return top, [found[other] for other in sorted(found) if other != name]
+
+
+@lru_cache(maxsize=None)
+def type_hash(name: str) -> str:
+    """
+    Hash what :func:`describe` describes.
+
+    :returns: ``RIHS01_`` and 64 hexadecimal digits.
+    """
+    top, others = describe(name)
     text = json.dumps({'type_description': top, 'referenced_type_descriptions': others})
     return 'RIHS01_' + hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clients of services."""
+
+import struct
+import threading
+import time
+from typing import Any
+
+from rosidl_embedded import cdr
+
+from rclpy import _dds
+from rclpy._dds import Reader, Writer
+from rclpy._entity import Entity, Work
+from rclpy._graph import user_data_value
+from rclpy.callback_groups import CallbackGroup
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.qos import QoSProfile
+from rclpy.service import REQUEST_HEADER
+from rclpy.task import Future
+
+_numbers = iter(range(1, 2 ** 63))
+
+
+class Client(Entity):
+    """Calls a service; made by :meth:`.Node.create_client`."""
+
+    def __init__(self, context: Context, client_impl: tuple[Reader, Writer], srv_type: Any,
+                 srv_name: str, qos_profile: QoSProfile, callback_group: CallbackGroup,
+                 logger_name: str) -> None:
+        self.context = context
+        self._reader, self._writer = client_impl
+        self._identity = _dds.instance_handle(self._writer.handle)
+        self._destroyed = False
+        self.srv_type = srv_type
+        self.srv_name = srv_name
+        self.qos_profile = qos_profile
+        self.callback_group = callback_group
+        self._logger_name = logger_name
+        self._pending_requests: dict[int, Future] = {}
+        self._lock = threading.Lock()
+
+    def _handle(self) -> int | None:
+        return None if self._destroyed else self._reader.condition
+
+    def _take(self, executor: Any) -> Work | None:
+        if self._destroyed:
+            return None
+        for sample in self._reader.take():
+            try:
+                client, number = REQUEST_HEADER.unpack_from(sample.data, 4)
+                if client != self._identity:
+                    return None  # another client's response
+                response = cdr.deserialize(sample.data, self.srv_type.Response, 20)
+            except (ValueError, struct.error) as error:
+                from rclpy.logging import get_logger
+                get_logger(self._logger_name).error(
+                    f"Dropped a response of service '{self.srv_name}': {error}")
+                continue
+            with self._lock:
+                future = self._pending_requests.get(number)
+            if future is None:
+                return None  # nobody waits for it any more
+            future._set_executor(executor)
+            return future.set_result, (response,), None
+        return None
+
+    def call(self, request: Any, timeout_sec: float | None = None) -> Any:
+        """
+        Call the service and wait; an executor has to run in another thread.
+
+        :param timeout_sec: limit of the wait.
+        :returns: the response; None if the time was over.
+        :raises TypeError: if it is another type's request.
+        """
+        if not isinstance(request, self.srv_type.Request):
+            raise TypeError()
+        event = threading.Event()
+        future = self.call_async(request)
+        future.add_done_callback(lambda _: event.set())
+        if not event.wait(timeout_sec):
+            self.remove_pending_request(future)
+        return future.result()
+
+    def call_async(self, request: Any) -> Future:
+        """
+        Call the service; the future is done when the response is there.
+
+        :raises TypeError: if it is another type's request.
+        """
+        if not isinstance(request, self.srv_type.Request):
+            raise TypeError()
+        if self._destroyed:
+            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        future = Future()
+        with self._lock:
+            number = next(_numbers)
+            self._pending_requests[number] = future
+        future.add_done_callback(self.remove_pending_request)
+        prefix = cdr.HEADER + REQUEST_HEADER.pack(self._identity, number)
+        try:
+            self._writer.write(cdr.serialize(request, prefix))
+        except (AssertionError, _dds.DDSError):
+            self.remove_pending_request(future)
+            raise
+        return future
+
+    def get_pending_request(self, sequence_number: int) -> Future:
+        """
+        Give the future of a request.
+
+        :raises KeyError: if it isn't pending.
+        """
+        with self._lock:
+            return self._pending_requests[sequence_number]
+
+    def remove_pending_request(self, future: Future) -> None:
+        """Wait no longer for a response."""
+        with self._lock:
+            for number, pending in self._pending_requests.items():
+                if pending is future:
+                    del self._pending_requests[number]
+                    break
+
+    def service_is_ready(self) -> bool:
+        """Say whether there is a server that hears and answers this client."""
+        if self._destroyed:
+            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        servers = set()
+        for handle in self._writer.matched():
+            endpoint = self._writer.matched_endpoint(handle)
+            if endpoint is not None:
+                servers.add(user_data_value(endpoint, 'serviceid') or endpoint.participant)
+        for handle in self._reader.matched():
+            endpoint = self._reader.matched_endpoint(handle)
+            if endpoint is not None and (
+                    user_data_value(endpoint, 'serviceid') or endpoint.participant) in servers:
+                return True
+        return False
+
+    def wait_for_service(self, timeout_sec: float | None = None) -> bool:
+        """Wait until :meth:`service_is_ready`, or for a number of seconds."""
+        limit = None if timeout_sec is None else time.monotonic() + timeout_sec
+        if self.service_is_ready():
+            return True
+        waiting, guard = _dds.WaitSet(), _dds.Guard()
+        self.context._wakers.add(guard.trigger)
+        try:
+            self._writer.watch(_dds.PUBLICATION_MATCHED)
+            self._reader.watch(_dds.SUBSCRIPTION_MATCHED)
+            waiting.attach({self._writer.handle, self._reader.handle, guard.handle})
+            while self.context.ok() and not self.service_is_ready():
+                left = 2 ** 62 if limit is None else int((limit - time.monotonic()) * 1e9)
+                if left <= 0:
+                    break
+                waiting.wait(left)
+                self._writer.status('publication_matched')
+                self._reader.status('subscription_matched')
+        finally:
+            self.context._wakers.discard(guard.trigger)
+            waiting.close()
+            guard.close()
+        return self.service_is_ready()
+
+    @property
+    def service_name(self) -> str:
+        """The expanded and remapped name."""
+        return '/' + self._writer.topic[len('rq/'):-len('Request')]
+
+    def destroy(self) -> None:
+        """Free it; a program calls :meth:`.Node.destroy_client`."""
+        if not self._destroyed:
+            self._destroyed = True
+            self._reader.close()
+            self._writer.close()

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Guard conditions: a program calls its executor."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy._dds import Guard
+from rclpy._entity import Entity, Work
+from rclpy.callback_groups import CallbackGroup
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+
+
+class GuardCondition(Entity):
+    """Calls back after :meth:`trigger`; made by :meth:`.Node.create_guard_condition`."""
+
+    def __init__(self, callback: Callable[[], Any] | None, callback_group: CallbackGroup | None,
+                 context: Context | None = None) -> None:
+        self.callback = callback
+        self.callback_group = callback_group
+        self._guard: Guard | None = Guard()
+
+    def _handle(self) -> int | None:
+        return self._guard.handle if self._guard else None
+
+    def _take(self, executor: Any) -> Work | None:
+        if self._guard is None or not self._guard.take() or self.callback is None:
+            return None
+        return self.callback, (), None
+
+    def trigger(self) -> None:
+        """
+        Have the callback called.
+
+        :raises InvalidHandle: if it was destroyed.
+        """
+        if self._guard is None:
+            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        self._guard.trigger()
+
+    def destroy(self) -> None:
+        """Free it; a program calls :meth:`.Node.destroy_guard_condition`."""
+        guard, self._guard = self._guard, None
+        if guard is not None:
+            guard.close()

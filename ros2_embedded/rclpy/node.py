@@ -1,0 +1,561 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, TYPE_CHECKING
+import weakref
+
+from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
+
+from rclpy import _arguments, logging
+from rclpy._dds import Reader, Writer
+from rclpy._entity import Entity
+from rclpy._graph import Graph, type_hash_data
+from rclpy._names import dds_type, expand, join, REQUEST_PREFIX, RESPONSE_PREFIX, TOPIC_PREFIX
+from rclpy._node_graph import NodeGraph
+from rclpy._node_parameters import NodeParameters
+from rclpy.callback_groups import (
+    CallbackGroup, MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup)
+from rclpy.client import Client
+from rclpy.clock import Clock, ROSClock
+from rclpy.constants import S_TO_NS
+from rclpy.context import Context
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import NodeNameNonExistentError, NotInitializedException
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.parameter import Parameter
+from rclpy.parameter_service import ParameterService
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy, LivelinessPolicy, qos_profile_parameter_events,
+    qos_profile_rosout_default, qos_profile_services_default, QoSProfile, ReliabilityPolicy)
+from rclpy.qos_overriding_options import override, QoSOverridingOptions
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.time_source import TimeSource
+from rclpy.timer import Rate, Timer
+from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+from rclpy.utilities import get_default_context
+from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_node_name import validate_node_name
+from rclpy.validate_topic_name import validate_topic_name
+from rclpy.waitable import Waitable
+
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
+__all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
+
+HIDDEN_NODE_PREFIX = '_'
+_TYPE_DESCRIPTION = 'start_type_description_service'
+
+
+class Node(NodeParameters, NodeGraph):
+    """
+    A node: what publishes, subscribes, serves and calls under one name.
+
+    :param node_name: its name, which ``__node:=`` may replace.
+    :param context: by default the one that ``rclpy.init()`` initializes.
+    :param cli_args: a command line of its own.
+    :param namespace: its namespace, which ``__ns:=`` may replace.
+    :param use_global_arguments: whether the process's command line holds for it.
+    :param enable_rosout: whether its messages go to /rosout.
+    :param start_parameter_services: whether others may read and set its parameters.
+    :param parameter_overrides: values that go before declared defaults.
+    :param allow_undeclared_parameters: whether parameters need no declaration.
+    :param automatically_declare_parameters_from_overrides: declare what has a value.
+    :param enable_logger_service: whether others may read and set its loggers' levels.
+    :raises NotInitializedException: without ``rclpy.init()``.
+    :raises NameValidationException: if its name or namespace is invalid.
+    """
+
+    def __init__(self, node_name: str, *, context: Context | None = None,
+                 cli_args: list[str] | None = None, namespace: str | None = None,
+                 use_global_arguments: bool = True, enable_rosout: bool = True,
+                 start_parameter_services: bool = True,
+                 parameter_overrides: list[Parameter] | None = None,
+                 allow_undeclared_parameters: bool = False,
+                 automatically_declare_parameters_from_overrides: bool = False,
+                 enable_logger_service: bool = False) -> None:
+        self._context = get_default_context() if context is None else context
+        self._publishers: list[Publisher] = []
+        self._subscriptions: list[Subscription] = []
+        self._clients: list[Client] = []
+        self._services: list[Service] = []
+        self._timers: list[Timer] = []
+        self._guards: list[GuardCondition] = []
+        self._waitables: list[Waitable] = []
+        self._default_callback_group: CallbackGroup = MutuallyExclusiveCallbackGroup()
+        self._rate_group = ReentrantCallbackGroup()
+        self._executor_reference: weakref.ReferenceType[Executor] | None = None
+        self._destroyed = False
+        self._init_parameters(allow_undeclared_parameters)
+        if not self._context.ok() or self._context._graph is None:
+            raise NotInitializedException('cannot create node')
+        self._graph: Graph = self._context._graph
+        own = _arguments.parse(['--ros-args', *(cli_args or [])])
+        _arguments.check_known(own)
+        self._settings = _arguments.Settings(
+            own, self._context._arguments if use_global_arguments else None)
+        self._name = self._settings.node_name(node_name)
+        space = self._settings.namespace(node_name, namespace or '/')
+        self._namespace = space if space.startswith('/') else '/' + space
+        validate_node_name(self._name)
+        validate_namespace(self._namespace)
+        self._logger_name = join(self._namespace, self._name)[1:].replace('/', '.')
+        self._logger = logging.get_logger(self._logger_name)
+        with self._graph.held():
+            self._record = self._graph.add_node(self._namespace, self._name)
+            if enable_rosout and self._settings.switch('rosout'):
+                self._start_rosout()
+            self._parameter_event_publisher: Publisher | None = self.create_publisher(
+                ParameterEvent, '/parameter_events', qos_profile_parameter_events)
+            self._clock = ROSClock()
+            self._start_parameters(parameter_overrides,
+                                   automatically_declare_parameters_from_overrides)
+            if start_parameter_services:
+                self._parameter_service = ParameterService(self)
+            if enable_logger_service:
+                from rclpy.logging_service import LoggingService
+                self._logger_service = LoggingService(self)
+            if self.get_parameter(_TYPE_DESCRIPTION).value:
+                from rclpy.type_description_service import TypeDescriptionService
+                self._type_description_service = TypeDescriptionService(self)
+
+    def _start_rosout(self) -> None:
+        from rcl_interfaces.msg import Log
+        publisher = self.create_publisher(Log, '/rosout', qos_profile_rosout_default)
+        reference = weakref.ref(publisher)
+
+        def publish(stamp: int, severity: int, name: str, message: str, file: str,
+                    function: str, line: int) -> None:
+            target = reference()
+            if target is None or not self_context.ok() or target._writer is None:
+                return
+            log = Log(level=int(severity), name=name, msg=message, file=file,
+                      function=function, line=line)
+            log.stamp.sec, log.stamp.nanosec = divmod(stamp, S_TO_NS)
+            target.publish(log)
+
+        self_context = self._context
+        self._rosout = publish
+        logging._rosout[self._logger_name] = publish
+
+    def _start_parameters(self, given: list[Parameter] | None, declare_all: bool) -> None:
+        values = self._settings.parameters(self.get_fully_qualified_name())
+        self._parameter_overrides = {
+            name: Parameter(name, value=value) for name, value in values.items()}
+        self._parameter_overrides.update({one.name: one for one in given or []})
+        if declare_all:
+            self.declare_parameters(
+                '', [(one.name, one.value, ParameterDescriptor())
+                     for one in self._parameter_overrides.values()], ignore_override=True)
+        self._time_source = TimeSource(node=self)
+        self._time_source.attach_clock(self._clock)
+        if not self.has_parameter(_TYPE_DESCRIPTION):
+            self.declare_parameter(_TYPE_DESCRIPTION, True, ParameterDescriptor(
+                description='If enabled, start the ~/get_type_description service.',
+                read_only=True))
+
+    def _publish_parameter_event(self, event: Any) -> None:
+        if self._parameter_event_publisher is not None:
+            event.node = self.get_fully_qualified_name()
+            event.stamp = self._clock.now().to_msg()
+            self._parameter_event_publisher.publish(event)
+
+    # --- what it has ---
+
+    @property
+    def publishers(self) -> Iterator[Publisher]:
+        """Its publishers."""
+        yield from self._publishers
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Its subscriptions."""
+        yield from self._subscriptions
+
+    @property
+    def clients(self) -> Iterator[Client]:
+        """Its clients."""
+        yield from self._clients
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """Its services."""
+        yield from self._services
+
+    @property
+    def timers(self) -> Iterator[Timer]:
+        """Its timers."""
+        yield from self._timers
+
+    @property
+    def guards(self) -> Iterator[GuardCondition]:
+        """Its guard conditions."""
+        yield from self._guards
+
+    @property
+    def waitables(self) -> Iterator[Waitable]:
+        """Its waitables."""
+        yield from self._waitables
+
+    def _entities(self) -> list[Entity]:
+        """All that an executor waits for, in the order it is executed in."""
+        return [*self._waitables, *self._timers, *self._subscriptions, *self._guards,
+                *self._clients, *self._services]
+
+    @property
+    def executor(self) -> 'Executor | None':
+        """The executor it was added to."""
+        return self._executor_reference() if self._executor_reference is not None else None
+
+    @executor.setter
+    def executor(self, new_executor: 'Executor | None') -> None:
+        current = self.executor
+        if current is new_executor:
+            return
+        self._executor_reference = None
+        if current is not None:
+            current.remove_node(self)
+        if new_executor is not None:
+            self._executor_reference = weakref.ref(new_executor)
+            new_executor.add_node(self)
+
+    def _forget_executor(self, executor: 'Executor') -> None:
+        if self.executor is executor:
+            self._executor_reference = None
+
+    def _wake_executor(self) -> None:
+        executor = self.executor
+        if executor is not None:
+            executor.wake()
+
+    @property
+    def context(self) -> Context:
+        """Its context."""
+        return self._context
+
+    @property
+    def default_callback_group(self) -> CallbackGroup:
+        """The callback group of what is created without one."""
+        return self._default_callback_group
+
+    @property
+    def handle(self) -> 'Node':
+        """Itself."""
+        return self
+
+    def get_name(self) -> str:
+        """Give its name."""
+        return self._name
+
+    def get_namespace(self) -> str:
+        """Give its namespace."""
+        return self._namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """Give its name with its namespace."""
+        return join(self._namespace, self._name)
+
+    def get_clock(self) -> Clock:
+        """Give its clock, of ROS time."""
+        return self._clock
+
+    def get_logger(self) -> RcutilsLogger:
+        """Give its logger."""
+        return self._logger
+
+    # --- names ---
+
+    def _resolve(self, name: str, only_expand: bool, is_service: bool) -> str:
+        validate_topic_name(name, is_service=is_service)
+        full = expand(name, self._name, self._namespace)
+        from rclpy.validate_full_topic_name import validate_full_topic_name
+        if not only_expand:
+            full = self._settings.remap(full, self._name, self._namespace,
+                                        'rosservice' if is_service else 'rostopic')
+        validate_full_topic_name(full, is_service=is_service)
+        return full
+
+    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
+        """
+        Expand and remap a topic's name.
+
+        :raises InvalidTopicNameException: if it is invalid.
+        """
+        return self._resolve(topic, only_expand, False)
+
+    def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
+        """
+        Expand and remap a service's name.
+
+        :raises InvalidServiceNameException: if it is invalid.
+        """
+        return self._resolve(service, only_expand, True)
+
+    # --- creating ---
+
+    def _profile(self, qos_or_depth: QoSProfile | int) -> QoSProfile:
+        if isinstance(qos_or_depth, QoSProfile):
+            return qos_or_depth
+        if not isinstance(qos_or_depth, int):
+            raise TypeError(f'Expected QoSProfile or int, but received {type(qos_or_depth)!r}')
+        if qos_or_depth < 0:
+            raise ValueError('history depth must be greater than or equal to zero')
+        return QoSProfile(depth=qos_or_depth)
+
+    def _available(self, profile: QoSProfile, topic: str, publisher: bool) -> QoSProfile:
+        """Replace what is BEST_AVAILABLE by the strictest that all others go together with."""
+        if ReliabilityPolicy.BEST_AVAILABLE != profile.reliability \
+                and DurabilityPolicy.BEST_AVAILABLE != profile.durability \
+                and LivelinessPolicy.BEST_AVAILABLE != profile.liveliness:
+            return profile
+        others = [one.policies for one in self._graph.endpoints(writers=not publisher)
+                  if one.topic == topic]
+        chosen = QoSProfile(history=profile.history, depth=profile.depth)
+        reliable = publisher or all(one.reliable for one in others)
+        durable = publisher or all(one.transient_local for one in others)
+        manual = publisher and any(one.manual_liveliness for one in others) \
+            or not publisher and bool(others) and all(one.manual_liveliness for one in others)
+        for name, best, value in (
+                ('reliability', ReliabilityPolicy.BEST_AVAILABLE,
+                 ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
+                ('durability', DurabilityPolicy.BEST_AVAILABLE,
+                 DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE),
+                ('liveliness', LivelinessPolicy.BEST_AVAILABLE,
+                 LivelinessPolicy.MANUAL_BY_TOPIC if manual else LivelinessPolicy.AUTOMATIC)):
+            given = getattr(profile, name)
+            setattr(chosen, name, value if given == best else given)
+        for name in ('deadline', 'liveliness_lease_duration'):
+            if getattr(profile, name).nanoseconds != 2 ** 63 - 2:
+                setattr(chosen, name, getattr(profile, name))
+        return chosen
+
+    def _topic_entity(self, kind: Any, msg_type: Any, topic: str, profile: QoSProfile,
+                      options: QoSOverridingOptions | None) -> tuple[Any, QoSProfile]:
+        check_is_valid_msg_type(msg_type)
+        publishes = kind is Writer
+        full = self.resolve_topic_name(topic)
+        if options is not None:
+            override(self, 'publisher' if publishes else 'subscription', full, profile, options)
+        name = topic if profile.avoid_ros_namespace_conventions else TOPIC_PREFIX + full
+        profile = self._available(profile, name, publishes)
+        type_name = msg_type._definition.name
+        entity = kind(self._graph.participant, name, dds_type(type_name),
+                      profile._policies(type_hash_data(type_name)))
+        self._graph.add_endpoints(self._record, entity)
+        return entity, profile
+
+    def create_publisher(
+            self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, *,
+            callback_group: CallbackGroup | None = None,
+            event_callbacks: PublisherEventCallbacks | None = None,
+            qos_overriding_options: QoSOverridingOptions | None = None,
+            publisher_class: type[Publisher] = Publisher) -> Publisher:
+        """
+        Create a publisher.
+
+        :param qos_profile: a profile, or how many messages are kept.
+        :param callback_group: of its events.
+        """
+        writer, profile = self._topic_entity(
+            Writer, msg_type, topic, self._profile(qos_profile), qos_overriding_options)
+        publisher = publisher_class(
+            writer, msg_type, topic, profile, event_callbacks or PublisherEventCallbacks(),
+            callback_group or self._default_callback_group, self._context, self._logger_name)
+        self._publishers.append(publisher)
+        self._waitables += publisher.event_handlers
+        self._wake_executor()
+        return publisher
+
+    def create_subscription(
+            self, msg_type: Any, topic: str, callback: Callable[..., Any],
+            qos_profile: QoSProfile | int, *, callback_group: CallbackGroup | None = None,
+            event_callbacks: SubscriptionEventCallbacks | None = None,
+            qos_overriding_options: QoSOverridingOptions | None = None,
+            raw: bool = False) -> Subscription:
+        """
+        Create a subscription.
+
+        :param callback: called with each message, or with it and a dictionary of its times.
+        :param qos_profile: a profile, or how many messages are kept.
+        :param raw: give the callback bytes, not messages.
+        """
+        group = callback_group or self._default_callback_group
+        reader, profile = self._topic_entity(
+            Reader, msg_type, topic, self._profile(qos_profile), qos_overriding_options)
+        try:
+            subscription = Subscription(
+                reader, msg_type, topic, callback, group, profile, raw,
+                event_callbacks or SubscriptionEventCallbacks(), self._logger_name)
+        except RuntimeError:
+            reader.close()
+            raise
+        group.add_entity(subscription)
+        self._subscriptions.append(subscription)
+        self._waitables += subscription.event_handlers
+        self._wake_executor()
+        return subscription
+
+    def _service_entity(self, srv_type: Any, name: str, profile: QoSProfile,
+                        serves: bool) -> tuple[Reader, Writer]:
+        check_is_valid_srv_type(srv_type)
+        full = self.resolve_service_name(name)
+        topics = {'Request': f'{REQUEST_PREFIX}{full}Request',
+                  'Response': f'{RESPONSE_PREFIX}{full}Reply'}
+        identity = f"{'serviceid' if serves else 'clientid'}={self._graph.service_id()};".encode()
+        reads, writes = ('Request', 'Response') if serves else ('Response', 'Request')
+        made: list[Any] = []
+        for kind, part in ((Reader, reads), (Writer, writes)):
+            type_name = f'{srv_type._service}_{part}'
+            made.append(kind(self._graph.participant, topics[part], dds_type(type_name),
+                             profile._policies(identity + type_hash_data(type_name))))
+        self._graph.add_endpoints(self._record, *made)
+        return made[0], made[1]
+
+    def create_client(self, srv_type: Any, srv_name: str, *,
+                      qos_profile: QoSProfile = qos_profile_services_default,
+                      callback_group: CallbackGroup | None = None) -> Client:
+        """Create a client of a service."""
+        group = callback_group or self._default_callback_group
+        client = Client(
+            self._context, self._service_entity(srv_type, srv_name, qos_profile, False),
+            srv_type, srv_name, qos_profile, group, self._logger_name)
+        group.add_entity(client)
+        self._clients.append(client)
+        self._wake_executor()
+        return client
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any],
+                       *, qos_profile: QoSProfile = qos_profile_services_default,
+                       callback_group: CallbackGroup | None = None) -> Service:
+        """
+        Create a service.
+
+        :param callback: called with request and response; gives the response.
+        """
+        group = callback_group or self._default_callback_group
+        service = Service(
+            self._service_entity(srv_type, srv_name, qos_profile, True), srv_type, srv_name,
+            callback, group, qos_profile, self._logger_name)
+        group.add_entity(service)
+        self._services.append(service)
+        self._wake_executor()
+        return service
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[..., Any] | None,
+                     callback_group: CallbackGroup | None = None, clock: Clock | None = None,
+                     autostart: bool = True) -> Timer:
+        """
+        Create a timer.
+
+        :param timer_period_sec: its period in seconds.
+        :param clock: by default the node's.
+        :param autostart: False: it starts at :meth:`.Timer.reset`.
+        """
+        group = callback_group or self._default_callback_group
+        timer = Timer(callback, group, int(float(timer_period_sec) * S_TO_NS),
+                      clock or self._clock, context=self._context, autostart=autostart,
+                      wake=self._wake_executor)
+        group.add_entity(timer)
+        self._timers.append(timer)
+        self._wake_executor()
+        return timer
+
+    def create_guard_condition(self, callback: Callable[..., Any],
+                               callback_group: CallbackGroup | None = None) -> GuardCondition:
+        """Create a guard condition."""
+        group = callback_group or self._default_callback_group
+        guard = GuardCondition(callback, group, context=self._context)
+        group.add_entity(guard)
+        self._guards.append(guard)
+        self._wake_executor()
+        return guard
+
+    def create_rate(self, frequency: float, clock: Clock | None = None) -> Rate:
+        """
+        Create a rate.
+
+        :param frequency: in hertz.
+        """
+        if frequency <= 0:
+            raise ValueError('frequency must be > 0')
+        timer = self.create_timer(1.0 / frequency, None, self._rate_group, clock)
+        return Rate(timer, context=self._context)
+
+    def add_waitable(self, waitable: Waitable) -> None:
+        """Have executors wait for a waitable."""
+        self._waitables.append(waitable)
+        self._wake_executor()
+
+    def remove_waitable(self, waitable: Waitable) -> None:
+        """Have executors wait for a waitable no more."""
+        self._waitables.remove(waitable)
+        self._wake_executor()
+
+    # --- destroying ---
+
+    def _destroy(self, things: list[Any], thing: Any, *endpoints: Reader | Writer | None) -> bool:
+        if thing not in things:
+            return False
+        things.remove(thing)
+        for handler in getattr(thing, 'event_handlers', []):
+            self._waitables.remove(handler)
+        self._graph.remove_endpoints(self._record, *[one for one in endpoints if one is not None])
+        thing.destroy()
+        self._wake_executor()
+        return True
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """Destroy a publisher; False if it isn't the node's."""
+        return self._destroy(self._publishers, publisher, publisher._writer)
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Destroy a subscription; False if it isn't the node's."""
+        return self._destroy(self._subscriptions, subscription, subscription._reader)
+
+    def destroy_client(self, client: Client) -> bool:
+        """Destroy a client; False if it isn't the node's."""
+        return self._destroy(self._clients, client, client._reader, client._writer)
+
+    def destroy_service(self, service: Service) -> bool:
+        """Destroy a service; False if it isn't the node's."""
+        return self._destroy(self._services, service, service._reader, service._writer)
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """Destroy a timer; False if it isn't the node's."""
+        return self._destroy(self._timers, timer)
+
+    def destroy_guard_condition(self, guard: GuardCondition) -> bool:
+        """Destroy a guard condition; False if it isn't the node's."""
+        return self._destroy(self._guards, guard)
+
+    def destroy_rate(self, rate: Rate) -> bool:
+        """Destroy a rate; False if it isn't the node's."""
+        done = self.destroy_timer(rate._timer)
+        rate.destroy()
+        return done
+
+    def destroy_node(self) -> None:
+        """Destroy the node and all that it has."""
+        if self._destroyed:
+            return
+        self._destroyed = True
+        self._parameter_event_publisher = None
+        if logging._rosout.get(self._logger_name) is getattr(self, '_rosout', False):
+            del logging._rosout[self._logger_name]
+        with self._graph.held():
+            for things, destroy in ((self._publishers, self.destroy_publisher),
+                                    (self._subscriptions, self.destroy_subscription),
+                                    (self._clients, self.destroy_client),
+                                    (self._services, self.destroy_service),
+                                    (self._timers, self.destroy_timer),
+                                    (self._guards, self.destroy_guard_condition)):
+                while things:
+                    destroy(things[0])  # type: ignore[operator]
+            self._graph.remove_node(self._record)
+        executor = self.executor
+        if executor is not None:
+            executor.remove_node(self)

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quality of service."""
+
+from enum import Enum, IntEnum
+from typing import Any
+import warnings
+
+from rclpy._dds import Policies
+from rclpy.duration import Duration, Infinite
+
+
+class QoSPolicyKind(IntEnum):
+    """Policies, as events name them."""
+
+    INVALID = 1 << 0
+    DURABILITY = 1 << 1
+    DEADLINE = 1 << 2
+    LIVELINESS = 1 << 3
+    RELIABILITY = 1 << 4
+    HISTORY = 1 << 5
+    LIFESPAN = 1 << 6
+    DEPTH = 1 << 7
+    LIVELINESS_LEASE_DURATION = 1 << 8
+    AVOID_ROS_NAMESPACE_CONVENTIONS = 1 << 9
+
+
+def qos_policy_name_from_kind(policy_kind: QoSPolicyKind | int) -> str:
+    """Name a policy."""
+    return QoSPolicyKind(policy_kind).name
+
+
+class InvalidQoSProfileException(Exception):
+    """A profile's arguments don't make one."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__('Invalid QoSProfile', *args)
+
+
+class QoSPolicyEnum(IntEnum):
+    """The base of the policies' values."""
+
+    @classmethod
+    def short_keys(cls) -> list[str]:
+        """List the values' names as one types them."""
+        return [key.lower() for key in cls.__members__]
+
+    @classmethod
+    def get_from_short_key(cls, name: str) -> int:
+        """Find the value of a name, in upper or lower case."""
+        return cls[name.upper()].value
+
+    @property
+    def short_key(self) -> str:
+        """The value's name as one types it."""
+        return self.name.lower()
+
+
+class HistoryPolicy(QoSPolicyEnum):
+    """How many samples are kept."""
+
+    SYSTEM_DEFAULT = 0
+    KEEP_LAST = 1
+    KEEP_ALL = 2
+    UNKNOWN = 3
+
+
+class ReliabilityPolicy(QoSPolicyEnum):
+    """Whether lost samples are sent again."""
+
+    SYSTEM_DEFAULT = 0
+    RELIABLE = 1
+    BEST_EFFORT = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class DurabilityPolicy(QoSPolicyEnum):
+    """Whether late subscriptions get earlier samples."""
+
+    SYSTEM_DEFAULT = 0
+    TRANSIENT_LOCAL = 1
+    VOLATILE = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class LivelinessPolicy(QoSPolicyEnum):
+    """Who says that a publisher is alive."""
+
+    SYSTEM_DEFAULT = 0
+    AUTOMATIC = 1
+    MANUAL_BY_TOPIC = 3
+    UNKNOWN = 4
+    BEST_AVAILABLE = 5
+
+
+QoSHistoryPolicy = HistoryPolicy
+QoSReliabilityPolicy = ReliabilityPolicy
+QoSDurabilityPolicy = DurabilityPolicy
+QoSLivelinessPolicy = LivelinessPolicy
+
+_UNSPECIFIED = Duration()
+DeadlineBestAvailable = Duration(nanoseconds=2 ** 63 - 2)
+LivelinessLeaseDurationeBestAvailable = Duration(nanoseconds=2 ** 63 - 2)
+
+
+class QoSProfile:
+    """
+    A set of policies.
+
+    :raises InvalidQoSProfileException: without history and depth, or KEEP_LAST without depth.
+    """
+
+    __slots__ = ['_history', '_depth', '_reliability', '_durability', '_lifespan', '_deadline',
+                 '_liveliness', '_liveliness_lease_duration', '_avoid_ros_namespace_conventions']
+
+    def __init__(self, **kwargs: Any) -> None:
+        assert all('_' + key in self.__slots__ for key in kwargs), \
+            f'Invalid arguments passed to constructor: {kwargs.keys()!r}'
+        if 'history' not in kwargs:
+            if 'depth' not in kwargs:
+                raise InvalidQoSProfileException('History and/or depth settings are required.')
+            kwargs['history'] = HistoryPolicy.KEEP_LAST
+        self.history = kwargs['history']
+        if self.history == HistoryPolicy.KEEP_LAST and 'depth' not in kwargs:
+            raise InvalidQoSProfileException('History set to KEEP_LAST without a depth setting.')
+        self.depth = kwargs.get('depth', 10)
+        self.reliability = kwargs.get('reliability', ReliabilityPolicy.RELIABLE)
+        self.durability = kwargs.get('durability', DurabilityPolicy.VOLATILE)
+        self.lifespan = kwargs.get('lifespan', _UNSPECIFIED)
+        self.deadline = kwargs.get('deadline', _UNSPECIFIED)
+        self.liveliness = kwargs.get('liveliness', LivelinessPolicy.SYSTEM_DEFAULT)
+        self.liveliness_lease_duration = kwargs.get('liveliness_lease_duration', _UNSPECIFIED)
+        self.avoid_ros_namespace_conventions = kwargs.get(
+            'avoid_ros_namespace_conventions', False)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, QoSProfile) and all(
+            getattr(self, slot) == getattr(other, slot) for slot in self.__slots__)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __str__(self) -> str:
+        policies = ', '.join(f'{slot[1:]}={getattr(self, slot)}' for slot in self.__slots__)
+        return f'{type(self).__name__}({policies})'
+
+    def _policies(self, user_data: bytes, ignore_local: bool = False) -> Policies:
+        """Translate to DDS as rmw_cyclonedds does."""
+        keep_all = self.history == HistoryPolicy.KEEP_ALL
+        return Policies(
+            depth=0 if keep_all else max(self.depth, 1),
+            reliable=self.reliability != ReliabilityPolicy.BEST_EFFORT,
+            transient_local=self.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            lifespan=self.lifespan.nanoseconds,
+            deadline=self.deadline.nanoseconds,
+            manual_liveliness=self.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC,
+            lease=self.liveliness_lease_duration.nanoseconds,
+            user_data=user_data,
+            ignore_local=ignore_local)
+
+    @classmethod
+    def _from_policies(cls, policies: Policies, local: bool = False) -> 'QoSProfile':
+        """Translate from DDS; of a remote endpoint nobody knows the history."""
+        history = HistoryPolicy.UNKNOWN
+        if local:
+            history = HistoryPolicy.KEEP_LAST if policies.depth else HistoryPolicy.KEEP_ALL
+        return cls(
+            history=history,
+            depth=policies.depth if local else 0,
+            reliability=ReliabilityPolicy.RELIABLE if policies.reliable
+            else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if policies.transient_local
+            else DurabilityPolicy.VOLATILE,
+            lifespan=Duration(nanoseconds=policies.lifespan),
+            deadline=Duration(nanoseconds=policies.deadline),
+            liveliness=LivelinessPolicy.MANUAL_BY_TOPIC if policies.manual_liveliness
+            else LivelinessPolicy.AUTOMATIC,
+            liveliness_lease_duration=Duration(nanoseconds=policies.lease))
+
+
+def _policy(name: str, kind: type) -> property:
+    """Make the property of a policy, which checks what it is set to."""
+    slot = '_' + name
+
+    def getter(self: QoSProfile) -> Any:
+        return getattr(self, slot)
+
+    def setter(self: QoSProfile, value: Any) -> None:
+        assert isinstance(value, (kind, int) if issubclass(kind, IntEnum) else kind)
+        if name == 'depth' and value == 0 and self.history == HistoryPolicy.KEEP_LAST:
+            warnings.warn(
+                "A zero depth with KEEP_LAST doesn't make sense; no data could be stored. "
+                'This will be interpreted as SYSTEM_DEFAULT')
+        setattr(self, slot, kind(value) if issubclass(kind, IntEnum) else value)
+
+    return property(getter, setter, doc=f"The policy '{name}'.")
+
+
+for _name, _kind in (
+        ('history', HistoryPolicy), ('depth', int), ('reliability', ReliabilityPolicy),
+        ('durability', DurabilityPolicy), ('lifespan', Duration), ('deadline', Duration),
+        ('liveliness', LivelinessPolicy), ('liveliness_lease_duration', Duration),
+        ('avoid_ros_namespace_conventions', bool)):
+    setattr(QoSProfile, _name, _policy(_name, _kind))
+
+qos_profile_unknown = QoSProfile(
+    history=HistoryPolicy.UNKNOWN, depth=0, reliability=ReliabilityPolicy.UNKNOWN,
+    durability=DurabilityPolicy.UNKNOWN, liveliness=LivelinessPolicy.UNKNOWN)
+qos_profile_default = QoSProfile(depth=10)
+qos_profile_system_default = QoSProfile(
+    history=HistoryPolicy.SYSTEM_DEFAULT, depth=0,
+    reliability=ReliabilityPolicy.SYSTEM_DEFAULT, durability=DurabilityPolicy.SYSTEM_DEFAULT)
+qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+qos_profile_services_default = QoSProfile(depth=10)
+qos_profile_parameters = QoSProfile(depth=1000)
+qos_profile_parameter_events = QoSProfile(depth=1000)
+qos_profile_best_available = QoSProfile(
+    depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE,
+    durability=DurabilityPolicy.BEST_AVAILABLE, deadline=DeadlineBestAvailable,
+    liveliness=LivelinessPolicy.BEST_AVAILABLE,
+    liveliness_lease_duration=LivelinessLeaseDurationeBestAvailable)
+qos_profile_action_status_default = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+qos_profile_rosout_default = QoSProfile(
+    depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10))
+
+
+class QoSPresetProfiles(Enum):
+    """The profiles by name."""
+
+    UNKNOWN = qos_profile_unknown
+    DEFAULT = qos_profile_default
+    SYSTEM_DEFAULT = qos_profile_system_default
+    SENSOR_DATA = qos_profile_sensor_data
+    SERVICES_DEFAULT = qos_profile_services_default
+    PARAMETERS = qos_profile_parameters
+    PARAMETER_EVENTS = qos_profile_parameter_events
+    ACTION_STATUS_DEFAULT = qos_profile_action_status_default
+    BEST_AVAILABLE = qos_profile_best_available
+
+    @classmethod
+    def short_keys(cls) -> list[str]:
+        """List the profiles' names as one types them."""
+        return [key.lower() for key in cls.__members__]
+
+    @classmethod
+    def get_from_short_key(cls, name: str) -> QoSProfile:
+        """Find the profile of a name, in upper or lower case."""
+        return cls[name.upper()].value
+
+
+class QoSCompatibility(IntEnum):
+    """Whether a publisher's and a subscription's profile go together."""
+
+    OK = 0
+    WARNING = 1
+    ERROR = 2
+
+
+def qos_check_compatible(
+        publisher_qos: QoSProfile,
+        subscription_qos: QoSProfile) -> tuple[QoSCompatibility, str]:
+    """
+    Say whether a publisher and a subscription with these profiles would be matched.
+
+    :returns: the verdict and the reasons; WARNING where it depends on the middleware.
+    """
+    errors, warned = [], []
+    publisher, subscription = publisher_qos, subscription_qos
+    if publisher.reliability == ReliabilityPolicy.BEST_EFFORT \
+            and subscription.reliability == ReliabilityPolicy.RELIABLE:
+        errors.append('ERROR: Best effort publisher and reliable subscription;')
+    if publisher.durability == DurabilityPolicy.VOLATILE \
+            and subscription.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        errors.append('ERROR: Volatile publisher and transient local subscription;')
+    for name, offered, requested in (
+            ('Deadline', publisher.deadline, subscription.deadline),
+            ('Liveliness lease duration', publisher.liveliness_lease_duration,
+             subscription.liveliness_lease_duration)):
+        if requested not in (_UNSPECIFIED, Infinite) and (
+                offered == _UNSPECIFIED or offered > requested):
+            errors.append(
+                f"ERROR: Subscription's {name.lower()} is shorter than the publisher's;")
+    if publisher.liveliness == LivelinessPolicy.AUTOMATIC \
+            and subscription.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
+        errors.append('ERROR: Publisher\'s liveliness is automatic and subscription\'s is '
+                      'manual by topic;')
+    unsure = ('SYSTEM_DEFAULT', 'UNKNOWN')
+    for name in ('reliability', 'durability', 'liveliness'):
+        for who, profile in (('Publisher', publisher), ('Subscription', subscription)):
+            if getattr(profile, name).name in unsure:
+                warned.append(f"WARNING: {who}'s {name} is {getattr(profile, name).name};")
+    if errors:
+        return QoSCompatibility.ERROR, ''.join(errors + warned)
+    return (QoSCompatibility.WARNING if warned else QoSCompatibility.OK), ''.join(warned)

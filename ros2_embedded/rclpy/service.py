@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Services."""
+
+from collections.abc import Callable
+import struct
+import time
+from typing import Any, NamedTuple
+
+from rosidl_embedded import cdr
+
+from rclpy._dds import Reader, Writer
+from rclpy._entity import Entity, Work
+from rclpy._graph import user_data_value
+from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidHandle, RCLError
+from rclpy.qos import QoSProfile
+
+REQUEST_HEADER = struct.Struct('<Qq')  # rmw_cyclonedds: the client's writer, a sequence number
+READER_WAIT = 0.1  # seconds a response waits for the client's reader to be discovered
+
+
+class RequestId(NamedTuple):
+    """Which request of which client."""
+
+    writer_guid: int
+    sequence_number: int
+    publication: int
+
+
+class ServiceInfo(NamedTuple):
+    """What is known of a request."""
+
+    source_timestamp: int
+    received_timestamp: int
+    request_id: RequestId
+
+
+class Service(Entity):
+    """Answers requests; made by :meth:`.Node.create_service`."""
+
+    def __init__(self, service_impl: tuple[Reader, Writer], srv_type: Any, srv_name: str,
+                 callback: Callable[[Any, Any], Any], callback_group: CallbackGroup,
+                 qos_profile: QoSProfile, logger_name: str) -> None:
+        self._reader, self._writer = service_impl
+        self._destroyed = False
+        self.srv_type = srv_type
+        self.srv_name = srv_name
+        self.callback = callback
+        self.callback_group = callback_group
+        self.qos_profile = qos_profile
+        self._logger_name = logger_name
+
+    def _handle(self) -> int | None:
+        return None if self._destroyed else self._reader.condition
+
+    def _take(self, executor: Any) -> Work | None:
+        if self._destroyed:
+            return None
+        for sample in self._reader.take():
+            try:
+                client, number = REQUEST_HEADER.unpack_from(sample.data, 4)
+                request = cdr.deserialize(sample.data, self.srv_type.Request, 20)
+            except (ValueError, struct.error) as error:
+                from rclpy.logging import get_logger
+                get_logger(self._logger_name).error(
+                    f"Dropped a request to service '{self.srv_name}': {error}")
+                continue
+            info = ServiceInfo(sample.source_timestamp, time.time_ns(),
+                               RequestId(client, number, sample.publication))
+            return (self.callback, (request, self.srv_type.Response()),
+                    lambda response: self.send_response(response, info))
+        return None
+
+    def _reader_is_known(self, publication: int) -> bool | None:
+        """Whether the client's reader is matched; None if the client is gone."""
+        client = self._reader.matched_endpoint(publication)
+        if client is None:
+            return None
+        identity = user_data_value(client, 'clientid')
+        if identity is None:
+            return True
+        return any(reader is not None and user_data_value(reader, 'clientid') == identity
+                   for reader in map(self._writer.matched_endpoint, self._writer.matched()))
+
+    def send_response(self, response: Any, header: ServiceInfo | RequestId) -> None:
+        """
+        Answer a request.
+
+        :raises TypeError: if it is another type's response.
+        """
+        if not isinstance(response, self.srv_type.Response):
+            raise TypeError(f"Service '{self.srv_name}': the callback gave "
+                            f'{type(response)}, not {self.srv_type.Response}')
+        if self._destroyed:
+            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        request = header.request_id if isinstance(header, ServiceInfo) else header
+        data = cdr.serialize(response, cdr.HEADER + REQUEST_HEADER.pack(*request[:2]))
+        limit = time.monotonic() + READER_WAIT
+        while (known := self._reader_is_known(request.publication)) is False:
+            if time.monotonic() > limit:
+                raise RCLError('failed to send response: timeout')
+            time.sleep(0.001)
+        if known:
+            self._writer.write(data)
+
+    @property
+    def service_name(self) -> str:
+        """The expanded and remapped name."""
+        return '/' + self._reader.topic[len('rq/'):-len('Request')]
+
+    def destroy(self) -> None:
+        """Free it; a program calls :meth:`.Node.destroy_service`."""
+        if not self._destroyed:
+            self._destroyed = True
+            self._reader.close()
+            self._writer.close()

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscriptions."""
+
+from collections.abc import Callable
+from enum import Enum
+import inspect
+import time
+from typing import Any
+
+from rosidl_embedded import cdr
+
+from rclpy._dds import Reader
+from rclpy._entity import Entity, Work
+from rclpy._names import demangle_topic
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
+from rclpy.qos import QoSProfile
+
+
+class Subscription(Entity):
+    """Receives messages; made by :meth:`.Node.create_subscription`."""
+
+    class CallbackType(Enum):
+        """Whether the callback wants to know about the message, too."""
+
+        MessageOnly = 0
+        WithMessageInfo = 1
+
+    def __init__(self, subscription_impl: Reader, msg_type: Any, topic: str,
+                 callback: Callable[..., Any], callback_group: CallbackGroup,
+                 qos_profile: QoSProfile, raw: bool,
+                 event_callbacks: SubscriptionEventCallbacks, logger_name: str) -> None:
+        self._reader: Reader | None = subscription_impl
+        self.msg_type = msg_type
+        self.topic = topic
+        self.callback = callback
+        self.callback_group = callback_group
+        self.qos_profile = qos_profile
+        self.raw = raw
+        self._logger_name = logger_name
+        self.event_handlers: list[EventHandler] = event_callbacks.create_event_handlers(
+            callback_group, subscription_impl, topic, logger_name)
+
+    def _use(self) -> Reader:
+        if self._reader is None:
+            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        return self._reader
+
+    def _handle(self) -> int | None:
+        return self._reader.condition if self._reader else None
+
+    def _next(self) -> tuple[Any, dict[str, Any]] | None:
+        """Take the next message and what is known of it."""
+        if self._reader is None:
+            return None
+        for sample in self._reader.take():
+            try:
+                message = bytes(sample.data) if self.raw else cdr.deserialize(
+                    sample.data, self.msg_type)
+            except ValueError as error:
+                from rclpy.logging import get_logger
+                get_logger(self._logger_name).error(
+                    f"Dropped a message on topic '{self.topic}': {error}")
+                continue
+            return message, {
+                'source_timestamp': sample.source_timestamp,
+                'received_timestamp': time.time_ns(),
+                'publication_sequence_number': None,
+                'reception_sequence_number': None}
+        return None
+
+    def _take(self, executor: Any) -> Work | None:
+        taken = self._next()
+        if taken is None:
+            return None
+        with_info = self._callback_type is Subscription.CallbackType.WithMessageInfo
+        return self._callback, taken if with_info else taken[:1], None
+
+    def get_publisher_count(self) -> int:
+        """Count the publishers it receives from."""
+        return len(self._use().matched())
+
+    @property
+    def handle(self) -> 'Subscription':
+        """Itself."""
+        self._use()
+        return self
+
+    @property
+    def topic_name(self) -> str:
+        """The expanded and remapped topic."""
+        name = self._use().topic
+        return demangle_topic(name) or name
+
+    @property
+    def callback(self) -> Callable[..., Any]:
+        """What is called with each message, or with it and what is known of it."""
+        return self._callback
+
+    @callback.setter
+    def callback(self, value: Callable[..., Any]) -> None:
+        for arguments, kind in (((object(),), Subscription.CallbackType.MessageOnly),
+                                ((object(), object()), Subscription.CallbackType.WithMessageInfo)):
+            try:
+                inspect.signature(value).bind(*arguments)
+            except TypeError:
+                continue
+            self._callback, self._callback_type = value, kind
+            return
+        raise RuntimeError(
+            'Subscription.__init__(): callback should be either be callable with one argument'
+            '(to get only the message) or two (to get message and message info)')
+
+    def destroy(self) -> None:
+        """Free it; a program calls :meth:`.Node.destroy_subscription`."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()

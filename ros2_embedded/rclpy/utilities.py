@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The default context, and small helpers."""
+
+from collections.abc import Sequence
+import os
+import sys
+import threading
+
+from rclpy.constants import S_TO_NS
+from rclpy.context import Context
+
+_default: Context | None = None
+_lock = threading.Lock()
+
+
+def get_default_context(*, shutting_down: bool = False) -> Context:
+    """Give the context that is used where none is named; shutting down, forget it."""
+    global _default
+    with _lock:
+        context = _default or Context()
+        _default = None if shutting_down else context
+        return context
+
+
+def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
+    """Give the arguments (``sys.argv``'s by default) that ROS doesn't use."""
+    from rclpy._arguments import parse
+    return parse(list(sys.argv if args is None else args)).others
+
+
+def ok(*, context: Context | None = None) -> bool:
+    """Say whether a context is initialized and not shut down."""
+    return (context or get_default_context()).ok()
+
+
+def shutdown(*, context: Context | None = None) -> None:
+    """Shut a context down."""
+    (context or get_default_context(shutting_down=True)).shutdown()
+
+
+def try_shutdown(*, context: Context | None = None) -> None:
+    """Shut a context down unless it already is."""
+    if context is None:
+        context = get_default_context(shutting_down=True)
+    context.try_shutdown()
+
+
+def get_rmw_implementation_identifier() -> str:
+    """Name the middleware."""
+    return 'rmw_cyclonedds_cpp'
+
+
+def get_available_rmw_implementations() -> set[str]:
+    """Name the middlewares there are."""
+    chosen = os.environ.get('RMW_IMPLEMENTATIONS')
+    available = {'rmw_cyclonedds_cpp'}
+    if chosen:
+        wanted = set(chosen.split(os.pathsep))
+        if missing := wanted - available:
+            raise RuntimeError(
+                f"The RMW implementations {missing} specified in 'RMW_IMPLEMENTATIONS' are not "
+                f"available ({', '.join(sorted(available))})")
+        return wanted
+    return available
+
+
+def timeout_sec_to_nsec(timeout_sec: float | None) -> int:
+    """Convert a time-out to nanoseconds; none and negative ones to -1, for ever."""
+    if timeout_sec is None or timeout_sec < 0:
+        return -1
+    return int(float(timeout_sec) * S_TO_NS)
