@@ -73,7 +73,9 @@ class Node:
         self.running = False
         self.seen = False
         self.stopping = False
+        self.expected = True
         self.waiting: list[str] = []  # signals that came before the process
+        self.held: list[tuple[str, str]] = []  # output that launch told of before its process
         decoder = codecs.getincrementaldecoder('utf-8')
         self.decoders = {name: decoder('replace') for name in ('stdout', 'stderr')}
 
@@ -232,7 +234,9 @@ class ObeyAgent(Action):
     def started(self, context: LaunchContext, node: Node, event: ProcessStarted) -> None:
         """Report a process."""
         node.running = node.seen = True
+        node.expected = False
         self._report('started', node, pid=event.pid, cmd=list(event.cmd))
+        self._let_go(node)
         waiting, node.waiting = node.waiting, []
         for name in waiting:
             self._signal(context, node, name)
@@ -240,7 +244,11 @@ class ObeyAgent(Action):
     def output(self, node: Node, event: ProcessIO) -> None:
         """Report what a process wrote."""
         stream = 'stdout' if event.from_stdout else 'stderr'
-        self._output(node, stream, node.decoders[stream].decode(event.text))
+        text = node.decoders[stream].decode(event.text)
+        if node.expected:
+            node.held.append((stream, text))
+        else:
+            self._output(node, stream, text)
 
     def exited(self, context: LaunchContext, node: Node, event: ProcessExited) -> None:
         """Report the end of a process, and whether launch starts it again."""
@@ -252,6 +260,7 @@ class ObeyAgent(Action):
             and node.retries_left != 0)
         if respawns and node.retries_left > 0:
             node.retries_left -= 1
+        node.expected = respawns
         self._report('exited', node, returncode=event.returncode, respawns=respawns)
 
     def _executed(self, context: LaunchContext, node: Node) -> None:
@@ -264,9 +273,15 @@ class ObeyAgent(Action):
         future.add_done_callback(lambda _: context.emit_event_sync(_Ended(node)))
 
     def ended(self, node: Node) -> None:
-        """Report a process that never started."""
+        """See to what is left when launch is through with a process."""
+        self._let_go(node)
         if not node.seen:
             self._refuse(node, f'{node.name} could not be executed', 'see launch.log there')
+
+    def _let_go(self, node: Node) -> None:
+        held, node.held = node.held, []
+        for stream, text in held:
+            self._output(node, stream, text)
 
     def _output(self, node: Node, stream: str, text: str) -> None:
         for begin in range(0, len(text), CHUNK):

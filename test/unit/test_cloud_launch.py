@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a NodeSpec becomes a process on the machine: markers, executables, files, refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import socket
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('ament_index_python.packages', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+
+from fogros2 import cloud_launch
+from fogros2.agent_client import cloud_launch_source
+from fogros2.cloud_launch import RefusedNode, resolve
+
+
+@pytest.fixture
+def prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Install a package ``pack`` with an executable and a file that isn't one."""
+    root = tmp_path / 'prefix'
+    (root / 'share/ament_index/resource_index/packages').mkdir(parents=True)
+    (root / 'share/ament_index/resource_index/packages/pack').write_text('')
+    (root / 'share/pack').mkdir()
+    (root / 'lib/pack').mkdir(parents=True)
+    (root / 'lib/pack/talker').write_text('#!/bin/sh\n')
+    (root / 'lib/pack/talker').chmod(0o755)
+    (root / 'lib/pack/notes').write_text('')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(root))
+    return root
+
+
+@pytest.fixture
+def obey(tmp_path: Path):
+    ours, theirs = socket.socketpair()
+    action = cloud_launch.ObeyAgent(theirs, str(tmp_path))
+    yield action
+    ours.close()
+    theirs.close()
+
+
+def test_markers_become_this_machines_paths(prefix):
+    assert resolve('plain', {}) == 'plain'
+    assert resolve(['a ', {'share': 'pack'}, '/x'], {}) == f'a {prefix}/share/pack/x'
+    assert resolve([{'prefix': 'pack'}], {}) == str(prefix)
+    assert resolve(['@', {'file': 'k'}], {'k': '/t/k'}) == '@/t/k'
+    assert resolve([], {}) == ''
+
+
+@pytest.mark.parametrize('text', [[{'file': 'k'}], [{'new': 'x'}], [{}]])
+def test_markers_unknown_here_are_refused(prefix, text):
+    with pytest.raises(RefusedNode, match='means nothing'):
+        resolve(text, {})
+
+
+def test_an_unknown_package_is_refused_with_the_nearest_name(prefix):
+    with pytest.raises(RefusedNode) as caught:
+        resolve([{'share': 'packk'}], {})
+    assert "package 'packk' not found" in str(caught.value)
+    assert caught.value.hint == "did you mean 'pack'?"
+    with pytest.raises(RefusedNode, match="package '../x' not found"):
+        resolve([{'prefix': '../x'}], {})
+
+
+def test_executables_are_the_packages(prefix):
+    assert cloud_launch.find_executable('pack', 'talker') == f'{prefix}/lib/pack/talker'
+    for name in ('listener', 'notes', ''):
+        with pytest.raises(RefusedNode) as caught:
+            cloud_launch.find_executable('pack', name)
+        assert caught.value.hint == 'it has: notes, talker'
+
+
+def test_a_spec_becomes_launchs_own_process(prefix, obey):
+    process = obey._process({
+        'id': '1', 'name': 'talker-7', 'package': 'pack', 'executable': 'talker',
+        'prefix': ['nice', '-n', '5'], 'environment': {'A': [{'share': 'pack'}]},
+        'arguments': ['--ros-args', '-r', 'x:=y $(not a substitution)'],
+        'sigterm_timeout': 1.5})
+    words = [''.join(part.text for part in word) for word in process.cmd] if hasattr(
+        process, 'cmd') else []
+    assert words == ['nice', '-n', '5', f'{prefix}/lib/pack/talker', '--ros-args', '-r',
+                     'x:=y $(not a substitution)']
+    assert process.output == {}
+
+
+def test_files_are_private_and_named_for_people(prefix, obey):
+    process = obey._process({
+        'id': '1', 'name': 'n', 'arguments': ['true', [{'file': '/home/me/params.yaml'}],
+                                              [{'file': '../../evil'}]],
+        'files': {'/home/me/params.yaml': ['dir: ', {'share': 'pack'}],
+                  '../../evil': ['see ', {'file': '/home/me/params.yaml'}]}})
+    paths = [''.join(part.text for part in word) for word in process.cmd][1:]
+    folder = Path(paths[0]).parent
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert [Path(path).parent for path in paths] == [folder, folder]
+    assert [Path(path).stat().st_mode & 0o777 for path in paths] == [0o600, 0o600]
+    assert Path(paths[0]).name.endswith('params.yaml')
+    assert Path(paths[0]).read_text() == f'dir: {prefix}/share/pack'
+    assert Path(paths[1]).read_text() == f'see {paths[0]}'
+
+
+@pytest.mark.parametrize('spec, reason', [
+    ({}, 'nothing to run'),
+    ({'arguments': ['no-such-program']}, "'no-such-program' not found"),
+    ({'arguments': ['/proc/version']}, "isn't executable"),
+    ({'arguments': ['true'], 'cwd': '/no/such'}, "'/no/such' isn't there"),
+    ({'arguments': ['true'], 'environment': {'PATH': '/no/such'}}, "'true' not found"),
+    ({'package': 'pack', 'executable': 'none'}, "'none' not found in package 'pack'"),
+])
+def test_what_can_not_run_is_refused_before_launch_sees_it(prefix, obey, spec, reason):
+    with pytest.raises(RefusedNode, match=reason):
+        obey._process({'id': '1', 'name': 'n', **spec})
+
+
+def test_a_shell_command_is_left_to_the_shell(obey):
+    assert obey._process({'id': '1', 'name': 'n', 'shell': True, 'arguments': ['a | b']}).shell
+
+
+def test_it_imports_nothing_of_fogros2():
+    text = cloud_launch_source().read_text()
+    assert not [line for line in text.splitlines()
+                if line.strip().startswith(('import fogros2', 'from fogros2'))]
+
+
+def test_it_runs_as_a_launch_file_of_its_own_and_ends_with_its_agent(tmp_path):
+    path = tmp_path / 'cloud.launch.py'
+    path.write_bytes(cloud_launch_source().read_bytes())
+    ours, theirs = socket.socketpair()
+    ours.settimeout(30)
+    child = subprocess.Popen(
+        [sys.executable, str(path)], pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL,
+        env={**os.environ, 'FOGROS2_AGENT_FD': str(theirs.fileno()),
+             'FOGROS2_AGENT_DIRECTORY': str(tmp_path), 'ROS_LOG_DIR': str(tmp_path)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    theirs.close()
+    with ours, ours.makefile('rb') as lines:
+        ours.sendall(json.dumps({'command': 'start', 'nodes': [{
+            'id': 'a', 'name': 'a-1', 'arguments': ['cat', [{'file': 'f'}], '-'],
+            'files': {'f': 'text\n'}}]}).encode() + b'\n')
+        events = [json.loads(lines.readline()) for _ in range(2)]
+        assert [e['event'] for e in events] == ['started', 'output']
+        assert events[1]['text'] == 'text\n'
+        ours.shutdown(socket.SHUT_WR)
+        last = json.loads(lines.readline())
+        assert (last['event'], last['respawns']) == ('exited', False)
+        assert lines.readline() == b''
+    assert child.wait(30) == 0
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith('files-')] == []
