@@ -132,6 +132,7 @@ install_packages() {
 
 mkdir -p .cache
 log=$PWD/.cache/setup.log
+: >"$log"
 if [ -n "$packages" ]; then
     if ! have apt-get; then
         fail "Missing, and this computer has no apt to install it from: $packages" \
@@ -170,6 +171,14 @@ copy_sources() {
         --exclude=./benchmarks --exclude=./test . | tar -x -C .cache/source
 }
 
+# pip's chatter goes to the log; what it says last is shown when it fails
+pip_in() {
+    env=$1; shift
+    "$env/bin/python" -m pip "$@" >>"$log" 2>&1 </dev/null && return
+    tail -n 15 "$log" >&2
+    fail "pip could not install what is needed." "Its whole output: $log"
+}
+
 # prepare FOLDER PYTHON OPTIONS WHAT: $5... are pip's words for what goes in
 prepare() {
     folder=$1 interpreter=$2 options=$3 what=$4
@@ -188,14 +197,14 @@ prepare() {
         say "Making the virtual environment ${folder#"$PWD"/} ($what, $("$interpreter" -V 2>&1))"
         [ -x "$folder/bin/python" ] && "$folder/bin/python" -c '' 2>/dev/null \
             || "$interpreter" -m venv --clear $options "$folder"
-        "$folder/bin/python" -m pip install -q 'setuptools>=70.1' wheel
-        "$folder/bin/python" -m pip install -q --no-build-isolation "$@"
+        pip_in "$folder" install 'setuptools>=70.1' wheel
+        pip_in "$folder" install --no-build-isolation "$@"
     else
         say "Sources changed: installing them into ${folder#"$PWD"/} again"
     fi
     # whatever pip believes to be there already
     for word; do set -- "$@" "${word%\[*\]}"; shift; done
-    "$folder/bin/python" -m pip install -q --no-deps --no-build-isolation --force-reinstall "$@"
+    pip_in "$folder" install --no-deps --no-build-isolation --force-reinstall "$@"
     rm -rf .cache/source
     echo "$needs $sources" >"$stamp"
 }
