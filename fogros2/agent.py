@@ -24,7 +24,7 @@ it: the VPN's, and the one that ends the machine.
 ``start``      ``nodes``: list of NodeSpec; an id that is known already is left alone
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
 ``signal``     ``node``, ``signal``: 'SIGINT'
-``status``     see ``Agent.do_status``
+``status``     see ``Agent.do_status``; ``ping`` says nothing at less cost
 ``log``        ``from`` seq, ``follow``: replies ``first`` and ``next`` (seqs that exist), then
                sends the events' lines; ``lost`` counts events that rotation took away
 ``release``    stop the nodes, disarm the heartbeat, reply when done; ``exit`` true: leave then
@@ -945,6 +945,10 @@ class Agent:
                      for kept in self.kept.values()],
             'rss_kb': rss, 'first': self.log.first, 'next': self.log.next,
         }
+
+    def do_ping(self, client: Client, request: Json) -> Json:
+        """Say something."""
+        return {}
 
     def do_log(self, client: Client, request: Json) -> Optional[Json]:
         """Send events from a seq on."""

@@ -20,6 +20,8 @@ from fogros2.waiting import wait_until
 
 #: Seconds between heartbeats.
 HEARTBEAT_INTERVAL = 2.0
+#: Seconds after which a connection that says nothing is given up.
+SILENCE = 20.0
 
 EventCallback = Callable[[dict[str, Any]], None]
 
@@ -57,6 +59,8 @@ class AgentClient:
     :param python: interpreter there.
     :param agent_path: where ``agent.py`` is there.
     :param cancel: once set, requests end with Cancelled and no new connection is tried.
+    :param silence: seconds without a byte, though asked for one, after which a connection counts
+        as lost: a robot that changed networks would learn of that from TCP in a quarter hour.
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class AgentClient:
         agent_path: str,
         python: str = 'python3',
         cancel: Optional[threading.Event] = None,
+        silence: float = SILENCE,
     ) -> None:
         self._shell = shell
         self._command = Command(
@@ -77,6 +82,9 @@ class AgentClient:
         self._cancel = cancel or threading.Event()
         self._closed = threading.Event()
         self._lock = threading.Lock()
+        self._writing = threading.Lock()
+        self._silence = silence
+        self._heard = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
@@ -103,9 +111,11 @@ class AgentClient:
             if self._closed.is_set():
                 raise AgentError('the connection to the agent was closed')
             self._stream = self._shell.open(self._command)
+            self._heard = time.monotonic()
             self._thread = threading.Thread(
                 target=self._read_all, name='fogros2-agent', daemon=True)
             self._thread.start()
+            threading.Thread(target=self._watch, name='fogros2-agent-watch', daemon=True).start()
 
     def request(self, command: str, *, timeout: float = 30.0, **arguments: Any) -> dict[str, Any]:
         """
@@ -131,8 +141,7 @@ class AgentClient:
             self._pending[number] = pending
             stream = self._stream
         if stream is not None:
-            with contextlib.suppress(ConnectError):  # the reader sees to it
-                stream.write(line)
+            self._send(stream, line)
         deadline = time.monotonic() + timeout
         try:
             while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
@@ -168,8 +177,7 @@ class AgentClient:
         with self._lock:
             stream = self._stream
         if stream is not None:
-            with contextlib.suppress(ConnectError):
-                self._follow_on(stream)
+            self._follow_on(stream)
 
     def close(self) -> None:
         """Drop the connection; requests that wait fail; the agent goes on."""
@@ -210,6 +218,7 @@ class AgentClient:
         stream = self._stream
         assert stream is not None
         for line in iter(stream.readline, b''):
+            self._heard = time.monotonic()
             try:
                 message = json.loads(line)
             except ValueError:
@@ -234,8 +243,7 @@ class AgentClient:
                 self._next = 1
                 stream = self._stream
                 if reply.get('next', 0) > 1 and stream is not None:
-                    with contextlib.suppress(ConnectError):
-                        self._follow_on(stream)
+                    self._follow_on(stream)
             elif reply.get('lost'):
                 self._tell({'event': 'lost', 'count': reply['lost']})
             return
@@ -258,9 +266,30 @@ class AgentClient:
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
-        stream.write(to_json({
+        self._send(stream, to_json({
             'id': self._log_request, 'command': 'log', 'from': self._next, 'follow': True,
         }).encode() + b'\n')
+
+    def _send(self, stream: Stream, line: bytes) -> None:
+        """Write a line; where the link is gone the reader sees to what was asked."""
+        with self._writing, contextlib.suppress(ConnectError):
+            stream.write(line)
+
+    def _watch(self) -> None:
+        """Give up a connection on which nothing comes, after having asked for something."""
+        thread = self._thread
+        while thread is not None and thread.is_alive():
+            if self._closed.wait(self._silence / 4):
+                return
+            stream, silent = self._stream, time.monotonic() - self._heard
+            if stream is None or silent < self._silence / 4:
+                continue
+            if silent > self._silence:
+                stream.close()
+            elif self._writing.acquire(timeout=self._silence / 4):
+                # whoever holds it for longer is stuck in a dead link himself
+                self._writing.release()
+                self._send(stream, to_json({'id': 0, 'command': 'ping'}).encode() + b'\n')
 
     def _reopen(self) -> None:
         """Connect again, with growing pauses, for as long as anybody wants it."""
@@ -287,6 +316,10 @@ class AgentClient:
                 self._error = AgentError(f"the agent can't be reached: {error.args[0]}",
                                          error.hint)
                 return
+        if self._closed.is_set():
+            stream.close()
+            return
+        self._heard = time.monotonic()
         with self._lock:
             self._stream = stream
             again = []
@@ -296,11 +329,10 @@ class AgentClient:
                 elif not pending.done.is_set():
                     pending.reply = {'ok': False, 'error': 'the connection was lost meanwhile'}
                     pending.done.set()
-        with contextlib.suppress(ConnectError):
-            if self._next is not None:
-                self._follow_on(stream)
-            for line in again:
-                stream.write(line)
+        if self._next is not None:
+            self._follow_on(stream)
+        for line in again:
+            self._send(stream, line)
 
 
 class Heartbeat:

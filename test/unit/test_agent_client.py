@@ -8,7 +8,7 @@ import json
 import queue
 import socket
 import threading
-from typing import Any, Optional
+from typing import Any
 
 import pytest
 
@@ -83,9 +83,9 @@ def agent(next_seq: int = 1, **status: Any) -> ScriptedStream:
 def make() -> Iterator[Callable[..., AgentClient]]:
     clients: list[AgentClient] = []
 
-    def build(*streams: Any, cancel: Optional[threading.Event] = None) -> AgentClient:
+    def build(*streams: Any, **more: Any) -> AgentClient:
         shell: Any = ScriptedShell(*streams)
-        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', cancel=cancel))
+        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', **more))
         return clients[-1]
     yield build
     for client in clients:
@@ -264,6 +264,20 @@ def test_a_subscriber_that_asks_is_stopped_before_it_hangs(make):
     stream.say({'event': 'x', 'seq': 1})
     until(lambda: caught)
     assert 'subscriber' in str(caught[0])
+
+
+def test_a_connection_that_falls_silent_is_given_up(make):
+    mute = ScriptedStream(lambda request: [])
+    second = agent()
+    client = make(mute, second, silence=0.2)
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    until(lambda: second.asked)
+    assert 'ping' in [request['command'] for request in mute.asked]
+    assert [e['state'] for e in seen] == ['lost', 'back']
+    # one that answers is kept
+    until(lambda: sum(request['command'] == 'ping' for request in second.asked) > 6)
+    assert len(seen) == 2
 
 
 def test_heartbeats_go_out_and_come_back():
