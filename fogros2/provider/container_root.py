@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 import functools
+import glob
 import io
 import os
 from pathlib import Path
@@ -32,16 +33,20 @@ ETC = (
     'X11', 'OpenCL', 'adduser.conf', 'alternatives', 'apt', 'bash.bashrc', 'bash_completion.d',
     'bindresvport.blacklist', 'ca-certificates', 'ca-certificates.conf', 'crypto-policies',
     'debconf.conf', 'debian_version', 'default/locale', 'default/useradd', 'deluser.conf',
-    'dpkg', 'ethertypes', 'fonts', 'gai.conf', 'glvnd', 'groff', 'gss', 'host.conf', 'init.d',
+    'dpkg', 'ethertypes', 'fonts', 'gai.conf', 'glvnd', 'groff', 'gss', 'host.conf',
     'inputrc', 'iproute2', 'issue', 'issue.net', 'java-*', 'ld.so.cache', 'ld.so.conf',
     'ld.so.conf.d', 'libaudit.conf', 'libnl-3', 'locale.alias', 'locale.conf', 'locale.gen',
     'localtime', 'login.defs', 'lsb-release', 'magic', 'magic.mime', 'manpath.config',
     'mime.types', 'mke2fs.conf', 'netconfig', 'networks', 'nsswitch.conf', 'os-release',
     'pam.conf', 'pam.d', 'perl', 'pki/tls/certs', 'pki/ca-trust', 'profile', 'profile.d',
-    'protocols', 'python3', 'python3.*', 'rc?.d', 'rmt', 'ros', 'rpc', 'security', 'selinux',
+    'protocols', 'python3', 'python3.*', 'rmt', 'ros', 'rpc', 'security', 'selinux',
     'services', 'sgml', 'shells', 'skel', 'ssl/certs', 'ssl/openssl.cnf', 'terminfo',
-    'timezone', 'ucf.conf', 'update-motd.d', 'vim', 'vulkan', 'xattr.conf', 'xdg', 'xml',
+    'timezone', 'ucf.conf', 'vim', 'vulkan', 'xattr.conf', 'xdg', 'xml',
 )
+
+#: Entries from which a folder of settings is mounted as the system's folders are: making 400
+#: links takes a file system longer than a mount.
+MANY = 40
 
 #: Never copied, wherever it lies and whoever may read it.
 _SECRET = re.compile(
@@ -52,9 +57,9 @@ _SECRET = re.compile(
 _URL_LOGIN = re.compile(rb'://[^/\s:@]+:[^/\s@]+@')
 
 _FOLDERS: Mapping[str, int] = {
-    'dev': 0o755, 'home': 0o755, 'media': 0o755, 'mnt': 0o755, 'opt': 0o755, 'proc': 0o555,
-    'root': 0o711, 'run': 0o755, 'run/lock': 0o1777, 'run/sshd': 0o755, 'srv': 0o755,
-    'sys': 0o555, 'tmp': 0o1777, 'etc': 0o755, 'usr': 0o755, 'var': 0o755,
+    'dev': 0o755, 'etc/init.d': 0o755, 'home': 0o755, 'media': 0o755, 'mnt': 0o755,
+    'opt': 0o755, 'proc': 0o555, 'root': 0o711, 'run': 0o755, 'run/lock': 0o1777,
+    'run/sshd': 0o755, 'srv': 0o755, 'sys': 0o555, 'tmp': 0o1777, 'var': 0o755,
     'var/cache/apt/archives/partial': 0o755, 'var/cache/debconf': 0o755, 'var/lib': 0o755,
     'var/lib/apt/lists/partial': 0o755, 'var/lib/dpkg': 0o755, 'var/lib/misc': 0o755,
     'var/log/apt': 0o755, 'var/mail': 0o2775, 'var/opt': 0o755, 'var/spool': 0o755,
@@ -111,15 +116,51 @@ class Archive:
         return self._buffer.getvalue()[:end]
 
 
-def system_mounts(root: Path = Path('/')) -> list[str]:
-    """Return the system's folders to be laid under throw-away layers, shortest first."""
-    found = [f'/{name}' for name in SYSTEM
-             if (root / name).is_dir() and not (root / name).is_symlink()]
-    if (root / PACKAGES[1:]).is_dir():
+@functools.lru_cache(maxsize=1)
+def system_mounts() -> tuple[str, ...]:
+    """Return the system's folders to be laid under throw-away layers, outer ones first."""
+    found = [f'/{name}' for name in SYSTEM if _is_folder(Path('/', name))]
+    if os.path.isdir(PACKAGES):
         found.append(PACKAGES)
     # an overlay doesn't look below another file system that is mounted inside it
-    below = [point for point in mount_points() if point.startswith('/usr/')]
-    return found + (below if root == Path('/') else [])
+    found += [point for point in mount_points() if point.startswith('/usr/')]
+    return (*found, *many_settings())
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+@functools.lru_cache(maxsize=4)
+def allowed_settings(etc: str = '/etc') -> Mapping[str, tuple[str, ...]]:
+    """Return what of ``etc`` is on the allow-list, and for folders everything below them."""
+    found = {}
+    for pattern in ETC:
+        for path in sorted(glob.glob(f'{etc}/{pattern}')):
+            below: list[str] = []
+            if not os.path.islink(path):
+                for top, folders, files in os.walk(path):
+                    below += [f'{top}/{name}' for name in (*folders, *files)]
+            found[path] = tuple(sorted(below))
+    return found
+
+
+@functools.lru_cache(maxsize=4)
+def many_settings(etc: str = '/etc') -> tuple[str, ...]:
+    """Return the folders on the allow-list with many entries, all of them fit to be seen."""
+    return tuple(path for path, below in allowed_settings(etc).items()
+                 if len(below) >= MANY and all(_fit(entry) for entry in (path, *below)))
+
+
+def _fit(path: str) -> bool:
+    """Return whether a setting may be seen: no secret by name, mode or content."""
+    if _SECRET.search(path):
+        return False
+    mode = os.lstat(path).st_mode
+    if stat.S_ISREG(mode) and mode & 0o4:
+        with open(path, 'rb') as file:
+            return not _URL_LOGIN.search(file.read())
+    return stat.S_ISLNK(mode) or stat.S_ISDIR(mode) and mode & 0o5 == 0o5
 
 
 def mount_points(table: Path = Path('/proc/self/mountinfo')) -> list[str]:
@@ -145,40 +186,34 @@ def _mounts(table: Path) -> Iterator[tuple[str, str]]:
             words[words.index('-') + 1]
 
 
-def readable(path: Path) -> bool:
-    """Return whether every user of this computer may read a file or folder."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        return mode & 0o5 == 0o5
-    return stat.S_ISREG(mode) and bool(mode & 0o4)
+def settings(archive: Archive, etc: str = '/etc') -> None:
+    """Add what of ``etc`` is on the allow-list, readable for all, and no secret."""
+    for path, below in allowed_settings(etc).items():
+        if path in many_settings(etc):
+            archive.folder(f'etc{path[len(etc):]}')
+            continue
+        hidden: list[str] = []
+        for entry in (path, *below):
+            if any(entry.startswith(f'{folder}/') for folder in hidden):
+                continue
+            try:
+                if _fit(entry):
+                    _add(archive, entry, f'etc{entry[len(etc):]}')
+                else:
+                    hidden.append(entry)
+            except FileNotFoundError:
+                continue  # removed while we looked, by a package manager
 
 
-def settings(archive: Archive, etc: Path = Path('/etc')) -> None:
-    """Add what of ``etc`` is on the allow-list, readable for all, and no secret by its name."""
-    for pattern in ETC:
-        for path in sorted(etc.glob(pattern)):
-            _add(archive, path, etc)
-
-
-def _add(archive: Archive, path: Path, etc: Path) -> None:
-    name = f'etc/{path.relative_to(etc)}'
-    if _SECRET.search(name):
-        return
-    try:
-        if path.is_symlink():
-            archive.link(name, os.readlink(path))
-        elif not readable(path):
-            return
-        elif path.is_dir():
-            archive.folder(name)
-            for child in sorted(path.iterdir()):
-                _add(archive, child, etc)
-        else:
-            data = path.read_bytes()
-            if not _URL_LOGIN.search(data):
-                archive.file(name, data, 0o755 if path.stat().st_mode & 0o111 else 0o644)
-    except FileNotFoundError:
-        return  # removed while we looked, by a package manager
+def _add(archive: Archive, path: str, name: str) -> None:
+    mode = os.lstat(path).st_mode
+    if stat.S_ISLNK(mode):
+        archive.link(name, os.readlink(path))
+    elif stat.S_ISDIR(mode):
+        archive.folder(name)
+    else:
+        with open(path, 'rb') as file:
+            archive.file(name, file.read(), 0o755 if mode & 0o111 else 0o644)
 
 
 def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
@@ -216,7 +251,7 @@ def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
         archive.folder(f'home/{user}', 0o750, 1000)
         for name in ('.bashrc', '.profile'):
             path = etc / 'skel' / name
-            if path.is_file() and readable(path):
+            if path.is_file() and _fit(str(path)):
                 archive.file(f'home/{user}/{name}', path.read_bytes(), 0o644, 1000)
 
 
@@ -272,9 +307,11 @@ def editable(site: Path) -> list[str]:
     for path in site.glob('*.pth'):
         for line in path.read_text(errors='replace').splitlines():
             if line.startswith('/') and os.path.isdir(line):
-                found += [str(child) for child in Path(line).iterdir()
-                          if (child / '__init__.py').is_file()
-                          or child.suffix == '.py' and child.name != 'setup.py']
+                packages = [str(child) for child in Path(line).iterdir()
+                            if (child / '__init__.py').is_file()
+                            or child.suffix == '.py' and child.name != 'setup.py']
+                # a mount each, unless the folder is there for packages alone
+                found += packages if len(packages) <= 8 else [line]
     for path in site.glob('__editable__*_finder.py'):
         match = re.search(r'^MAPPING[^=]*= *(\{.*\})', path.read_text(), re.MULTILINE)
         if match:
