@@ -226,6 +226,11 @@ class Launch:
                 self._robot = RobotVpn(self, folder)
             return self._robot
 
+    @property
+    def ending(self) -> bool:
+        """Whether the launch is on its way down."""
+        return self._closed
+
     def machines(self) -> list[RunningMachine]:
         """Return the machines that are up now."""
         return [up.result() for up in list(self._ups.values())
@@ -284,13 +289,13 @@ class Launch:
 
 
 class RobotVpn:
-    """The robot's VPN interface: one per launch, with every machine of it as a peer."""
+    """The robot's VPN interface, one per launch, and the machines that it leads to."""
 
     def __init__(self, launch: Launch, folder: Path) -> None:
         self._launch = launch
         self._lock = threading.Lock()
         self._up = False
-        self._peers: dict[str, Peer] = {}
+        self._members: dict[str, VpnMember] = {}
         self._public_key = ''
         self._stop = threading.Event()
         self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
@@ -315,27 +320,32 @@ class RobotVpn:
                 threading.Thread(target=self._keep, name='fog-vpn', daemon=True).start()
             return Peer('robot', self._public_key, self.interface.address)
 
-    def add(self, peer: Peer) -> dict[str, Peer]:
-        """Add a machine; return all machines."""
+    def peers_of(self, name: str) -> list[Peer]:
+        """Return the peers of a machine as they are now."""
+        robot = self.ensure()
         with self._lock:
-            self._peers[peer.name] = peer
+            return plan.machine_peers(
+                robot, name, {n: member.peer for n, member in self._members.items()})
+
+    def add(self, member: VpnMember) -> None:
+        """Let the robot, and every machine that is there already, know of a new one."""
+        with self._lock:
+            self._members[member.peer.name] = member
             self._launch.robot(self.vpn.peers(self.interface, self._sorted()))
-            return dict(self._peers)
+            everyone = list(self._members.values())
+        for other in everyone:
+            other.update(self)
 
     def remove(self, name: str) -> None:
-        """Take a machine out."""
+        """Forget a machine; the robot's interface is told unless it goes as well."""
         with self._lock:
-            if self._peers.pop(name, None) is not None and self._up:
+            gone = self._members.pop(name, None)
+            if gone is not None and self._up and not self._launch.ending:
                 self._launch.robot(
                     self.vpn.peers(self.interface, self._sorted()), cancel=False)
 
-    def peers(self) -> dict[str, Peer]:
-        """Return the machines that are peers now."""
-        with self._lock:
-            return dict(self._peers)
-
     def _sorted(self) -> list[Peer]:
-        return [self._peers[name] for name in sorted(self._peers)]
+        return [self._members[name].peer for name in sorted(self._members)]
 
     def _keep(self) -> None:
         """Get the interface's program going again when it died; nodes don't notice."""
@@ -359,6 +369,40 @@ class RobotVpn:
         with self._lock:
             self._up = False
             self._launch.robot(self.vpn.down(self.interface), cancel=False)
+
+
+class VpnMember:
+    """A machine in the VPN: told its peers anew when another joins."""
+
+    def __init__(
+        self, peer: Peer, interface: VpnInterface, on: Callable[[Iterable[Command]], str],
+        keep: Callable[[], None],
+    ) -> None:
+        self.peer = peer
+        self.interface = interface
+        self._on = on
+        self._keep = keep
+        self._lock = threading.Lock()
+        self._told: list[Peer] = []
+
+    def up(self, robot: RobotVpn) -> None:
+        """Bring the machine's interface up with the peers of this moment."""
+        with self._lock:
+            self._told = robot.peers_of(self.peer.name)
+            self._on(robot.vpn.up(self.interface, self._told))
+
+    def update(self, robot: RobotVpn) -> None:
+        """Tell the machine its peers, unless somebody else just did."""
+        with self._lock:
+            peers = robot.peers_of(self.peer.name)
+            if peers != self._told:
+                self._on(robot.vpn.peers(self.interface, peers))
+                self._told = peers
+                self._keep()
+
+    def repair(self, robot: RobotVpn) -> list[list[str]]:
+        """Return the command lines that get the machine's VPN going again."""
+        return [list(c.argv) for c in robot.vpn.repair(self.interface, self._told)]
 
 
 class RunningMachine:
@@ -430,10 +474,11 @@ class _Deployment:
                 ros = self._prepare_host(shell)
                 interface = self._interface()
                 agent = self._arm(machine, shell, undo)
-                joining = pool.submit(self._join_vpn, machine, shell, interface, robot, undo)
+                robot.result()
+                joining = pool.submit(self._join_vpn, machine, shell, agent, interface, undo)
                 syncing = pool.submit(self._sync, shell, ros)
                 configuring = pool.submit(self._configure_dds, shell, interface)
-                public_key = joining.result()
+                public_key = joining.result().peer.public_key
                 syncing.result()
                 dds = configuring.result()
             with step(self.launch.report, self.name, 'agent') as detail:
@@ -585,36 +630,37 @@ class _Deployment:
         return interface
 
     def _join_vpn(
-        self, machine: Machine, shell: Shell, interface: VpnInterface,
-        robot: Future[Peer], undo: contextlib.ExitStack,
-    ) -> str:
+        self, machine: Machine, shell: Shell, agent: AgentClient, interface: VpnInterface,
+        undo: contextlib.ExitStack,
+    ) -> VpnMember:
         with step(self.launch.report, self.name, 'VPN') as detail:
-            vpn = self.launch._robot_vpn().vpn
-            me = robot.result()
+            robot = self.launch._robot_vpn()
             undo.callback(
                 self.launch.attempt, self.name, 'VPN', lambda: self._leave_vpn(shell, interface))
-            public_key = self._on(shell, [vpn.keys(interface)]).strip()
-            others = self.launch._robot_vpn().peers()
-            self._on(shell, vpn.up(interface, plan.machine_peers(me, self.name, others)))
-            everyone = self.launch._robot_vpn().add(Peer(
-                self.name, public_key, interface.address,
-                f'{machine.vpn_host}:{interface.port}'))
-            self._introduce(me, everyone)
+            public_key = self._on(shell, [robot.vpn.keys(interface)]).strip()
+            member = VpnMember(
+                Peer(self.name, public_key, interface.address,
+                     f'{machine.vpn_host}:{interface.port}'),
+                interface, lambda commands: self._on(shell, commands),
+                lambda: self._keep_vpn(agent, member))
+            member.up(robot)
+            robot.add(member)
+            self._keep_vpn(agent, member)
             detail.append(interface.address)
-            return public_key
+            return member
 
-    def _introduce(self, robot: Peer, machines: Mapping[str, Peer]) -> None:
-        """Tell the machines that are up already of the one that joined."""
-        vpn = self.launch._robot_vpn().vpn
-        for other in self.launch.machines():
-            if other.spec.name != self.name:
-                self._on(other.shell, vpn.peers(
-                    other.interface, plan.machine_peers(robot, other.spec.name, machines)))
+    def _keep_vpn(self, agent: AgentClient, member: VpnMember) -> None:
+        """Have the agent repair the machine's VPN when its program dies."""
+        robot = self.launch._robot_vpn()
+        agent.request(
+            'keep', timeout=self.timeouts.agent, what='vpn', interval=1.0,
+            alive=list(robot.vpn.alive(member.interface).argv), repair=member.repair(robot))
 
     def _leave_vpn(self, shell: Shell, interface: VpnInterface) -> None:
-        self.launch._robot_vpn().remove(self.name)
+        robot = self.launch._robot_vpn()
+        robot.remove(self.name)
         if self._survives():
-            self._on(shell, self.launch._robot_vpn().vpn.down(interface), cancel=False)
+            self._on(shell, robot.vpn.down(interface), cancel=False)
 
     def _on(self, shell: Shell, commands: Iterable[Command], *, cancel: bool = True) -> str:
         output = ''
@@ -692,19 +738,13 @@ class _Deployment:
         self, agent: AgentClient, interface: VpnInterface, ros: bootstrap.RosInstall,
         dds: Mapping[str, str], undo: contextlib.ExitStack,
     ) -> Heartbeat:
-        robot = self.launch._robot_vpn()
-        vpn = robot.vpn
-        me = robot.ensure()
-        peers = plan.machine_peers(me, self.name, robot.peers())
+        robot = self.launch._robot_vpn().interface
         agent.request(
-            'configure',
+            'configure', timeout=self.timeouts.agent,
             heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
-                       'peer': me.address},
+                       'peer': robot.address},
             environment={**ros.environment, **dds, **self.spec.environment},
             setup=list(ros.setup), ros_command=list(ros.command))
-        agent.request(
-            'keep', what='vpn', alive=list(vpn.alive(interface).argv), interval=1.0,
-            repair=[list(command.argv) for command in vpn.repair(interface, peers)])
         agent.request('launch')
         heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, self.launch.id)
         undo.callback(heartbeat.close)
@@ -725,13 +765,11 @@ class _Deployment:
     def _undo_nodes(self, agent: AgentClient, undo: contextlib.ExitStack) -> None:
         """Push what comes first on the way down: the nodes end."""
         def release() -> None:
-            agent.request('release', on_exit=self.spec.on_exit, exit=not self._boots_agent())
+            if self._survives():
+                agent.request('release', timeout=self.timeouts.agent,
+                              on_exit=self.spec.on_exit, exit=not self.provider.agent_program)
 
-        if self._survives():
-            undo.callback(self.launch.attempt, self.name, 'nodes', release)
-
-    def _boots_agent(self) -> bool:
-        return bool(self.provider.agent_program)
+        undo.callback(self.launch.attempt, self.name, 'nodes', release)
 
     def _survives(self) -> bool:
         """Whether the computer stays when the launch ends, so that it has to be tidied up."""

@@ -9,25 +9,30 @@ from pathlib import Path
 import subprocess
 import uuid
 
+import pytest
+
 from fogros2.model import Command
 from fogros2.process import run, which
 from fogros2.waiting import wait_until
-import pytest
 
-#: TEST-NET-2: nobody's, and no route leads out of an internal network.
-SUBNET = '198.51.100.0/24'
+#: TEST-NET-2 and 3: nobody's, and no route leads out of an internal network. Several, as two runs
+#: of the tests may meet on one computer.
+SUBNETS = [f'{net}.{host}/26' for net in ('198.51.100', '203.0.113') for host in (0, 64, 128, 192)]
 
 
 def traces(state: Path) -> set[str]:
     """Return everything on this computer now that a launch may leave behind, one line each."""
-    found = {f'interface {name}' for name in os.listdir('/sys/class/net') if name[:3] == 'fog'}
+    found = {f'interface {name}' for name in os.listdir('/sys/class/net')
+             if name[:3] == 'fog' and name[:4] != 'fogt'}
     for process in Path('/proc').glob('[0-9]*'):
         try:
             words = (process / 'cmdline').read_bytes().split(b'\0')
             comm = (process / 'comm').read_text().strip()
         except OSError:
             continue
-        if comm == 'wireguard-go' or any(w.endswith(b'agent.py') for w in words[:3]):
+        # 'fogt' begins the names of tests of single parts, which tidy up by themselves
+        vpn = comm == 'wireguard-go' and not any(w.startswith(b'fogt') for w in words)
+        if vpn or any(w.endswith(b'agent.py') for w in words[:3]):
             found.add(f'process {process.name} {comm}')
     for words, what in (
         (('podman', 'ps', '-a', '--format', '{{.Names}}'), 'container'),
@@ -36,7 +41,8 @@ def traces(state: Path) -> set[str]:
     ):
         if which(words[0]):
             output = run(Command(words, sudo=True), timeout=30, check=False).stdout
-            found |= {f'{what} {line}' for line in output.splitlines() if 'fog' in line}
+            found |= {f'{what} {line}' for line in output.splitlines()
+                      if 'fog' in line and 'fogt' not in line}
     found |= {f'mount {line.split()[1]}' for line in Path('/proc/mounts').read_text().splitlines()
               if 'fogros2' in line.split()[1]}
     for folder in (Path('/run'), Path('/tmp'), Path('/var/tmp')):
@@ -75,8 +81,13 @@ def engine(tun: None) -> str:
 def cloud_network(engine: str) -> Iterator[str]:
     """Return a container network without a way out, for the time of the tests."""
     name = f'fogt{uuid.uuid4().hex[:8]}'
-    run(Command((engine, 'network', 'create', '--internal', '--subnet', SUBNET, name),
-                sudo=True), timeout=60)
+    for subnet in SUBNETS:
+        made = run(Command((engine, 'network', 'create', '--internal', '--subnet', subnet, name),
+                           sudo=True), timeout=60, check=False)
+        if made.returncode == 0:
+            break
+    else:
+        pytest.fail(f'no subnet for the tests is free: {made.stderr}')
     yield name
     run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
 
