@@ -282,7 +282,10 @@ class ExecuteLocal(Action):
             return
         self.__logger.info(f"sending signal '{event.signal_name}' to process[{name}]")
         try:
-            self._subprocess_transport.send_signal(signal.Signals[event.signal_name])
+            if event.signal_name == 'SIGKILL':
+                self._subprocess_transport.kill()
+            else:
+                self._subprocess_transport.send_signal(signal.Signals[event.signal_name])
         except ProcessLookupError:
             self.__logger.debug(
                 f"signal '{event.signal_name}' not sent to '{name}' because it has closed already")

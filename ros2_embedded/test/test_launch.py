@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""launch's events, actions and handlers, through ROS 2's public API alone."""
+
+import asyncio
+import os
+import sys
+import textwrap
+
+import launch
+from launch import LaunchContext, LaunchDescription, LaunchIntrospector, LaunchService
+from launch.actions import (
+    AppendEnvironmentVariable, DeclareLaunchArgument, EmitEvent, ExecuteProcess, GroupAction,
+    IncludeLaunchDescription, LogInfo, OpaqueCoroutine, OpaqueFunction, PopEnvironment,
+    PopLaunchConfigurations, PushEnvironment, PushLaunchConfigurations, RegisterEventHandler,
+    ResetLaunchConfigurations, SetEnvironmentVariable, SetLaunchConfiguration, Shutdown,
+    TimerAction, UnregisterEventHandler, UnsetEnvironmentVariable, UnsetLaunchConfiguration)
+from launch.conditions import (
+    evaluate_condition_expression, IfCondition, InvalidConditionExpressionError,
+    LaunchConfigurationEquals, LaunchConfigurationNotEquals, UnlessCondition)
+from launch.event_handlers import event_named, OnExecutionComplete, OnProcessExit, OnShutdown
+from launch.launch_description_sources import (
+    AnyLaunchDescriptionSource, InvalidLaunchFileError, PythonLaunchDescriptionSource)
+from launch.substitutions import (
+    LaunchConfiguration, TextSubstitution, ThisLaunchFile, ThisLaunchFileDir)
+import launch.utilities
+from launch.utilities import perform_substitutions
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _log_into(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    launch.logging.reset()
+    yield
+    launch.logging.reset()
+
+
+def run(*entities, service=None):
+    service = service or LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription(entities))
+    return service.run()
+
+
+def note(notes, what):
+    """Return an action that appends a value, or the values of configurations, to a list."""
+    return OpaqueFunction(function=lambda context: notes.append(
+        what(context) if callable(what) else what))
+
+
+def configuration(name):
+    return lambda context: context.launch_configurations.get(name)
+
+
+class Asked(launch.Event):
+    name = 'test.Asked'
+
+
+def test_entities_are_visited_depth_first_and_in_order():
+    notes = []
+    nested = OpaqueFunction(function=lambda context: [note(notes, 2), note(notes, 3)])
+    assert run(note(notes, 1), nested, GroupAction([note(notes, 4)]), note(notes, 5)) == 0
+    assert notes == [1, 2, 3, 4, 5]
+
+
+def test_conditions_decide_when_the_action_is_visited():
+    notes = []
+
+    def conditional(what, condition):
+        return OpaqueFunction(function=lambda context: notes.append(what), condition=condition)
+
+    with pytest.warns(UserWarning, match='deprecated'):
+        equals = LaunchConfigurationEquals('a', 'TRUE')
+        absent = LaunchConfigurationEquals('absent', None)
+        differs = LaunchConfigurationNotEquals('a', 'TRUE')
+    assert run(
+        SetLaunchConfiguration('a', 'TRUE'),
+        conditional(1, IfCondition(LaunchConfiguration('a'))),
+        conditional(2, UnlessCondition(LaunchConfiguration('a'))),
+        conditional(3, UnlessCondition('0')),
+        conditional(4, equals), conditional(5, absent), conditional(6, differs)) == 0
+    assert notes == [1, 3, 4, 5]
+
+
+@pytest.mark.parametrize('text, value', [('true', True), (' True', True), ('1', True),
+                                         ('FALSE', False), ('0', False)])
+def test_condition_expressions(text, value):
+    assert evaluate_condition_expression(
+        LaunchContext(), [TextSubstitution(text=text)]) is value
+
+
+def test_a_condition_that_is_neither_true_nor_false_is_refused():
+    with pytest.raises(InvalidConditionExpressionError, match='expected one of .* got \'maybe\''):
+        evaluate_condition_expression(LaunchContext(), [TextSubstitution(text='maybe')])
+
+
+def test_a_scoped_group_leaves_configurations_and_environment_as_they_were(monkeypatch):
+    monkeypatch.setenv('FOG_TEST', 'outer')
+    notes = []
+    everything = note(notes, lambda context: (
+        context.launch_configurations.get('a'), context.launch_configurations.get('b'),
+        context.environment.get('FOG_TEST')))
+
+    def inner(**kwargs):
+        return GroupAction([
+            everything, SetLaunchConfiguration('a', 'inner'),
+            SetEnvironmentVariable('FOG_TEST', 'inner')],
+            launch_configurations={'b': LaunchConfiguration('a', default='none')}, **kwargs)
+
+    assert run(
+        SetLaunchConfiguration('a', 'outer'), inner(), everything,
+        inner(forwarding=False), everything, inner(scoped=False), everything) == 0
+    assert notes == [
+        ('outer', 'outer', 'outer'), ('outer', None, 'outer'),
+        (None, 'outer', 'outer'), ('outer', None, 'outer'),
+        ('outer', 'outer', 'outer'), ('inner', 'outer', 'inner')]
+
+
+def test_environment_and_configuration_actions(monkeypatch):
+    monkeypatch.setenv('FOG_PATH', 'b')
+    monkeypatch.setenv('FOG_GONE', 'x')
+    monkeypatch.delenv('FOG_NEW', raising=False)
+    notes = []
+    state = note(notes, lambda context: [
+        context.environment.get(name) for name in ('FOG_PATH', 'FOG_GONE', 'FOG_NEW')])
+    assert run(
+        PushEnvironment(), AppendEnvironmentVariable('FOG_PATH', 'c'),
+        AppendEnvironmentVariable('FOG_PATH', 'a', prepend=True, separator='-'),
+        AppendEnvironmentVariable('FOG_NEW', 'n'), UnsetEnvironmentVariable('FOG_GONE'),
+        state, PopEnvironment(), state,
+        SetLaunchConfiguration('a', '1'), PushLaunchConfigurations(),
+        UnsetLaunchConfiguration('a'), UnsetLaunchConfiguration('never'),
+        note(notes, configuration('a')), PopLaunchConfigurations(),
+        ResetLaunchConfigurations({'b': LaunchConfiguration('a')}),
+        note(notes, lambda context: dict(context.launch_configurations))) == 0
+    assert notes == [['a-b:c', None, 'n'], ['b', 'x', None], None, {'b': '1'}]
+
+
+def test_arguments(capsys):
+    notes = []
+    assert run(
+        SetLaunchConfiguration('given', 'g'),
+        DeclareLaunchArgument('given', default_value='d'),
+        DeclareLaunchArgument('default', default_value=['d', LaunchConfiguration('given')]),
+        note(notes, lambda context: dict(context.launch_configurations))) == 0
+    assert notes == [{'given': 'g', 'default': 'dg'}]
+    assert run(DeclareLaunchArgument('needed', description='what for')) == 1
+    assert run(SetLaunchConfiguration('one', 'c'),
+               DeclareLaunchArgument('one', choices=['a', 'b'])) == 1
+    out = capsys.readouterr().out
+    assert 'Required launch argument "needed" (description: "what for") was not provided' in out
+    assert ('Argument "one" provided value "c" is not valid. '
+            "Valid options are: ['a', 'b']") in out
+    with pytest.raises(RuntimeError, match='is not in provided choices'):
+        DeclareLaunchArgument('one', choices=['a', 'b'], default_value='c')
+    assert DeclareLaunchArgument('one', choices=['a']).description == "One of: ['a']"
+
+
+def test_an_exception_is_logged_in_one_line_and_shuts_down_with_status_1(capsys):
+    def fail(context):
+        raise ValueError('no good')
+
+    notes = []
+    assert run(
+        RegisterEventHandler(OnShutdown(on_shutdown=lambda event, context: notes.append(
+            event.reason))),
+        OpaqueFunction(function=fail), note(notes, 'never')) == 1
+    text = 'Caught exception in launch (see debug for traceback): no good'
+    assert f'[ERROR] [launch]: {text}' in capsys.readouterr().out.splitlines()
+    assert notes == [text]
+
+
+def test_handlers_get_events_newest_first_and_handle_once_goes():
+    notes = []
+
+    def handler(what, **kwargs):
+        return launch.EventHandler(
+            matcher=event_named(Asked.name), entities=[note(notes, what)], **kwargs)
+
+    gone = handler('gone')
+    assert run(
+        RegisterEventHandler(handler('first')), RegisterEventHandler(gone),
+        UnregisterEventHandler(gone), RegisterEventHandler(handler('once', handle_once=True)),
+        EmitEvent(event=Asked()), EmitEvent(event=Asked())) == 0
+    assert notes == ['once', 'first', 'first']
+
+
+def test_locals_last_as_long_as_an_event():
+    notes = []
+
+    def look(context):
+        notes.append((type(context.locals.event).__name__, hasattr(context.locals, 'mine')))
+        context.extend_locals({'mine': 1})
+        context.extend_globals({'ours': context.get_locals_as_dict().get('ours', 0) + 1})
+        notes.append((context.locals.mine, context.locals.ours))
+
+    assert run(
+        RegisterEventHandler(launch.EventHandler(
+            matcher=event_named(Asked.name), entities=OpaqueFunction(function=look))),
+        EmitEvent(event=Asked()), EmitEvent(event=Asked())) == 0
+    assert notes == [('Asked', False), (1, 1), ('Asked', False), (1, 2)]
+    with pytest.raises(AttributeError, match="does not contain attribute 'nothing'"):
+        LaunchContext().locals.nothing
+
+
+def test_execution_complete_comes_when_the_future_is_done():
+    notes = []
+    timer = TimerAction(period=0.05, actions=[note(notes, 'timer')])
+    assert run(
+        RegisterEventHandler(OnExecutionComplete(
+            target_action=timer, on_completion=[note(notes, 'complete')])),
+        timer, note(notes, 'after')) == 0
+    assert notes[0] == 'after' and sorted(notes[1:]) == ['complete', 'timer']
+
+
+def test_timers_and_shutdown():
+    notes = []
+    assert run(
+        TimerAction(period=60.0, actions=[note(notes, 'never')]),
+        TimerAction(period=TextSubstitution(text='0.05'), actions=[
+            note(notes, 'first'), Shutdown(reason='enough')]),
+        RegisterEventHandler(OnShutdown(on_shutdown=[note(
+            notes, lambda context: context.locals.event.reason)]))) == 0
+    assert notes == ['first', 'enough']
+    cancelled = TimerAction(period=60.0, actions=[])
+    assert run(cancelled, OpaqueFunction(function=lambda context: cancelled.cancel())) == 0
+    with pytest.raises(TypeError, match="'TimerAction' expected 'actions'"):
+        TimerAction(period=1.0, actions=None)
+
+
+def test_coroutines_keep_the_launch_alive_and_their_exceptions_end_it(capsys):
+    notes = []
+
+    async def work(context, what, more=None):
+        await asyncio.sleep(0.05)
+        notes.append((type(context).__name__, what, more))
+        if what == 'fail':
+            raise RuntimeError('failed inside')
+
+    assert run(OpaqueCoroutine(coroutine=work, args=['ok'], kwargs={'more': 1})) == 0
+    assert notes == [('LaunchContext', 'ok', 1)]
+    assert run(OpaqueCoroutine(coroutine=work, args=['fail'])) == 1
+    assert 'Caught exception in launch (see debug for traceback): failed inside' in (
+        capsys.readouterr().out)
+    with pytest.raises(TypeError, match='expected a coroutine function'):
+        OpaqueCoroutine(coroutine=lambda: None)
+
+
+def test_the_launch_waits_for_completion_futures():
+    notes = []
+
+    def start(context):
+        future = context.asyncio_loop.run_in_executor(None, lambda: notes.append('done'))
+        context.add_completion_future(future)
+
+    assert run(OpaqueFunction(function=start)) == 0
+    assert notes == ['done']
+
+
+def test_a_service_runs_again_and_takes_events_from_other_threads():
+    service = LaunchService(noninteractive=True)
+    notes = []
+    assert service.event_loop is None and service.shutdown() is None
+    for number in (1, 2):
+        asked = launch.EventHandler(
+            matcher=event_named(Asked.name), entities=[note(notes, number)], handle_once=True)
+
+        def emit(context):
+            context.add_completion_future(context.asyncio_loop.run_in_executor(
+                None, service.emit_event, Asked()))
+
+        assert run(RegisterEventHandler(asked), OpaqueFunction(function=emit),
+                   service=service) == 0
+    assert notes == [1, 2]
+
+
+def test_run_async_beside_other_coroutines():
+    async def both():
+        service = LaunchService(noninteractive=True)
+        service.include_launch_description(LaunchDescription([LogInfo(msg='in loop')]))
+        task = asyncio.get_running_loop().create_task(
+            service.run_async(shutdown_when_idle=False))
+        while service.task is None:
+            await asyncio.sleep(0.01)
+        assert service.task is task
+        await service.shutdown()
+        return await task
+
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    try:
+        assert loop.run_until_complete(both()) == 0
+    finally:
+        loop.close()
+        asyncio.set_event_loop(asyncio.new_event_loop())
+
+
+PYTHON_FILE = '''
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, SetLaunchConfiguration
+from launch.substitutions import LaunchConfiguration, ThisLaunchFileDir
+def generate_launch_description():
+    return LaunchDescription([
+        DeclareLaunchArgument('word'),
+        SetLaunchConfiguration('said', ['says ', LaunchConfiguration('word')]),
+        SetLaunchConfiguration('dir', ThisLaunchFileDir())])
+'''
+
+
+def test_include(tmp_path, capsys):
+    path = tmp_path / 'inner.launch.py'
+    path.write_text(PYTHON_FILE)
+    notes = []
+    state = note(notes, lambda context: (
+        context.launch_configurations['said'], context.launch_configurations['dir']))
+    for source in (PythonLaunchDescriptionSource(str(path)), AnyLaunchDescriptionSource(
+            [str(tmp_path), '/inner.launch.py']), str(path)):
+        assert run(IncludeLaunchDescription(
+            source, launch_arguments={'word': 'hello'}.items()), state) == 0
+    assert notes == [('says hello', str(tmp_path))] * 3
+    assert run(IncludeLaunchDescription(str(path))) == 1
+    assert ("Included launch description missing required argument 'word' (description: "
+            "'no description given'), given: []") in capsys.readouterr().out
+
+
+def test_this_launch_file(tmp_path):
+    path = tmp_path / 'a.launch.py'
+    path.write_text('import launch\ndef generate_launch_description():\n'
+                    '    return launch.LaunchDescription()\n')
+    context = LaunchContext()
+    with pytest.raises(RuntimeError, match='ThisLaunchFile used outside of a launch file'):
+        ThisLaunchFile().perform(context)
+    IncludeLaunchDescription(str(path)).execute(context)
+    assert ThisLaunchFile().perform(context) == str(path)
+    assert ThisLaunchFileDir().perform(context) == str(tmp_path)
+
+
+@pytest.mark.parametrize('content, expected', [
+    ('def broken(:', r"SyntaxError: .*\(broken.launch.py, line 1\)"),
+    ('x = 1', r"does not contain the required function 'generate_launch_description\(\)'"),
+    ('import nothing_of_the_kind', "ModuleNotFoundError: No module named 'nothing_of_the_kind'"),
+])
+def test_broken_launch_files(tmp_path, content, expected, capsys):
+    path = tmp_path / 'broken.launch.py'
+    path.write_text(content)
+    with pytest.raises(InvalidLaunchFileError, match=expected):
+        AnyLaunchDescriptionSource(str(path)).get_launch_description(LaunchContext())
+    assert run(IncludeLaunchDescription(str(path))) == 1
+    assert 'Caught multiple exceptions when trying to load file of format [py]' in (
+        capsys.readouterr().out)
+
+
+def test_declared_arguments_of_what_is_nested(tmp_path):
+    path = tmp_path / 'inner.launch.py'
+    path.write_text(PYTHON_FILE)
+    description = LaunchDescription([
+        DeclareLaunchArgument('a'), GroupAction([DeclareLaunchArgument('b')]),
+        GroupAction([DeclareLaunchArgument('c')], condition=IfCondition('true')),
+        IncludeLaunchDescription(str(path)),
+        RegisterEventHandler(OnShutdown(on_shutdown=[])), DeclareLaunchArgument('a')])
+    arguments = description.get_launch_arguments()
+    assert [(argument.name, argument._conditionally_included) for argument in arguments] == [
+        ('a', False), ('b', False), ('c', True), ('word', False)]
+
+
+def test_deprecated_description(capsys):
+    description = LaunchDescription(deprecated_reason='old')
+    assert (description.deprecated, description.deprecated_reason) == (True, 'old')
+    assert run(description) == 0
+    assert 'deprecated launch description: old' in capsys.readouterr().out
+
+
+def test_introspection():
+    process = ExecuteProcess(cmd=['ls', LaunchConfiguration('what')], cwd='/')
+    text = LaunchIntrospector().format_launch_description(LaunchDescription([
+        LogInfo(msg=['a', 'b']), process, EmitEvent(event=Asked()),
+        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=[
+            LogInfo(msg='bye')]))]))
+    lines = [line.lstrip('│├└─ ') for line in text.splitlines()]
+    assert lines[1:4] == [
+        "LogInfo('a' + 'b')",
+        "ExecuteProcess(cmd=['ls', LaunchConfig('what')], cwd=''/'', env=None, shell=False)",
+        "EmitEvent(event='test.Asked')"]
+    assert lines[4].startswith("RegisterEventHandler('<launch.event_handlers.")
+    assert lines[5:] == [
+        "OnProcessExit(matcher='event == ProcessExited and ExecuteLocal(event.action)', "
+        "handler='<actions>', handle_once=False)", "LogInfo('bye')"]
+
+
+def test_utilities():
+    context = LaunchContext()
+    subs = launch.utilities.normalize_to_list_of_substitutions(['a', TextSubstitution(text='b')])
+    assert perform_substitutions(context, subs) == 'ab'
+    with pytest.raises(TypeError, match='Failed to normalize given item of type'):
+        launch.utilities.normalize_to_list_of_substitutions(['a', 1])
+    assert launch.utilities.is_a_subclass(Asked, launch.Event)
+    assert launch.utilities.is_a_subclass(Asked(), launch.Event)
+    assert not launch.utilities.is_a(Asked, launch.Event)
+    log = LogInfo(msg='')
+    assert launch.utilities.normalize_to_list_of_entities([log, [log, log]]) == [log] * 3
+    with pytest.raises(TypeError, match="'me' expected 'x' to be one of .* but got '1'"):
+        launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
+
+
+def test_deep_module_paths():
+    code = textwrap.dedent('''
+        import launch_ros.actions.push_ros_namespace, launch.actions.shutdown_action
+        import launch.conditions.if_condition, launch.event_handlers.on_process_io
+        import launch.events.process.process_started, launch_ros.substitutions.find_package
+        import launch.utilities.class_tools_impl, launch_ros.actions.load_composable_nodes
+        from launch.actions.execute_process import ExecuteProcess
+        from launch.substitutions.launch_configuration import LaunchConfiguration
+        import launch
+        assert ExecuteProcess is launch.actions.ExecuteProcess
+        assert launch.actions.shutdown_action.Shutdown is launch.actions.Shutdown
+        try:
+            import launch.actions.never_heard_of
+        except ModuleNotFoundError:
+            pass
+        assert not hasattr(launch.actions, 'NeverHeardOf')
+    ''')
+    assert os.spawnl(os.P_WAIT, sys.executable, sys.executable, '-c', code) == 0
