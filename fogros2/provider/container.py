@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 import dataclasses
 import datetime
-import difflib
 import json
 import os
 from pathlib import Path
@@ -35,6 +34,7 @@ from fogros2.model import (
 )
 from fogros2.provider import container_engine, container_entry, container_root, Provider
 from fogros2.provider.container_engine import Engine
+from fogros2.provider.options import convert, known
 from fogros2.waiting import wait_until
 
 #: Labels beside the core's tags.
@@ -131,40 +131,12 @@ class Options:
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
         fields = {field.name: field for field in dataclasses.fields(cls)}
-        values: dict[str, Any] = {}
-        for name, value in given.items():
-            if name not in fields:
-                near = difflib.get_close_matches(name, fields, n=1)
-                raise ConfigurationError(
-                    f"a container machine has no option '{name}'",
-                    f"did you mean '{near[0]}'?" if near else
-                    f"there are: {', '.join(fields)}")
-            if value is not None:
-                values[name] = _checked(name, value, fields[name].default)
-        options = cls(**values)
+        options_given = known(given, fields, 'a container machine')
+        options = cls(**{
+            name: convert(name, value, {} if name == 'env' else fields[name].default)
+            for name, value in options_given.items()})
         _check_values(options)
         return options
-
-
-def _checked(name: str, value: Any, default: Any) -> Any:
-    wrong = ConfigurationError(f"option '{name}' of a container machine can't be {value!r}")
-    if isinstance(default, tuple):
-        if isinstance(value, str) or not isinstance(value, Sequence) \
-                or not all(isinstance(item, str) for item in value):
-            raise ConfigurationError(str(wrong), 'it takes a list of strings')
-        return tuple(value)
-    if isinstance(default, float):
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-            raise ConfigurationError(str(wrong), 'it takes a number above 0')
-        return float(value)
-    if isinstance(default, str):
-        if isinstance(value, bool) or not isinstance(value, (str, int)):
-            raise ConfigurationError(str(wrong), 'it takes a string')
-        return str(value)
-    if not isinstance(value, Mapping) or not all(
-            isinstance(k, str) and isinstance(v, str) for k, v in value.items()):
-        raise ConfigurationError(str(wrong), 'it takes names and strings')
-    return dict(value)
 
 
 def _check_values(options: Options) -> None:

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading the options of a machine: what is unknown or of the wrong kind is named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import difflib
+from typing import Any, Union
+
+from fogros2.errors import ConfigurationError
+
+Value = Union[str, float, tuple[str, ...], Mapping[str, str]]
+
+
+def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str, Any]:
+    """
+    Return the options that aren't None.
+
+    :param names: the names that exist.
+    :param what: whose options they are, such as 'a container machine'.
+    :raises ConfigurationError: one has another name; the hint has the nearest.
+    """
+    names = list(names)
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            raise ConfigurationError(
+                f"{what} has no option '{name}'",
+                f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(names)}")
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def convert(name: str, value: Any, default: Value) -> Value:
+    """
+    Return an option's value in the kind of its default.
+
+    :raises ConfigurationError: it is of another kind.
+    """
+    if isinstance(default, tuple):
+        if not isinstance(value, str) and isinstance(value, Sequence) \
+                and all(isinstance(item, str) for item in value):
+            return tuple(value)
+        expected = 'a list of strings'
+    elif isinstance(default, float):
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0:
+            return float(value)
+        expected = 'a number above 0'
+    elif isinstance(default, str):
+        if isinstance(value, (str, int)) and not isinstance(value, bool):
+            return str(value)
+        expected = 'a string'
+    else:
+        if isinstance(value, Mapping) and all(
+                isinstance(word, str) for pair in value.items() for word in pair):
+            return dict(value)
+        expected = 'names and strings'
+    raise ConfigurationError(f"option '{name}' can't be {value!r}", f'it takes {expected}')

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any computer that exists already and runs an SSH server: used, tidied up, never ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+import getpass
+import os
+from pathlib import Path
+import socket
+from typing import Any, ClassVar
+from urllib.parse import parse_qsl, urlencode
+
+from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError, Unsupported
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import Provider
+from fogros2.provider.options import convert, known
+
+_SCHEME = 'ssh:'
+#: Seconds after which a computer that doesn't answer counts as off.
+_PATIENCE = 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """
+    What a launch file says of a computer.
+
+    :param host: name or address.
+    :param user: login user; '' for the name of the user here.
+    :param port: of its SSH server.
+    :param key: private key file; '' for the user's own keys and agent.
+    :param host_key: ``ssh-ed25519 AAAA...``; '' leaves it to ``known_hosts``.
+    """
+
+    host: str = ''
+    user: str = ''
+    port: str = '22'
+    key: str = ''
+    host_key: str = ''
+
+    @classmethod
+    def parse(cls, given: Mapping[str, Any]) -> Options:
+        """
+        Return the options of a spec.
+
+        :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
+        """
+        fields = {field.name: field.default for field in dataclasses.fields(cls)}
+        options = cls(**{
+            name: str(convert(name, value, fields[name]))
+            for name, value in known(given, fields, 'an SSH machine').items()})
+        if not options.host or any(c.isspace() or c in '/@' for c in options.host) \
+                or options.host.startswith('-'):
+            raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",
+                                     'host= takes a name or an address')
+        if not options.port.isdigit() or not 0 < int(options.port) < 65536:
+            raise ConfigurationError(f"'{options.port}' can't be the port of an SSH machine",
+                                     'port= takes a number from 1 to 65535')
+        if options.host_key and len(options.host_key.split()) < 2:
+            raise ConfigurationError(f"'{options.host_key}' is no host key",
+                                     "host_key= takes 'ssh-ed25519 AAAA...'")
+        if options.key and not os.access(Path(options.key).expanduser(), os.R_OK):
+            raise ConfigurationError(f"the key '{options.key}' can't be read", 'check key=')
+        return options
+
+
+class SSHProvider(Provider):
+    """Computers that others set up and look after."""
+
+    name: ClassVar[str] = 'ssh'
+
+    def check(self, spec: MachineSpec) -> None:
+        """Look at the options; nothing is asked over the network."""
+        Options.parse(spec.options)
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Return the id of the computer, which has to answer."""
+        options = Options.parse(spec.options)
+        try:
+            reach(options.host, int(options.port))
+        except socket.gaierror as error:
+            raise ProviderError(f"there is no host called '{options.host}'",
+                                f"check host= of '{spec.name}'") from error
+        except ConnectionRefusedError as error:
+            raise ProviderError(
+                f'{options.host} refuses connections to port {options.port}',
+                'does its SSH server run, and at that port?') from error
+        except OSError as error:
+            raise ProviderError(
+                f'{options.host} port {options.port} does not answer: {error}',
+                'is it on, and reachable from this robot?') from error
+        return _SCHEME + urlencode({
+            'name': spec.name, **dataclasses.asdict(options),
+            'user': options.user or getpass.getuser(),
+            'key': str(Path(options.key).expanduser().absolute()) if options.key else ''})
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the computer, as stopped if its SSH port doesn't answer."""
+        if not machine_id.startswith(_SCHEME):
+            raise MachineNotFound(f"'{machine_id}' is no SSH machine")
+        words = dict(parse_qsl(machine_id[len(_SCHEME):], keep_blank_values=True))
+        try:
+            host, port = words['host'], int(words['port'])
+            shell = Endpoint('ssh', host, port, words['user'], words['host_key'] or None,
+                             words['key'] or None)
+            name = words['name']
+        except (KeyError, ValueError) as error:
+            raise MachineNotFound(f"'{machine_id}' is no SSH machine") from error
+        try:
+            address = reach(host, port)
+        except OSError:
+            return Machine(machine_id, name, self.name, MachineState.STOPPED, owned=False)
+        return Machine(
+            machine_id, name, self.name, MachineState.RUNNING, shell=shell, vpn_host=address,
+            owned=False)
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        """Raise Unsupported: a computer of somebody's keeps no tags of ours."""
+        raise Unsupported('an SSH machine keeps no tags')
+
+    def destroy(self, machine_id: str) -> None:
+        """Do nothing: the computer isn't ours to end."""
+
+
+def reach(host: str, port: int, timeout: float = _PATIENCE) -> str:
+    """
+    Return the address under which a TCP port answers.
+
+    :raises OSError: it doesn't.
+    """
+    with socket.create_connection((host, port), timeout=timeout) as connection:
+        return str(connection.getpeername()[0])
