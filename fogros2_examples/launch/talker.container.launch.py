@@ -9,10 +9,13 @@ from launch_ros.actions import Node
 
 def generate_launch_description():
     """Describe the demo; ``count:=20`` ends it after 20 messages."""
-    machine = ContainerInstance(name=LaunchConfiguration('name'))
+    machine = ContainerInstance(
+        name=LaunchConfiguration('name'), on_exit=LaunchConfiguration('on_exit'))
     return FogROSLaunchDescription([
         DeclareLaunchArgument('name', default_value='talker-machine',
                               description='what the machine is called'),
+        DeclareLaunchArgument('on_exit', default_value='delete',
+                              description='what becomes of it: delete, stop or keep'),
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),
         CloudNode(machine=machine, package='fogros2_examples', executable='talker',

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the agent takes of a machine's memory."""
+
+from __future__ import annotations
+
+import statistics
+
+from figures import Row, write
+from fogros2.deploy import Launch
+from fogros2.model import Command, MachineSpec, NodeSpec
+from fogros2.waiting import wait_until
+
+RUNS = 3
+
+
+def resident() -> float:
+    """Return the resident memory of an agent that runs a node, in MB."""
+    launch = Launch()
+    try:
+        machine = launch.up(MachineSpec('bench-memory', 'container'))
+        machine.start([NodeSpec('a', 'talker-1', 'fogros2_examples', 'talker')])
+        wait_until(
+            lambda: any(n['state'] == 'running' for n in machine.agent.request('status')['nodes']),
+            timeout=30, what='the node')
+        status = machine.shell.run(Command(('sh', '-c', (
+            'for p in /proc/[0-9]*; do tr "\\0" " " <$p/cmdline | grep -q "agent.py serve" && '
+            'grep VmRSS $p/status; done; true')), sudo=True), timeout=30).stdout
+        return max(float(line.split()[1]) for line in status.splitlines()) / 1000
+    finally:
+        launch.down()
+
+
+def main() -> None:
+    """Take the median."""
+    value = statistics.median(resident() for _ in range(RUNS))
+    write('footprint', "The agent's memory", [
+        Row('agent, resident, one node running', value, 'MB', 30.0, runs=RUNS)])
+
+
+if __name__ == '__main__':
+    main()

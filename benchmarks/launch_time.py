@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From ``ros2 launch`` to the first message of a node on a machine, beside the same pair here."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import time
+
+from figures import Row, write
+
+RUNS = 10
+NAME = 'bench-launch'
+
+
+def first_message(*arguments: str) -> float:
+    """Return the seconds from the start of a launch to the first message that is heard."""
+    begin = time.perf_counter()
+    child = subprocess.Popen(
+        ['ros2', 'launch', 'fogros2_examples', *arguments, 'count:=1'],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert child.stdout is not None
+    heard = None
+    said = []
+    for line in child.stdout:
+        said.append(line)
+        if heard is None and 'I heard' in line:
+            heard = time.perf_counter() - begin
+    if child.wait() != 0 or heard is None:
+        raise SystemExit(f'the launch failed:\n{"".join(said)}')
+    return heard
+
+
+def main() -> None:
+    """Take the runs in turn, so that the computer's moods fall on all alike."""
+    here, new, kept = [], [], []
+    container = ('talker.container.launch.py', f'name:={NAME}')
+    try:
+        first_message('talker.container.launch.py', f'name:={NAME}-kept', 'on_exit:=keep')
+        for _ in range(RUNS):
+            here.append(first_message('talker.local.launch.py'))
+            new.append(first_message(*container))
+            kept.append(first_message(
+                'talker.container.launch.py', f'name:={NAME}-kept', 'on_exit:=keep'))
+    finally:
+        subprocess.run(['ros2', 'fog', 'delete', '--yes', f'{NAME}-kept'], check=False)
+    alone = statistics.median(here)
+    write('launch_time', 'From ros2 launch to the first message', [
+        Row('both nodes here', alone, 's', runs=RUNS),
+        Row('talker on a new container', statistics.median(new), 's', runs=RUNS),
+        Row('talker on a kept container', statistics.median(kept), 's', runs=RUNS),
+        Row('new container, more than here', statistics.median(new) - alone, 's', 1.8,
+            published='27 s (local Kubernetes), 85 to 275 s (AWS)', runs=RUNS),
+        Row('kept container, more than here', statistics.median(kept) - alone, 's', 0.9,
+            runs=RUNS),
+    ])
+
+
+if __name__ == '__main__':
+    main()
