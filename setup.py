@@ -41,6 +41,7 @@ setup(
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
+        'bench': ['matplotlib'],
         'test': ['pytest', 'pytest-timeout', 'ruff', 'mypy', 'types-paramiko', 'types-PyYAML'],
     },
     zip_safe=False,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 from figures import Row, seconds, write
+
 from fogros2.deploy import Launch
 from fogros2.model import MachineSpec
 

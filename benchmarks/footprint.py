@@ -6,6 +6,7 @@ from __future__ import annotations
 import statistics
 
 from figures import Row, write
+
 from fogros2.deploy import Launch
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.waiting import wait_until

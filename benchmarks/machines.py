@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long one launch takes to bring up 1, 4 and 16 container machines, each reaching the others."""
+"""How long one launch takes for 1, 4 and 16 container machines, each reaching the others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import statistics
 import time
 
 from figures import Row, write
+
 from fogros2.deploy import Launch
 from fogros2.model import MachineSpec
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DDS round trip between robot and machine, through the VPN and beside it, and within the robot."""
+"""DDS round trip between robot and machine, through the VPN and beside it, and here alone."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 
 from figures import Row, seconds, write
+
 from fogros2.deploy import Launch
 from fogros2.model import Command, MachineSpec
 from fogros2.shell import Shell

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A talker on a machine of its own, a container on this computer; a listener here."""
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 
 def generate_launch_description():

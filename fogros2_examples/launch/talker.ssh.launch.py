@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A talker on a computer that exists already, reached by SSH; a listener here."""
 
-from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
 
 
 def generate_launch_description():

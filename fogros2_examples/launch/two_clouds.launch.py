@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two machines at once: a talker on one, a listener on the other, a second listener here."""
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 from launch_ros.actions import Node
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 
 def generate_launch_description():
