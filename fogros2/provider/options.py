@@ -5,11 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import difflib
-from typing import Any, Union
+from typing import Any
 
 from fogros2.errors import ConfigurationError
-
-Value = Union[str, float, tuple[str, ...], Mapping[str, str]]
 
 
 def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str, Any]:
@@ -30,7 +28,7 @@ def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str
     return {name: value for name, value in given.items() if value is not None}
 
 
-def convert(name: str, value: Any, default: Value) -> Value:
+def convert(name: str, value: Any, default: Any) -> Any:
     """
     Return an option's value in the kind of its default.
 
