@@ -25,7 +25,7 @@ import time
 from typing import Optional
 
 LAUNCH_FILE = ('fogros2_examples', 'talker.container.launch.py')
-HEARD = re.compile(r'I heard: \[(.*?(\d+) from (\S+) \(([0-9a-fA-F.:]+)\))\]')
+HEARD = re.compile(r'I heard: \[.* from (\S+) \(([0-9a-fA-F.:]+)\): \d+\]')
 STEP = re.compile(r'\[fogros2\]: (\S+): (.+?) ([0-9.]+) s(?: \((.*)\))?$')
 COLOUR = re.compile(r'\x1b\[[0-9;]*m')
 
@@ -95,7 +95,7 @@ def launch(words: list[str], name: str, count: int, timeout: float) -> Run:
                 run.steps.append((found[1], found[2], found[3]))
             if found := HEARD.search(plain):
                 run.first = run.first or time.monotonic() - run.begin
-                run.hosts.append((found[3], found[4]))
+                run.hosts.append((found[1], found[2]))
                 if len(run.hosts) == max(1, count // 4):
                     asked = threading.Thread(target=ask, args=(name, run))
                     asked.start()

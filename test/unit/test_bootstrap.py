@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a machine has, what it needs, and the embedded default installed for real."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from fogros2 import bootstrap, host, process, wheels
+from fogros2.errors import PrerequisiteError
+from fogros2.host import HostFacts, Python
+from fogros2.model import Command, MachineSpec
+from fogros2.plan import Underlay
+from fogros2.wheels import Wheels
+
+TOOLS = frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
+PYTHON = Python('/usr/bin/python3', (3, 12), True)
+NOBLE = HostFacts(
+    system='ubuntu', release='24.04', codename='noble', architecture='x86_64', uid=1000,
+    user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True, pythons=(PYTHON,),
+    programs=TOOLS, tun=True, free_bytes=50 << 30)
+ROS = dataclasses.replace(
+    NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
+    programs=TOOLS | {'colcon', 'rosdep'})
+DEBIAN = dataclasses.replace(
+    NOBLE, system='debian', release='13', libc='glibc 2.41',
+    pythons=(Python('/usr/bin/python3', (3, 13), True),))
+WHEELS = Wheels('/cache', 'k1', (3, 12), 'x86_64', 'glibc 2.28',
+                'fogros2-1-py3-none-any.whl', 'pip-25-py3-none-any.whl')
+UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
+    'PATH': '/robot/.venv/bin:/usr/bin', 'AMENT_PREFIX_PATH': '/ws/install/a:/robot/.venv',
+    'ROS_DOMAIN_ID': '7', 'ROS_DISTRO': 'jazzy'})
+
+
+def plan(facts: HostFacts, mode: Any = 'auto', wheel: Wheels = WHEELS,
+         robot: HostFacts = NOBLE) -> bootstrap.Preparation:
+    spec = MachineSpec('m', 'ssh', bootstrap=mode)
+    return bootstrap.plan(spec, facts, robot, UNDER, wheel, None)
+
+
+def scripts(commands: tuple[Command, ...]) -> str:
+    return '\n'.join(command.argv[-1] for command in commands)
+
+
+def test_the_probe_works_here() -> None:
+    result = process.run(host.probe([sys.prefix]), timeout=30)
+    facts = host.parse_facts(result.stdout)
+    assert facts.architecture == os.uname().machine
+    assert facts.uid == os.getuid()
+    assert facts.home == os.environ['HOME']
+    assert facts.python is not None and facts.python.version >= (3, 10)
+    assert facts.free_bytes is not None and facts.free_bytes > 0
+    assert ('rsync' in facts.programs) == (process.which('rsync') is not None)
+    assert sys.prefix in facts.environments
+    assert facts.cloud_launch.endswith('fogros2/cloud_launch.py')
+
+
+def test_the_probe_survives_odd_prefixes(tmp_path: Path) -> None:
+    odd = tmp_path / "a b'c"
+    odd.mkdir()
+    result = process.run(host.probe([str(odd), '/nowhere']), timeout=30)
+    facts = host.parse_facts(result.stdout)
+    assert list(facts.environments) == [str(odd)]
+    assert facts.cloud_launch == ''
+
+
+def test_facts_by_value() -> None:
+    facts = host.parse_facts("""\
+Welcome to Ubuntu, said the login script
+os ubuntu 24.04 noble
+arch aarch64
+user 1000 ubuntu
+home /home/ubuntu
+libc glibc 2.39
+root
+python 3 12 1 /usr/bin/python3
+python 3 10 0 /usr/local/bin/python3.10
+program rsync
+program sudo
+ros jazzy /opt/ros/jazzy
+rmw jazzy rmw_fastrtps_cpp
+rmw jazzy rmw_cyclonedds_cpp
+tun
+disk 1024
+route default
+route 10.0.0.0/24
+installed 0123
+""")
+    assert facts == HostFacts(
+        system='ubuntu', release='24.04', codename='noble', architecture='aarch64', uid=1000,
+        user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,
+        pythons=(PYTHON, Python('/usr/local/bin/python3.10', (3, 10), False)),
+        programs=frozenset({'rsync', 'sudo'}), ros={'jazzy': '/opt/ros/jazzy'},
+        rmw={'jazzy': ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp')}, tun=True,
+        free_bytes=1 << 20, routes=('10.0.0.0/24',), installed=frozenset({'0123'}))
+    assert facts.has_ros
+
+
+def test_facts_of_nothing_are_defaults() -> None:
+    facts = host.parse_facts('')
+    assert facts.python is None and not facts.root and facts.free_bytes is None
+
+
+def test_a_machine_like_the_robot_needs_nothing() -> None:
+    robot = dataclasses.replace(NOBLE, environments={'/robot/.venv': '1-2'})
+    machine = dataclasses.replace(robot, cloud_launch='/robot/.venv/x/cloud_launch.py')
+    spec = MachineSpec('m', 'container')
+    todo = bootstrap.plan_alike(spec, machine, robot, UNDER, None)
+    assert todo is not None
+    assert (todo.mode, todo.tools, todo.commands, todo.note) == ('none', (), (), 'there already')
+    assert todo.install.command == (
+        '/robot/.venv/bin/ros2', 'launch', '/robot/.venv/x/cloud_launch.py')
+    assert todo.install.environment == UNDER.environment
+    other = dataclasses.replace(machine, environments={'/robot/.venv': '9-9'})
+    assert bootstrap.plan_alike(spec, other, robot, UNDER, None) is None
+    bare = dataclasses.replace(machine, environments={})
+    assert bootstrap.plan_alike(spec, bare, robot, UNDER, None) is None
+
+
+def test_auto_takes_ros_where_it_is() -> None:
+    todo = plan(ROS)
+    assert todo.mode == 'none' and todo.send_wheels
+    assert todo.install.kind == 'ros'
+    assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
+    assert todo.install.environment['PYTHONPATH'] == '/home/ubuntu/.local/share/fogros2/k1/site'
+    assert todo.install.environment['ROS_DOMAIN_ID'] == '7'
+    assert 'ROS_DISTRO' not in todo.install.environment
+    again = plan(dataclasses.replace(ROS, installed=frozenset({'k1'})))
+    assert (again.send_wheels, again.commands, again.note) == (False, (), 'there already')
+
+
+def test_auto_takes_the_embedded_default_elsewhere() -> None:
+    todo = plan(NOBLE)
+    assert todo.mode == 'embedded' and todo.send_wheels
+    assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1/wheels'
+    script = scripts(todo.commands)
+    assert '--no-index' in script and '--without-pip' in script
+    venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
+    assert todo.install.command == (
+        f'{venv}/bin/ros2', 'launch',
+        f'{venv}/lib/python3.12/site-packages/fogros2/cloud_launch.py')
+    assert not any(command.sudo for command in todo.commands)
+    again = plan(dataclasses.replace(NOBLE, installed=frozenset({'k1'})))
+    assert (again.mode, again.commands) == ('none', ())
+
+
+@pytest.mark.parametrize('facts', [
+    DEBIAN,
+    dataclasses.replace(NOBLE, architecture='aarch64'),
+    dataclasses.replace(NOBLE, libc='glibc 2.17'),
+    dataclasses.replace(NOBLE, libc='other 0'),
+])
+def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
+    script = scripts(plan(facts).commands)
+    assert '--no-index' not in script
+    assert 'ros2-embedded fogros2' in script
+
+
+def test_apt_installs_ros_on_noble_alone() -> None:
+    todo = plan(NOBLE, 'apt')
+    assert todo.mode == 'apt'
+    source, install, _ = todo.commands
+    assert source.sudo and 'ros-apt-source' in source.argv[-1]
+    for package in ('ros-jazzy-ros-base', 'ros-jazzy-rmw-cyclonedds-cpp',
+                    'python3-colcon-common-extensions', 'python3-rosdep'):
+        assert package in install.argv[-1]
+    assert plan(ROS, 'apt').commands[0].what == 'unpack fogros2'
+    with pytest.raises(PrerequisiteError, match='Ubuntu 24.04 alone'):
+        plan(DEBIAN, 'apt')
+    with pytest.raises(PrerequisiteError, match='takes root'):
+        plan(dataclasses.replace(NOBLE, root=False), 'apt')
+    with pytest.raises(PrerequisiteError, match='are free'):
+        plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'apt')
+
+
+def test_auto_installs_ros_where_the_embedded_default_is_not_enough() -> None:
+    assert plan(NOBLE, wheel=dataclasses.replace(WHEELS, embedded=False)).mode == 'apt'
+    with pytest.raises(PrerequisiteError, match='embedded default to send.*Ubuntu 24.04'):
+        plan(DEBIAN, wheel=dataclasses.replace(WHEELS, embedded=False))
+
+
+def test_none_installs_nothing() -> None:
+    with pytest.raises(PrerequisiteError, match="bootstrap='auto'"):
+        plan(NOBLE, 'none')
+    assert plan(ROS, 'none').install.kind == 'ros'
+    with pytest.raises(PrerequisiteError, match='lacks rsync'):
+        plan(dataclasses.replace(ROS, programs=TOOLS - {'rsync'}), 'none')
+
+
+def test_missing_programs_are_installed_first_or_named() -> None:
+    bare = dataclasses.replace(NOBLE, programs=frozenset({'apt-get', 'ip'}))
+    tools = plan(bare).tools
+    assert len(tools) == 1 and tools[0].sudo
+    for package in ('rsync', 'wireguard-tools', 'wireguard-go'):
+        assert package in tools[0].argv[-1]
+    assert 'iproute2' not in tools[0].argv[-1]
+    with pytest.raises(PrerequisiteError, match=r'lacks rsync, wireguard-tools \(on the machine'):
+        plan(dataclasses.replace(bare, root=False))
+    kernel = dataclasses.replace(
+        NOBLE, kernel_wireguard=True, programs=TOOLS - {'wireguard-go'})
+    assert plan(kernel).tools == ()
+
+
+def test_a_machine_without_a_python_is_refused() -> None:
+    old = (Python('/usr/bin/python3', (3, 8), True),)
+    for pythons in ((), old):
+        with pytest.raises(PrerequisiteError, match='Python 3.10'):
+            plan(dataclasses.replace(NOBLE, pythons=pythons))
+
+
+def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -> None:
+    write = tmp_path / 'install/a/share/ament_index/resource_index/packages'
+    write.mkdir(parents=True)
+    (write / 'a').touch()
+    space = bootstrap.workspaces.inspect(tmp_path)
+    under = dataclasses.replace(
+        UNDER, environment={'AMENT_PREFIX_PATH': f'{tmp_path}/install/a:/robot/.venv',
+                            'PATH': '/robot/.venv/bin:/usr/bin'})
+    todo = bootstrap.plan(
+        MachineSpec('m', 'ssh', workspace=str(tmp_path)), NOBLE, NOBLE, under, WHEELS, space)
+    venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
+    assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{tmp_path}/install/a:{venv}'
+    assert todo.install.environment['PATH'].startswith(f'{venv}/bin:')
+    assert '/robot' not in ''.join(todo.install.environment.values())
+    assert todo.install.workspace is not None and todo.install.workspace.commands == ()
+
+
+@pytest.fixture(scope='module')
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
+    folder = tmp_path_factory.mktemp('wheels')
+    first = wheels.collect(folder)
+    # the second time everything is there
+    assert wheels.collect(folder) == first
+    return first
+
+
+def test_wheels_hold_this_installation(packed: Wheels) -> None:
+    assert packed.python == sys.version_info[:2]
+    names = os.listdir(packed.folder)
+    assert packed.fogros2 in names and packed.pip in names
+    assert not [name for name in names if name.startswith(('paramiko', 'pytest', 'mypy'))]
+    if packed.embedded:
+        assert [name for name in names if name.startswith('cyclonedds')]
+
+
+def test_the_embedded_default_is_installed_without_a_network(
+    packed: Wheels, tmp_path: Path,
+) -> None:
+    if not packed.embedded:
+        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
+    facts = dataclasses.replace(
+        host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(tmp_path),
+        pythons=(Python(sys.executable, sys.version_info[:2], True),),
+        programs=TOOLS)
+    spec = MachineSpec('m', 'ssh', bootstrap='embedded')
+    todo = bootstrap.plan(spec, facts, facts, UNDER, packed, None)
+    assert todo.mode == 'embedded'
+    target = Path(todo.wheels_target)
+    target.mkdir(parents=True)
+    subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)
+    offline = ['unshare', '-n'] if os.geteuid() == 0 else []
+    environment = {'PATH': '/usr/bin:/bin', 'HOME': str(tmp_path),
+                   'PIP_INDEX_URL': 'http://127.0.0.1:9/'}
+    for command in todo.commands:
+        subprocess.run([*offline, *command.argv], check=True, env=environment)
+    python = f'{tmp_path}/.local/share/fogros2/{packed.key}/venv/bin/python'
+    said = subprocess.run(
+        [python, '-c', 'import fogros2, rclpy, launch, std_msgs.msg; print(fogros2.__file__)'],
+        check=True, capture_output=True, text=True, env=environment, cwd=tmp_path).stdout
+    assert str(tmp_path) in said
+    assert Path(todo.install.command[-1]).is_file()
+    ros2 = Path(todo.install.command[0])
+    assert subprocess.run([ros2, 'fog', '-h'], check=True, capture_output=True, text=True,
+                          env=environment).stdout
+    # the next launch sees it and has nothing to do
+    facts = dataclasses.replace(facts, installed=frozenset({packed.key}))
+    assert bootstrap.plan(spec, facts, facts, UNDER, packed, None).commands == ()
+
+
+def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path: Path) -> None:
+    facts = dataclasses.replace(ROS, home=str(tmp_path))
+    todo = bootstrap.plan(MachineSpec('m', 'ssh'), facts, facts, UNDER, packed, None)
+    target = Path(todo.wheels_target)
+    target.mkdir(parents=True)
+    subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)
+    for command in todo.commands:
+        process.run(command, timeout=60)
+    assert Path(todo.install.command[-1]).is_file()
+    prefix = Path(todo.install.environment['AMENT_PREFIX_PATH'])
+    assert (prefix / 'share/ament_index/resource_index/packages/fogros2_examples').exists()
+    assert os.access(prefix / 'lib/fogros2_examples/talker', os.X_OK)

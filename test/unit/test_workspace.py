@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Workspaces: what is found in them, what travels, what is built."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+
+import pytest
+
+from fogros2 import workspace
+from fogros2.errors import WorkspaceError
+from fogros2.host import HostFacts, Python
+
+PYTHON = Python('/usr/bin/python3', (3, 12), True)
+ROBOT = HostFacts(system='ubuntu', release='24.04', architecture='x86_64', pythons=(PYTHON,),
+                  ros={'jazzy': '/opt/ros/jazzy'})
+SETUP = ('/opt/ros/jazzy/setup.sh',)
+
+
+def write(path: Path, text: str = '', mode: int = 0o644) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def package(folder: Path, name: str, build_type: str = 'ament_python') -> Path:
+    write(folder / 'package.xml',
+          f'<package><name>{name}</name><export><build_type>{build_type}</build_type></export>'
+          '</package>')
+    return folder
+
+
+def install(root: Path, name: str, *, merged: bool = False) -> Path:
+    prefix = root / 'install' if merged else root / 'install' / name
+    write(prefix / 'share/ament_index/resource_index/packages' / name)
+    package(prefix / 'share' / name, name)
+    write(prefix / 'lib' / name / 'node', '#!/usr/bin/python3\n', 0o755)
+    write(prefix / 'lib/python3.12/site-packages' / name / '__init__.py')
+    write(root / 'install/local_setup.sh')
+    return prefix
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    folder = tmp_path / 'ws'
+    package(folder / 'src/alpha', 'alpha')
+    package(folder / 'src/group/beta', 'beta', 'ament_cmake')
+    install(folder, 'alpha')
+    write(folder / 'log/latest/events.log')
+    write(folder / 'build/alpha/build.txt')
+    write(folder / '.git/config')
+    return folder
+
+
+def plan(space: workspace.Workspace, machine: HostFacts = ROBOT,
+         can_build: bool = True) -> workspace.WorkspacePlan:
+    return workspace.plan(space, machine, ROBOT, ros_setup=SETUP, can_build=can_build, name='m')
+
+
+def test_finds_packages_of_source_and_install_space(root: Path) -> None:
+    space = workspace.inspect(root)
+    assert dict(space.installed) == {'alpha': root / 'install/alpha'}
+    assert dict(space.sources) == {'alpha': root / 'src/alpha', 'beta': root / 'src/group/beta'}
+    assert space.packages['beta'] == root / 'src/group/beta'
+    assert space.packages['alpha'] == root / 'install/alpha'
+    assert space.python_only
+    assert space.python == 'python3.12'
+    assert space.executable('alpha', 'node') == root / 'install/alpha/lib/alpha/node'
+    assert space.executable('alpha', 'other') is None
+    assert space.executable('beta', 'node') is None
+
+
+def test_merged_install_space(tmp_path: Path) -> None:
+    install(tmp_path, 'alpha', merged=True)
+    install(tmp_path, 'gamma', merged=True)
+    space = workspace.inspect(tmp_path)
+    assert dict(space.installed) == {
+        'alpha': tmp_path / 'install', 'gamma': tmp_path / 'install'}
+
+
+def test_packages_below_a_package_or_an_ignore_marker_are_none(tmp_path: Path) -> None:
+    package(tmp_path / 'src/outer', 'outer')
+    package(tmp_path / 'src/outer/inner', 'inner')
+    package(tmp_path / 'src/off', 'off')
+    write(tmp_path / 'src/off/COLCON_IGNORE')
+    assert list(workspace.inspect(tmp_path).sources) == ['outer']
+
+
+def test_what_is_no_workspace_is_refused_with_a_hint(tmp_path: Path, root: Path) -> None:
+    with pytest.raises(WorkspaceError, match='is no folder'):
+        workspace.inspect(tmp_path / 'nowhere')
+    empty = tmp_path / 'empty'
+    empty.mkdir()
+    with pytest.raises(WorkspaceError, match='no colcon workspace.*install/'):
+        workspace.inspect(empty)
+    for folder in (root / 'log', root / 'build'):
+        with pytest.raises(WorkspaceError, match=f'did you mean {root}'):
+            workspace.inspect(folder)
+
+
+def test_a_broken_manifest_is_named(tmp_path: Path) -> None:
+    write(tmp_path / 'src/x/package.xml', '<package><name>x')
+    with pytest.raises(WorkspaceError, match='src/x/package.xml is no package manifest'):
+        workspace.inspect(tmp_path)
+
+
+def test_an_install_space_travels_as_it_is_between_computers_alike(root: Path) -> None:
+    way = plan(workspace.inspect(root))
+    assert (way.source, way.target, way.commands, way.reason) == (root, str(root), (), '')
+    assert way.includes == ()
+    assert '/log' in way.excludes and '.git' in way.excludes
+
+
+def test_python_alone_travels_to_another_system_of_the_same_python(root: Path) -> None:
+    machine = HostFacts(system='debian', release='13', architecture='aarch64', pythons=(PYTHON,))
+    assert plan(workspace.inspect(root), machine).commands == ()
+
+
+def test_another_python_builds_there(root: Path) -> None:
+    machine = HostFacts(system='debian', release='12', architecture='x86_64',
+                        pythons=(Python('/usr/bin/python3', (3, 11), True),))
+    way = plan(workspace.inspect(root), machine)
+    assert 'python3.12' in way.reason
+    assert '/install' in way.excludes and '/build' in way.excludes
+    rosdep, colcon = way.commands
+    assert 'rosdep install' in rosdep.argv[-1] and '--from-paths src' in rosdep.argv[-1]
+    assert colcon.argv[-1].startswith('. /opt/ros/jazzy/setup.sh\n')
+    assert 'colcon build' in colcon.argv[-1]
+    assert way.setup == f'{root}/install/local_setup.sh'
+
+
+def test_compiled_code_is_built_for_another_processor_or_system(root: Path) -> None:
+    write(root / 'install/beta/lib/libbeta.so')
+    write(root / 'install/beta/share/ament_index/resource_index/packages/beta')
+    space = workspace.inspect(root)
+    assert not space.python_only
+    assert plan(space).commands == ()
+    arm = HostFacts(system='ubuntu', release='24.04', architecture='aarch64', pythons=(PYTHON,),
+                    ros={'jazzy': '/opt/ros/jazzy'})
+    assert 'aarch64' in plan(space, arm).reason
+    with pytest.raises(WorkspaceError, match='has no colcon.*run colcon build here'):
+        plan(space, arm, can_build=False)
+
+
+def test_sources_alone_are_built_there(root: Path) -> None:
+    subprocess.run(['rm', '-r', root / 'install'], check=True)
+    space = workspace.inspect(root)
+    assert not space.python_only  # beta is ament_cmake
+    assert plan(space).reason == 'it is not built'
+
+
+def test_an_install_space_that_fits_nowhere_and_has_no_sources(root: Path) -> None:
+    subprocess.run(['rm', '-r', root / 'src'], check=True)
+    machine = HostFacts(pythons=(Python('/usr/bin/python3', (3, 11), True),))
+    with pytest.raises(WorkspaceError, match='no src/ to build'):
+        plan(workspace.inspect(root), machine)
+
+
+def test_symlink_install_brings_what_its_links_reach(root: Path) -> None:
+    site = root / 'install/alpha/lib/python3.12/site-packages'
+    write(root / 'src/alpha/alpha/__init__.py')
+    write(root / 'src/alpha/alpha/node.py', 'print()')
+    write(root / 'src/alpha/launch/a.launch.py')
+    write(root / 'src/alpha/secret/big.bin')
+    (root / 'build/alpha/alpha').symlink_to(root / 'src/alpha/alpha')
+    write(site / 'alpha.egg-link', f'{root}/build/alpha\n.')
+    share = root / 'install/alpha/share/alpha/launch'
+    share.mkdir()
+    (share / 'a.launch.py').symlink_to(root / 'src/alpha/launch/a.launch.py')
+    space = workspace.inspect(root)
+    assert set(space.links) == {
+        root / 'build/alpha', root / 'src/alpha/alpha', root / 'src/alpha/launch/a.launch.py'}
+    target = root.parent / 'there'
+    way = plan(space)
+    subprocess.run(
+        ['rsync', '-a', *(f'--include={p}' for p in way.includes),
+         *(f'--exclude={p}' for p in way.excludes), f'{root}/', f'{target}/'], check=True)
+    sent = {str(p.relative_to(target)) for p in target.rglob('*') if not p.is_dir()}
+    assert 'build/alpha/build.txt' in sent and 'src/alpha/alpha/node.py' in sent
+    assert 'src/alpha/launch/a.launch.py' in sent
+    assert os.path.islink(target / 'install/alpha/share/alpha/launch/a.launch.py')
+    assert not [path for path in sent if 'secret' in path or path.startswith(('log', '.git'))]
+    assert 'src/group/beta/package.xml' not in sent
+
+
+def test_a_link_that_leaves_the_workspace_is_refused(root: Path, tmp_path: Path) -> None:
+    outside = write(tmp_path / 'elsewhere/config.yaml')
+    (root / 'install/alpha/share/alpha/config.yaml').symlink_to(outside)
+    with pytest.raises(WorkspaceError, match=f'link to {outside}'):
+        plan(workspace.inspect(root))
+
+
+def test_links_into_ros_itself_may_stay(root: Path) -> None:
+    (root / 'install/alpha/share/alpha/x').symlink_to('/opt/ros/jazzy/share/x')
+    assert workspace.inspect(root).outside == ()
