@@ -30,8 +30,8 @@ it: the VPN's, and the one that ends the machine.
 ``release``    stop the nodes, disarm the heartbeat, reply when done; ``exit`` true: leave then
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
-``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``launch_exited``,
-``vpn_repaired``, ``end_failed``.
+``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
+and ``launch_exited`` where the nodes' launch process ended without having been told to.
 """
 
 from __future__ import annotations
@@ -89,6 +89,12 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'ros_command': ((list,), []),
     'log_bytes': ((int,), LOG_BYTES),
 }
+
+
+#: Settings that an agent which starts anew takes from the one before it.
+RESUMED = (
+    'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
+    'ros_command')
 
 
 class Refused(Exception):
@@ -490,6 +496,7 @@ class Agent:
                 raise Refused(
                     f'another agent (process {other}) serves {self.directory}',
                     'connect to it', 'running') from None
+            self._resume()
             self.log = Log(self.directory, self.config['log_bytes'])
             self.listener = self._listen()
         except OSError as error:
@@ -524,6 +531,18 @@ class Agent:
         """Return the path of a file in the agent's directory."""
         return os.path.join(self.directory, name)
 
+    def _resume(self) -> None:
+        """Take over what a launch had configured an agent that died here."""
+        try:
+            with open(self.path('config.json')) as stream:
+                saved = checked(json.load(stream))
+        except (AttributeError, OSError, Refused, ValueError):
+            return
+        if saved.get('machine') == self.config['machine']:
+            # the user could have written it: nothing that root would do
+            self.config.update({key: saved[key] for key in RESUMED if key in saved})
+            self.watchdog.configured(self.clock(), heartbeat=bool(self.config['heartbeat']))
+
     def save(self) -> None:
         """Keep the pid for people and the configuration for an agent that starts anew."""
         try:
@@ -557,6 +576,9 @@ class Agent:
         except Refused as error:
             say(str(error))
         self.every(10.0, self._trim_launch_log)
+        if self.log.next > 1:
+            # nodes of an agent that died here ended with it, and nobody could say so
+            self.emit('launch_exited', returncode=-int(signal.SIGKILL))
         while not self.done:
             now = self.clock()
             if not self.ending:
@@ -1165,10 +1187,11 @@ class Agent:
                 node.update(state='exited', pid=None, returncode=-number)
                 lines.append(dump({'event': 'exited', 'node': node['id'], 'name': node['name'],
                                    'returncode': -number, 'respawns': False})[1:])
-            lines.append(dump({'event': 'launch_exited', 'returncode': status})[1:])
-            self.write(lines)
             if not expected:
                 say(f'the launch process ended with status {status}')
+                lines.append(dump({'event': 'launch_exited', 'returncode': status})[1:])
+            if lines:
+                self.write(lines)
             self._remove_files()
             self._stopped()
         self.sweep(swept, quickly=self.ending)

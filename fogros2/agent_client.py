@@ -22,6 +22,11 @@ from fogros2.waiting import wait_until
 HEARTBEAT_INTERVAL = 2.0
 #: Seconds after which a connection that says nothing is given up.
 SILENCE = 20.0
+#: Seconds after which an agent that has gone won't come back.
+RESTART = 5.0
+
+#: A request for which nobody waits; its reply shows that the agent is there.
+_PING = b'{"id":0,"command":"ping"}\n'
 
 EventCallback = Callable[[dict[str, Any]], None]
 
@@ -61,6 +66,7 @@ class AgentClient:
     :param cancel: once set, requests end with Cancelled and no new connection is tried.
     :param silence: seconds without a byte, though asked for one, after which a connection counts
         as lost: a robot that changed networks would learn of that from TCP in a quarter hour.
+    :param restart: seconds that an agent which was there may take to be there again.
     """
 
     def __init__(
@@ -72,6 +78,7 @@ class AgentClient:
         python: str = 'python3',
         cancel: Optional[threading.Event] = None,
         silence: float = SILENCE,
+        restart: float = RESTART,
     ) -> None:
         self._shell = shell
         self._command = Command(
@@ -89,6 +96,9 @@ class AgentClient:
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
         self._error: Optional[AgentError] = None
+        self._restart = restart
+        self._ever = self._lost = False
+        self._absent: Optional[str] = None
         self._next: Optional[int] = None
         self._log_request = 0
         self._thread: Optional[threading.Thread] = None
@@ -193,16 +203,22 @@ class AgentClient:
 
     def _read_all(self) -> None:
         error: FogError
+        pause, quiet_since = 0.0, time.monotonic()
         try:
             while not self._closed.is_set():
-                self._read_stream()
-                if self._error is not None or self._closed.is_set():
+                if self._read_stream():
+                    pause, quiet_since = 0.0, time.monotonic()
+                elif self._hopeless(time.monotonic() - quiet_since):
                     break
-                self._tell({'event': 'connection', 'state': 'lost'})
+                if self._ever and not self._lost and not self._closed.is_set():
+                    self._lost = True
+                    self._tell({'event': 'connection', 'state': 'lost'})
+                if self._closed.wait(pause):
+                    break
+                pause = min(2 * pause + 0.1, 5.0)
                 self._reopen()
                 if self._stream is None:
                     break
-                self._tell({'event': 'connection', 'state': 'back'})
         finally:
             error = self._error or AgentError('the connection to the agent was closed')
             with self._lock:
@@ -214,9 +230,22 @@ class AgentClient:
         if self._error is not None and not self._closed.is_set():
             self._tell({'event': 'connection', 'state': 'absent', 'error': str(self._error)})
 
-    def _read_stream(self) -> None:
+    def _hopeless(self, seconds: float) -> bool:
+        """Tell whether to give up on an agent that hasn't said a word for so long."""
+        if self._absent is not None and (not self._ever or seconds > self._restart):
+            self._error = AgentError(self._absent, 'its machine may have ended')
+        elif not self._ever and seconds > self._restart:
+            self._error = AgentError(
+                'the program that should reach the agent ends without a word',
+                'is python3 on the machine, and agent.py with it?')
+        return self._error is not None
+
+    def _read_stream(self) -> bool:
+        """Take what comes until the stream ends; returns whether an agent was there."""
         stream = self._stream
         assert stream is not None
+        self._absent = None
+        spoke = False
         for line in iter(stream.readline, b''):
             self._heard = time.monotonic()
             try:
@@ -225,15 +254,21 @@ class AgentClient:
                 continue  # what a login script there says
             if not isinstance(message, dict):
                 continue
-            if 'event' in message:
-                self._deliver(message)
-            elif 'ok' in message:
-                self._answer(message)
-            elif message.get('kind') == 'absent':
-                self._error = AgentError(str(message.get('error')), 'its machine may have ended')
+            if message.get('kind') == 'absent' and 'ok' not in message:
+                self._absent = str(message.get('error'))
+            elif 'event' in message or 'ok' in message:
+                self._ever = spoke = True
+                if self._lost:
+                    self._lost = False
+                    self._tell({'event': 'connection', 'state': 'back'})
+                if 'event' in message:
+                    self._deliver(message)
+                else:
+                    self._answer(message)
         with self._lock:
             self._stream = None
         stream.close()
+        return spoke
 
     def _answer(self, reply: dict[str, Any]) -> None:
         number = reply.get('id')
@@ -289,7 +324,7 @@ class AgentClient:
             elif self._writing.acquire(timeout=self._silence / 4):
                 # whoever holds it for longer is stuck in a dead link himself
                 self._writing.release()
-                self._send(stream, to_json({'id': 0, 'command': 'ping'}).encode() + b'\n')
+                self._send(stream, _PING)
 
     def _reopen(self) -> None:
         """Connect again, with growing pauses, for as long as anybody wants it."""
@@ -331,7 +366,7 @@ class AgentClient:
                     pending.done.set()
         if self._next is not None:
             self._follow_on(stream)
-        for line in again:
+        for line in (_PING, *again):
             self._send(stream, line)
 
 

@@ -169,8 +169,10 @@ def test_an_agent_with_a_new_log_is_heard_from_its_beginning(make):
     first.say({'event': 'x', 'seq': 59})
     until(lambda: seen)
     first.say(None)
-    until(lambda: len(second.asked) == 2)
-    assert [a['from'] for a in second.asked] == [60, 1]
+    def logs() -> list[Any]:
+        return [request['from'] for request in second.asked if request['command'] == 'log']
+    until(lambda: len(logs()) == 2)
+    assert logs() == [60, 1]
     second.say({'event': 'y', 'seq': 1})
     until(lambda: seen[-1]['event'] == 'y')
 
@@ -211,6 +213,48 @@ def test_a_machine_without_an_agent_is_not_tried_for_ever(make):
         client.request('status')
     with pytest.raises(AgentError, match='no agent serves /run/x'):
         client.request('status')
+
+
+def test_an_agent_that_is_being_restarted_is_waited_for(make):
+    def absent() -> ScriptedStream:
+        stream = ScriptedStream(lambda request: [])
+        stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
+        stream.say(None)
+        return stream
+    first = agent()
+    client = make(first, absent(), absent(), agent())
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    client.request('status')
+    first.say(None)
+    until(lambda: len(seen) == 2)
+    assert [e['state'] for e in seen] == ['lost', 'back']
+
+
+def test_an_agent_that_has_gone_is_given_up(make):
+    first = agent()
+    streams = [ScriptedStream(lambda request: []) for _ in range(50)]
+    for stream in streams:
+        stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
+        stream.say(None)
+    client = make(first, *streams, restart=0.3)
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    client.request('status')
+    first.say(None)
+    until(lambda: len(seen) == 2)
+    assert [e['state'] for e in seen] == ['lost', 'absent']
+
+
+def test_a_program_that_ends_without_a_word_is_given_up(make):
+    streams = [ScriptedStream(lambda request: []) for _ in range(50)]
+    for stream in streams:
+        stream.say(b'python3: can not open file\n')
+        stream.say(None)
+    client = make(*streams, restart=0.3)
+    with pytest.raises(AgentError, match='without a word'):
+        client.request('status')
+    assert len(client._shell.opened) < 6
 
 
 def test_a_machine_that_no_longer_takes_our_key_is_not_tried_for_ever(make):
@@ -267,12 +311,13 @@ def test_a_subscriber_that_asks_is_stopped_before_it_hangs(make):
 
 
 def test_a_connection_that_falls_silent_is_given_up(make):
-    mute = ScriptedStream(lambda request: [])
+    mute = ScriptedStream(lambda request: [
+        {'id': request['id'], 'ok': True, 'next': 1}] if request['command'] == 'log' else [])
     second = agent()
     client = make(mute, second, silence=0.2)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
-    until(lambda: second.asked)
+    until(lambda: len(seen) == 2)
     assert 'ping' in [request['command'] for request in mute.asked]
     assert [e['state'] for e in seen] == ['lost', 'back']
     # one that answers is kept
