@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence, Set
 from functools import lru_cache
 import math
 import os
+import re
 from typing import Any
 
 from rosidl_embedded.definition import Definition, definition, Field, FLOATS, INTEGERS, TYPECODES
@@ -223,7 +224,30 @@ def _repr(self: Any) -> str:
         if field.kind == 'sequence' and isinstance(value, array.array):
             value = value.tolist()
         parts.append(f'{field.name}={value!r}')
-    return f"{self.__module__}.{type(self).__name__}({', '.join(parts)})"
+    package = self.__module__.rpartition('.')[0]
+    return f"{package}.{type(self).__name__}({', '.join(parts)})"
+
+
+def _restore(name: str, values: list[Any]) -> Any:
+    """Make a message anew; for pickle and copy."""
+    cls: Any = message_class(name)
+    message = cls.__new__(cls)
+    for slot, value in zip(cls.__slots__, values):
+        setattr(message, slot, value)
+    return message
+
+
+def _reduce(self: Any) -> tuple[Any, ...]:
+    return _restore, (self._definition.name, [getattr(self, slot) for slot in self.__slots__])
+
+
+def _module(name: str) -> str:
+    """Name the module in which rosidl puts a class: ``package.kind._snake_case``."""
+    package, kind, short = name.split('/')
+    short = re.sub(r'_(Request|Response|Event)$', '', short) if kind == 'srv' else short
+    snake = re.sub(r'([A-Z]+)([A-Z][a-z])', r'\1_\2', short)
+    snake = re.sub(r'([a-z0-9])([A-Z])', r'\1_\2', snake).lower()
+    return f'{package}.{kind}._{snake}'
 
 
 def _equal(self: Any, other: Any) -> bool:
@@ -262,11 +286,12 @@ def message_class(name: str) -> type:
     package, kind, short = name.split('/')
     fields_and_types = {field.name: type_text(field) for field in described.fields}
     body: dict[str, Any] = {
-        '__module__': f'{package}.{kind}',
+        '__module__': _module(name),
         '__slots__': ['_' + field.name for field in described.fields] + ['_check_fields'],
         '__doc__': f"Message class '{short}'.",
         '__init__': _constructor(described),
         '__repr__': _repr,
+        '__reduce__': _reduce,
         '__eq__': _equal,
         '__hash__': None,
         '_definition': described,
@@ -307,7 +332,7 @@ def service_class(name: str) -> type:
         raise NotImplementedError('Service classes can not be instantiated')
 
     return _Service(short, (), {
-        '__module__': f'{package}.{kind}',
+        '__module__': _module(name),
         '__doc__': f"Service class '{short}'.",
         '__init__': refuse,
         '_service': name,

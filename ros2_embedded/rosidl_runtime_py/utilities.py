@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Classes of interfaces by their names."""
+
+import importlib
+from typing import Any
+
+from rclpy.exceptions import NotEmbeddedError
+
+
+def _import(identifier: str, kind: str | None) -> Any:
+    parts = identifier.split('/')
+    if len(parts) == 2 and kind is not None:
+        parts.insert(1, kind)
+    if len(parts) != 3:
+        raise ValueError(f"'{identifier}' is not of the form package/kind/Name")
+    if parts[1] == 'action':
+        raise NotEmbeddedError(f'the action {identifier}')
+    return getattr(importlib.import_module('.'.join(parts[:2])), parts[2])
+
+
+def get_interface(identifier: str) -> Any:
+    """
+    Give the class of ``package/kind/Name``.
+
+    :raises ModuleNotFoundError: if there is no such package.
+    :raises AttributeError: if it has no such interface.
+    """
+    return _import(identifier, None)
+
+
+def get_message(identifier: str) -> Any:
+    """
+    Give the class of ``package/msg/Name`` or ``package/Name``.
+
+    :raises ModuleNotFoundError: if there is no such package.
+    :raises AttributeError: if it has no such message.
+    :raises ValueError: if it is no message.
+    """
+    interface = _import(identifier, 'msg')
+    if not is_message(interface):
+        raise ValueError(f"Expected the full name of a message, got '{identifier}'")
+    return interface
+
+
+def get_service(identifier: str) -> Any:
+    """
+    Give the class of ``package/srv/Name`` or ``package/Name``; see :func:`get_message`.
+
+    :raises ValueError: if it is no service.
+    """
+    interface = _import(identifier, 'srv')
+    if not is_service(interface):
+        raise ValueError(f"Expected the full name of a service, got '{identifier}'")
+    return interface
+
+
+def is_message(interface: Any) -> bool:
+    """Say whether it is a message's class."""
+    return hasattr(interface, '_definition')
+
+
+def is_service(interface: Any) -> bool:
+    """Say whether it is a service's class."""
+    return hasattr(interface, '_service')
+
+
+def is_action(interface: Any) -> bool:
+    """Say no: there are none."""
+    return False
