@@ -29,7 +29,7 @@ from launch.event_handlers import OnShutdown
 from launch.events.process import ShutdownProcess
 import launch.logging
 
-from fogros2.actions import signals
+from fogros2.actions import private, signals
 from fogros2.actions.console import Console
 from fogros2.actions.session import Session
 from fogros2.errors import Cancelled, ConfigurationError, FogError
@@ -140,9 +140,9 @@ class Coordinator:
         self.base_environment = start = _environment_at_start(context)
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
-        self._restore_signals = signals.take_over(context)
         self._launch = self._make_launch(
-            report=self._console, environment=start, cancel=self._cancel)
+            report=self._console, environment=dict(start), cancel=self._cancel)
+        self._restore_signals = signals.take_over(context)
         self._set_dds_environment()
 
     def know(self, machine: Union[CloudInstance, str]) -> None:
@@ -205,7 +205,8 @@ class Coordinator:
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()
-        self._context.environment.update(environment)
+        for kept in (self._context.environment, *private.kept_environments(self._context)):
+            kept.update(environment)
         # what the launch sets for the robot isn't the launch file's change, and doesn't travel
         self.base_environment.update(environment)
         late = []
@@ -295,11 +296,10 @@ class Coordinator:
 
     async def _take_down(self) -> None:
         # the VPN's interface must not go from under a node that runs
+        sessions = self._sessions.values()
         futures = [action.get_asyncio_future() for action in self._processes()]
-        waits = {future for future in futures if future is not None}
-        waits |= {s.deployment for s in self._sessions.values() if s.deployment is not None}
-        if waits:
-            await asyncio.wait(waits)
+        await _all_done({*futures, *(session.deployment for session in sessions)})
+        await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)
 
@@ -335,6 +335,12 @@ class Coordinator:
         future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(
             self._pool, function, *args)
         return future
+
+
+async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
+    waits = {future for future in futures if future is not None}
+    if waits:
+        await asyncio.wait(waits)
 
 
 def _nothing() -> None:

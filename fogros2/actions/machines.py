@@ -80,10 +80,7 @@ class CloudInstance:
             raise ConfigurationError(
                 f'{type(self).__name__} is no machine yet',
                 'use one of its kinds, such as ContainerInstance or SSHInstance')
-        if name is None and isinstance(on_exit, str) and on_exit != 'delete':
-            raise ConfigurationError(
-                f"a machine with on_exit='{on_exit}' needs a name",
-                'give it a name=, so that the next launch finds it')
+        self._made_up = name is None
         self._name = _two_words() if name is None else name
         self._workspace = ros_workspace
         self._working_dir_base = working_dir_base
@@ -103,6 +100,14 @@ class CloudInstance:
         for key, value in self._values.items():
             if isinstance(value, (str, int, float)):
                 _CHECKS[key](key, value)
+        if isinstance(on_exit, str):
+            self._check_findable(on_exit)
+
+    def _check_findable(self, on_exit: str) -> None:
+        if self._made_up and on_exit != 'delete':
+            raise ConfigurationError(
+                f"a machine with on_exit='{on_exit}' needs a name",
+                'give it a name=, so that the next launch finds it')
 
     def _unknown(self, name: str) -> ConfigurationError:
         known = sorted({
@@ -172,6 +177,7 @@ class CloudInstance:
             values = {
                 key: _CHECKS[key](key, words.resolve(context, value))
                 for key, value in self._values.items()}
+            self._check_findable(values['on_exit'])
             workspace = words.resolve(context, self._workspace)
             if workspace is None:
                 workspace = find_workspace(context.environment)

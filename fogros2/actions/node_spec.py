@@ -171,23 +171,18 @@ class Texts:
     def text(self, text: str) -> Text:
         """Return the text with markers, or as it is where it needs none."""
         parts: list[TextPart] = []
-        end = 0
+        begin = 0
         for match in self._pattern.finditer(text):
             prefix, kind, package = match.group('prefix', 'kind', 'package')
-            marker = Path(prefix, 'share/ament_index/resource_index/packages', package)
-            if not marker.exists():
+            if not Path(prefix, 'share/ament_index/resource_index/packages', package).exists():
                 continue
-            parts.append(text[end:match.start()])
-            if kind == 'share':
-                parts.append({'share': package})
-            else:
-                parts.extend([{'prefix': package}, f'/lib/{package}'])
-            end = match.end()
-        parts.append(text[end:])
-        parts = [part for part in parts if part]
-        if all(isinstance(part, str) for part in parts):
+            parts.append(text[begin:match.start()])
+            parts.append({'share' if kind == 'share' else 'prefix': package})
+            # a package's prefix is looked up; what follows it is the same there
+            begin = match.end() if kind == 'share' else match.end('prefix')
+        if not parts:
             return text
-        return tuple(parts)
+        return tuple(part for part in (*parts, text[begin:]) if part)
 
 
 def _below(path: str, folder: Optional[str]) -> bool:

@@ -95,6 +95,21 @@ def wait_to_fire(timer: TimerAction) -> Waiting:
     return bound
 
 
+def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
+    """
+    Return the copies of the environment that launch comes back to, to be changed in place.
+
+    A scoped group returns to one at its end, ResetEnvironment to another; what the launch as a
+    whole needs has to be in them.
+    """
+    found: list[dict[str, str]] = []
+    for name, value in vars(context).items():
+        if 'environment' in name:
+            found += [kept for kept in (value if isinstance(value, list) else [value])
+                      if isinstance(kept, dict)]
+    return found
+
+
 def signal_manager() -> Optional[AsyncSafeSignalManager]:
     """
     Return the manager in which the running LaunchService handles signals.

@@ -97,6 +97,8 @@ class RemoteRun:
         self.complete = completed
         self.started = False
         self.stopping = False
+        #: It exited, and its machine will start it again.
+        self.respawning = False
         self._context = context
         self._session = session
         self._details: dict[str, Any] = dict(action.process_details or {})
@@ -137,7 +139,8 @@ class RemoteRun:
         if self.complete.done() or self.stopping:
             return
         self.stopping = True
-        if not self._session.stop(self):
+        if not self._session.stop(self) or self.respawning:
+            # nothing runs, so there is no end of it to be reported
             self.end()
             return
         patience = self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
@@ -167,6 +170,7 @@ class RemoteRun:
 
     def _on_started(self, event: dict[str, Any]) -> None:
         self.started = True
+        self.respawning = False
         details = self.action.process_details
         assert details is not None
         details['pid'] = event['pid']
@@ -195,11 +199,13 @@ class RemoteRun:
                 f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
         self._context.emit_event_sync(
             ProcessExited(returncode=self._returncode, **self._details))
-        if not event.get('respawns'):
+        self.respawning = bool(event.get('respawns'))
+        if not self.respawning or self.stopping:
             self.end()
 
     def _on_refused(self, event: dict[str, Any]) -> None:
-        self._logger.error(f"process can't be started: {event['error']}")
+        hint = f" ({event['hint']})" if event.get('hint') else ''
+        self._logger.error(f"process can't be started: {event['error']}{hint}")
         self.end()
 
     def on_stdin(self, event: object) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 import functools
+import logging
 from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 
 import launch.logging
@@ -18,13 +19,20 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-#: Events of the agent that concern the machine, not one process: how they read.
+#: Events of the agent that concern the machine, not one process: level and how they read.
 _NOTICES = {
-    'watchdog': 'the agent stops everything: {reason}',
-    'vpn_repaired': 'the VPN was down and is up again',
-    'launch_exited': 'the launch on the machine ended with exit status {returncode}',
-    'lost': 'the connection is lost: {reason}',
+    'watchdog': (logging.ERROR, 'the agent ends everything: {reason}'),
+    'end_failed': (logging.ERROR, 'the machine would not end: exit status {returncode}'),
+    'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
+    'launch_exited': (
+        logging.ERROR, 'the launch on the machine ended with exit status {returncode}'),
+    'lost': (logging.WARNING, '{count} events of the agent came too late for its log'),
+    'connection lost': (logging.WARNING, 'the connection is lost; its nodes run on'),
+    'connection back': (logging.INFO, 'the connection is back'),
+    'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
 }
+#: Exit status of processes whose end nobody saw.
+_UNSEEN = -9
 
 
 class Run(Protocol):
@@ -65,7 +73,8 @@ class Session:
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
-        self._flushes: set[asyncio.Task[None]] = set()
+        #: What was asked of the agent and isn't answered yet.
+        self.requests: set[asyncio.Task[None]] = set()
         # requests reach the agent in the order they were made in
         self._order = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
@@ -89,7 +98,7 @@ class Session:
         self._runs[run.node.id] = run
         self._waiting.append(run)
         if self.running is not None:
-            self._soon(self._start_waiting)
+            self._request(self._start_waiting)
 
     def stop(self, run: Run) -> bool:
         """End a process there; False if it isn't there yet and now never will be."""
@@ -99,12 +108,12 @@ class Session:
             return False
         self._to_stop.append(run)
         if len(self._to_stop) == 1:
-            self._soon(self._stop_collected)
+            self._request(self._stop_collected)
         return True
 
     def signal(self, run: Run, name: str) -> None:
         """Send a process a signal."""
-        self._soon(functools.partial(self._signal, run, name))
+        self._request(functools.partial(self._signal, run, name))
 
     def forget(self, run: Run) -> None:
         """Take a process off the list: it ended."""
@@ -117,16 +126,16 @@ class Session:
         """Take it that the machine is up: what waited for it starts."""
         self.running = running
         running.subscribe(self._event_in_thread)
-        self._soon(self._start_waiting)
+        self._request(self._start_waiting)
         self._changed()
 
-    def _soon(self, function: Callable[[], Any]) -> None:
+    def _request(self, function: Callable[[], Any]) -> None:
         task = self._loop.create_task(function())
-        self._flushes.add(task)
-        task.add_done_callback(self._flushed)
+        self.requests.add(task)
+        task.add_done_callback(self._answered)
 
-    def _flushed(self, task: asyncio.Task[None]) -> None:
-        self._flushes.discard(task)
+    def _answered(self, task: asyncio.Task[None]) -> None:
+        self.requests.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None:
             self._fail(error)
@@ -178,12 +187,29 @@ class Session:
             if event['event'] == 'started':
                 self._changed()
             return
-        notice = _NOTICES.get(event['event'])
-        if notice is not None:
-            self._logger.warning(f'{self.spec.name}: {notice.format(**event)}')
-        if event['event'] == 'launch_exited':
-            for run in list(self._runs.values()):
-                if run in self._waiting:
-                    continue
-                run.on_event({**event, 'event': 'exited'} if run.started else {
-                    'event': 'refused', 'error': 'the launch on the machine ended'})
+        what = ' '.join([event['event'], *([event['state']] if 'state' in event else [])])
+        if what in _NOTICES:
+            level, text = _NOTICES[what]
+            # an agent of another version may say less
+            self._logger.log(level, f'{self.spec.name}: ' + text.format_map(_Told(event)))
+        if what in ('launch_exited', 'connection absent'):
+            self._end_unseen(event.get('returncode', _UNSEEN))
+
+    def _end_unseen(self, returncode: int) -> None:
+        for run in list(self._runs.values()):
+            if run in self._waiting:
+                continue
+            run.on_event({'event': 'exited', 'returncode': returncode} if run.started else {
+                'event': 'refused', 'error': 'the launch on the machine ended'})
+
+
+class _Told(dict[str, Any]):
+    """Fields of an event, '?' for those that it lacks."""
+
+    def __missing__(self, key: str) -> Any:
+        return _Unknown()
+
+
+class _Unknown:
+    def __format__(self, spec: str) -> str:
+        return '?'

@@ -56,9 +56,9 @@ class FakeMachine:
     def subscribe(self, callback):
         self.callback = callback
 
-    def say(self, what, node=None, **fields):
+    def say(self, name, node=None, **fields):
         """Send an event, from another thread as the agent's connection does."""
-        event = {'event': what, **fields}
+        event = {'event': name, **fields}
         if node is not None:
             event.update(node=node.id, name=node.name)
         thread = threading.Thread(target=self.callback, args=(event,))

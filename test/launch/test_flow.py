@@ -9,6 +9,7 @@ from launch import LaunchDescription
 from launch.actions import (
     EmitEvent,
     ExecuteProcess,
+    GroupAction,
     LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
@@ -191,6 +192,14 @@ def test_robot_nodes_have_the_dds_environment(run, fake, planner, capfd, descrip
     process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
     entities = [process, talker(planner)]
     assert run(description(entities if place == 'before' else entities[::-1])) == 0
+    assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
+
+
+def test_the_dds_environment_outlives_the_group_that_brought_it(run, fake, planner, capfd):
+    fake.on_start = ends
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
+    assert run(LaunchDescription([
+        GroupAction([talker(planner)]), GroupAction([process], forwarding=False)])) == 0
     assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
 
 
@@ -377,6 +386,46 @@ def test_the_agents_launch_may_end(run, fake, planner, capfd):
         capfd.readouterr().out)
 
 
+@pytest.mark.parametrize(('event', 'line'), [
+    ({'event': 'watchdog', 'reason': 'lifetime', 'action': 'delete'},
+     '[ERROR] [fogros2]: planner: the agent ends everything: lifetime'),
+    ({'event': 'vpn_repaired', 'what': 'vpn', 'seconds': 1.25},
+     '[WARNING] [fogros2]: planner: the VPN was down for 1.2 s and is up again'),
+    ({'event': 'vpn_repaired'},
+     '[WARNING] [fogros2]: planner: the VPN was down for ? s and is up again'),
+    ({'event': 'connection', 'state': 'lost'},
+     '[WARNING] [fogros2]: planner: the connection is lost; its nodes run on'),
+    ({'event': 'unheard of'}, ''),
+])
+def test_what_the_agent_says_of_its_machine(run, fake, planner, capfd, event, line):
+    def says(machine, node):
+        machine.say(event['event'], **{k: v for k, v in event.items() if k != 'event'})
+        ends(machine, node)
+
+    fake.on_start = says
+    assert run(LaunchDescription([talker(planner)])) == 0
+    assert line in capfd.readouterr().out
+
+
+def test_a_machine_that_vanished(run, fake, planner, capfd):
+    fake.on_start = lambda machine, node: machine.say(
+        'connection', state='absent', error='nobody answers')
+    node = talker(planner)
+    assert run(LaunchDescription([node])) == 0
+    assert node.return_code == -9
+    assert 'planner: the agent is gone: nobody answers' in capfd.readouterr().out
+
+
+def test_shutdown_between_two_lives_of_a_node(run, fake, planner):
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=1, respawns=True)
+    node = talker(planner, respawn=True, respawn_delay=60.0)
+    assert run(LaunchDescription([
+        node, RegisterEventHandler(OnProcessExit(target_action=node, on_exit=[Shutdown()])),
+    ])) == 0
+    assert fake.noted('stop')
+
+
 # -- failure -------------------------------------------------------------------------------------
 
 
@@ -539,3 +588,35 @@ def test_a_lifecycle_node_in_a_group(run, fake, planner):
     assert isinstance(node, LifecycleNode) and isinstance(node, Node)
     assert node.node_name == '/arm'
     assert len(fake.noted('start')) == 1
+
+
+def test_a_component_container_in_a_group(run, fake, planner, capfd):
+    from launch_ros.actions import ComposableNodeContainer
+
+    from fogros2 import CloudGroup
+    fake.on_start = ends
+    container = ComposableNodeContainer(
+        package='demo', executable='talker', name='box', namespace='')
+    assert run(LaunchDescription([CloudGroup(planner, [container])])) == 0
+    spec = fake.machines['planner'].nodes['talker']
+    assert '__node:=box' in spec.arguments
+
+
+def test_what_cannot_be_sent_is_refused_by_name(run, fake, planner, capfd):
+    from fogros2 import CloudGroup
+
+    class Sealed(ExecuteProcess):
+        def __init_subclass__(cls):
+            raise TypeError('it is sealed')
+
+    assert run(LaunchDescription([CloudGroup(planner, [Sealed(cmd=['true'])])])) == 1
+    assert "Sealed can't run on a machine: it is sealed" in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_a_machine_is_required():
+    from fogros2 import CloudGroup
+    with pytest.raises(ConfigurationError, match='is no machine'):
+        CloudNode(machine=7, package='demo', executable='talker')
+    with pytest.raises(ConfigurationError, match='is no machine'):
+        CloudGroup(None, [])

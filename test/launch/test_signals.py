@@ -24,7 +24,8 @@ from fogros2.actions.coordinator import Coordinator
 class Fake(FakeLaunch):
     def note(self, *what):
         super().note(*what)
-        print('note:', what[0], flush=True)
+        sys.stdout.write(f'note: {{what[0]}}\\n')
+        sys.stdout.flush()
     def down(self):
         self.note('down')
         if {slow_down}:

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each private part of launch that is used is there, and does what it is used for."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+
+import pytest
+
+pytest.importorskip('launch.launch_context', reason='launch is not installed')
+
+from launch import LaunchContext, LaunchService
+from launch.actions import ExecuteLocal, ExecuteProcess, TimerAction
+from launch.utilities import AsyncSafeSignalManager
+
+from fogros2.actions import private
+
+
+def test_methods():
+    assert inspect.iscoroutinefunction(getattr(ExecuteLocal, private.EXECUTE_PROCESS))
+    assert inspect.iscoroutinefunction(getattr(TimerAction, private.WAIT_TO_FIRE))
+    assert list(inspect.signature(ExecuteLocal._shutdown_process).parameters) == [
+        'self', 'context', 'send_sigint']
+
+
+def test_options():
+    action = ExecuteProcess(
+        cmd=['true'], respawn=True, respawn_delay=2.0, respawn_max_retries=3, log_cmd=True)
+    action.prepare(LaunchContext())
+    assert private.options(action) == private.Options(True, 2.0, 3, True)
+    assert private.transport(action) is None
+
+
+def test_output_format():
+    action = ExecuteProcess(cmd=['true'])
+    private.prefix_output(action, 'planner')
+    assert vars(action)['_ExecuteLocal__output_format'] == (
+        '[planner.{this.process_description.final_name}] {line}')
+
+
+def test_a_missing_method_is_noticed():
+    with pytest.raises(AttributeError, match='__no_such'):
+        private.replace(ExecuteProcess(cmd=['true']), '__no_such', None)
+
+
+def test_kept_environments():
+    context = LaunchContext()
+    before = len(private.kept_environments(context))
+    assert before >= 1  # what ResetEnvironment returns to
+    context._push_environment()
+    assert len(private.kept_environments(context)) == before + 1
+    context._pop_environment()
+
+
+def test_the_signal_manager():
+    assert private.signal_manager() is None
+    loop = asyncio.new_event_loop()
+    with AsyncSafeSignalManager(loop) as manager:
+        assert private.signal_manager() is manager
+    assert private.signal_manager() is None
+    loop.close()
+
+
+def test_handlers_of_the_context_can_be_gone_through():
+    context = LaunchService().context
+    assert len(tuple(context._event_handlers)) >= 2
