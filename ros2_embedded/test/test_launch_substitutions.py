@@ -2,6 +2,7 @@
 """launch's substitutions, typed values and launch files in XML and YAML, by value."""
 
 import os
+import re
 from typing import List
 
 from launch import LaunchContext, LaunchDescription, LaunchService
@@ -22,7 +23,7 @@ import pytest
 
 
 @pytest.fixture
-def context(tmp_path, monkeypatch, capsys):
+def context(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     monkeypatch.setenv('FOG_ENV', 'from env')
     launch.logging.reset()
@@ -227,6 +228,8 @@ launch:
 
 
 def launch_file(path):
+    # Standard output isn't the one there was when the context was made.
+    launch.logging.reset()
     service = LaunchService(noninteractive=True)
     service.include_launch_description(LaunchDescription([
         IncludeLaunchDescription(str(path))]))
@@ -235,7 +238,7 @@ def launch_file(path):
 
 @pytest.mark.parametrize('name, content', [
     ('a.launch.xml', XML), ('a.xml', XML), ('a_launch.yaml', YAML), ('a.launch.yml', YAML),
-    ('a.launch', XML)])
+    ('a.launch', XML)], ids=lambda value: value.partition('\n')[0])
 def test_launch_files(context, tmp_path, monkeypatch, capsys, name, content):
     monkeypatch.delenv('FOG_XML', raising=False)
     (tmp_path / name).write_text(content)
@@ -264,7 +267,6 @@ def test_bad_launch_files(context, tmp_path, capsys, content, error):
     assert launch_file(path) == 1
     out = capsys.readouterr().out
     assert 'Caught exception in launch (see debug for traceback)' in out
-    import re
     assert re.search(error, out)
 
 
