@@ -1167,7 +1167,7 @@ class Agent:
     def _signaller(self, launch: CloudLaunch, number: int) -> Callable[[], None]:
         def send() -> None:
             if self.launch is launch:
-                with self.root(), contextlib.suppress(ProcessLookupError):
+                with self.root(), contextlib.suppress(ProcessLookupError, PermissionError):
                     os.killpg(launch.pid, number)
         return send
 

@@ -981,3 +981,34 @@ def test_as_process_1_it_reaps_orphans_and_ends_when_told(root, tmp_path):
     assert rig.ended(agent) == 0
     assert time.monotonic() - begin < 2.2
     rig.close()
+
+
+def test_shell_commands_and_terminals_are_launchs(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[
+        NodeSpec('shell', 's-1', shell=True,  # noqa: S604 (a constant)
+                 arguments=('echo one two | tr a-z', 'A-Z')),
+        NodeSpec('tty', 't-1', arguments=('test', '-t', '1'), emulate_tty=True),
+        NodeSpec('prefix', 'p-1', arguments=('echo', 'hi'), prefix=('env', 'X=1'))])
+    for node in ('shell', 'tty', 'prefix'):
+        assert rig.wait('exited', node=node)['returncode'] == 0
+    assert (rig.text('shell'), rig.text('prefix')) == ('ONE TWO\n', 'hi\n')
+
+
+def test_the_installed_launch_file_runs_below_ros2_launch(rig):
+    share = Path(__file__).parents[2] / 'launch' / 'cloud.launch.py'
+    ros2 = shutil.which('ros2', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
+    if ros2 is None:
+        pytest.skip('needs ros2')
+    path = f'{Path(__file__).parents[2]}:{os.environ.get("PYTHONPATH", "")}'
+    rig.serve(ros_command=[ros2, 'launch', str(share)], environment={
+        'ROS_LOG_DIR': str(rig.folder),
+        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ},
+        'PYTHONPATH': path})
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', 'print("here")\n')])
+    assert rig.wait('exited', node='n')['returncode'] == 0
+    assert rig.text('n') == 'here\n'
+    client.request('release')
+    assert 'here' not in (rig.directory / 'launch.log').read_text()
