@@ -1,0 +1,569 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pictures to H.264 and back without delay: one picture in, one packet out; no ROS in it.
+
+A packet is one access unit in Annex B form, SPS and PPS with each IDR, no B-frames, and a SEI
+unit with a Tag. Deep pictures (16 bit, float) go through FFV1 instead, lossless always.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+import functools
+import os
+import secrets
+import time
+from typing import Optional
+import zlib
+
+import av
+from av.codec.context import CodecContext
+from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
+from av.video.frame import PictureType, VideoFrame
+from av.video.reformatter import ColorRange, Colorspace
+import numpy
+
+from image_transport_h264 import annexb
+from image_transport_h264.annexb import Tag
+from image_transport_h264.deep import DeepDecoder, DeepEncoder, lines, MAGIC, split
+from image_transport_h264.picture import (
+    BadPicture,
+    Buffer,
+    CodecError,
+    LARGEST_SIDE,
+    Layout,
+    LAYOUTS,
+    Picture,
+    Pixels,
+)
+
+__all__ = [
+    'BadPicture', 'CodecError', 'Damaged', 'Decoder', 'Encoder', 'Missing', 'Packet', 'Picture',
+    'Settings', 'working_encoders',
+]
+
+SOFTWARE = 'libx264'
+#: Asked in this order; VAAPI is left out: it takes frames that live on the device.
+HARDWARE = ('h264_nvenc', 'h264_qsv', 'h264_amf', 'h264_v4l2m2m')
+#: Seconds of the allowed bitrate that one picture may take: what bounds a key's time on the wire.
+BUFFER_SECONDS = 0.05
+CLOCK = 90000
+#: Pixels from which on a picture is worth dividing among cores.
+MANY_PIXELS = 1000 * 700
+
+
+class Damaged(CodecError):
+    """A packet that isn't what was sent; decoding goes on at the next key."""
+
+
+class Missing(CodecError):
+    """A packet that needs one which never came; decoding goes on at the next key."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """
+    How to encode.
+
+    :param bitrate: the most that the stream takes, bits per second.
+    :param quality: libx264's constant rate factor, 0 to 51, less is better; kept as long as
+        ``bitrate`` allows.
+    :param preset: libx264's: ultrafast, superfast, ...; slower makes less of the same quality.
+    :param gop: most pictures from a key to the next.
+    :param rate: pictures per second to expect, for the rate control's first guess.
+    :param encoder: 'auto' (a hardware encoder that works here, else libx264), or FFmpeg's name.
+    :param lossless: give back the identical pixels, at whatever size.
+    """
+
+    bitrate: int = 8_000_000
+    quality: float = 23.0
+    preset: str = 'ultrafast'
+    gop: int = 300
+    rate: float = 30.0
+    encoder: str = SOFTWARE
+    lossless: bool = False
+
+    def __post_init__(self) -> None:
+        if not 10_000 <= self.bitrate <= 1_000_000_000:
+            raise ValueError(f'bitrate {self.bitrate} is not between 10 kbit/s and 1 Gbit/s')
+        if not 0 <= self.quality <= 51:
+            raise ValueError(f'quality {self.quality} is not between 0 and 51')
+        if self.preset not in PRESETS:
+            raise ValueError(f"preset '{self.preset}' is not one of {', '.join(PRESETS)}")
+        if self.gop < 1:
+            raise ValueError(f'gop {self.gop} is less than 1')
+        if not 0 < self.rate <= 1000:
+            raise ValueError(f'rate {self.rate} is not between 0 and 1000')
+        if self.encoder not in ('auto', SOFTWARE, *HARDWARE):
+            raise ValueError(f"encoder '{self.encoder}' is not one of auto, {SOFTWARE}, "
+                             + ', '.join(HARDWARE))
+
+
+PRESETS = ('ultrafast', 'superfast', 'veryfast', 'faster', 'fast', 'medium', 'slow', 'slower',
+           'veryslow')
+
+
+@dataclasses.dataclass(frozen=True)
+class Packet:
+    """
+    One coded picture.
+
+    :param format: 'h264' or 'ffv1'.
+    :param data: Annex B, or FFV1's own form (see ``deep``).
+    """
+
+    format: str
+    data: bytes
+    tag: Tag
+
+    @property
+    def key(self) -> bool:
+        """Whether decoding can begin here."""
+        return self.tag.key
+
+
+class Encoder:
+    """Encodes pictures of one topic; size and encoding may change from one to the next."""
+
+    def __init__(self, settings: Optional[Settings] = None) -> None:
+        self._settings = settings or Settings()
+        self._codec: Optional[VideoCodecContext] = None
+        self._opened: object = None
+        self._coding = Coding('', '', False)
+        self._deep = DeepEncoder()
+        self._stream = secrets.randbits(32)
+        self._sequence = 0
+        self._pts = -1
+
+    @property
+    def settings(self) -> Settings:
+        """What it encodes with; a change takes effect with the next picture, which is a key."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: Settings) -> None:
+        self._settings = settings
+
+    def encode(
+        self, picture: Picture, *, key: bool = False, seconds: Optional[float] = None,
+    ) -> Packet:
+        """
+        Return the picture's packet.
+
+        :param key: make it one at which decoding can begin.
+        :param seconds: when the picture was taken, on any clock that runs forward; now without.
+        :raises BadPicture: its fields contradict each other, or its encoding isn't known.
+        :raises CodecError: the encoder refused it.
+        """
+        picture.check()
+        layout = picture.layout
+        level, plane = _alpha(picture) if layout.alpha else (None, b'')
+        tag = Tag(self._stream, self._sequence, False, picture.width, picture.height,
+                  picture.encoding, picture.step, picture.is_bigendian,
+                  alpha_level=level, alpha_plane=plane)
+        if layout.kind == 'deep':
+            data = self._deep.encode(picture, tag)
+            tag = dataclasses.replace(tag, key=True)
+            self._opened = None  # the next H.264 picture can't refer across this one
+        else:
+            data, is_key = self._encode(picture, layout, key, seconds)
+            tag = dataclasses.replace(tag, key=is_key)
+            data = annexb.insert(tag, data)
+        self._sequence = (self._sequence + 1) & 0xffffffff
+        return Packet('ffv1' if layout.kind == 'deep' else 'h264', data, tag)
+
+    def _encode(
+        self, picture: Picture, layout: Layout, key: bool, seconds: Optional[float],
+    ) -> tuple[bytes, bool]:
+        settings = self._settings
+        wanted = (picture.width, picture.height, picture.encoding, settings)
+        if self._codec is None or self._opened != wanted:
+            self._coding = _coding(layout, settings)
+            self._codec = _open(self._coding, picture.width, picture.height, settings)
+            self._opened, self._pts = wanted, -1
+        frame = _frame(picture, layout, self._coding)
+        now = time.monotonic() if seconds is None else seconds
+        self._pts = max(self._pts + 1, int(now * CLOCK))
+        frame.pts, frame.time_base = self._pts, Fraction(1, CLOCK)
+        frame.pict_type = PictureType.I if key else PictureType.NONE
+        try:
+            packets = self._codec.encode(frame)
+        except (FFmpegError, ValueError) as error:
+            self._opened = None
+            raise CodecError(f'{self._coding.codec}: {error}', 'encoder') from error
+        if len(packets) != 1:
+            self._opened = None
+            raise CodecError(f'{self._coding.codec} gave {len(packets)} packets for a picture',
+                             'encoder')
+        data = bytes(packets[0])
+        return data, annexb.IDR in annexb.kinds(data)
+
+
+class Decoder:
+    """
+    Decodes packets of one topic, in the order of their coming.
+
+    :param show_damage: decode across losses and damage, which shows as smears, instead of
+        waiting for the next key.
+    :param encoding: of pictures whose packets have no tag, from an encoder that isn't ours.
+    """
+
+    def __init__(self, *, show_damage: bool = False, encoding: str = 'bgr8') -> None:
+        self.show_damage = show_damage
+        self.encoding = encoding
+        self._codec: Optional[VideoCodecContext] = None
+        self._deep = DeepDecoder()
+        self._last: Optional[Tag] = None
+        self._needs_key = True
+
+    @property
+    def needs_key(self) -> bool:
+        """Whether nothing more can be decoded before a key."""
+        return self._needs_key
+
+    def decode(self, data: Buffer) -> Optional[Picture]:
+        """
+        Return the packet's picture, None for one that was decoded before or came too late.
+
+        :raises Missing: the packet needs one that never came.
+        :raises Damaged: the packet isn't what was sent.
+        """
+        packet = bytes(data)
+        try:
+            if packet[:len(MAGIC)] == MAGIC:
+                return self._decode_deep(packet)
+            return self._decode(packet)
+        except Damaged:
+            self._needs_key = True
+            raise
+
+    def _decode_deep(self, packet: bytes) -> Optional[Picture]:
+        try:
+            tag, _, _ = split(packet)
+            if self._is_old(tag):
+                return None
+            tag, picture = self._deep.decode(packet)
+        except CodecError as error:
+            raise Damaged(str(error), error.cause) from error
+        self._last, self._needs_key, self._codec = tag, False, None
+        return picture
+
+    def _decode(self, packet: bytes) -> Optional[Picture]:
+        tag, coded = annexb.extract(packet)
+        kinds = annexb.kinds(coded)
+        if tag is None:
+            key = annexb.IDR in kinds
+        elif tag.checksum != zlib.crc32(coded) and not self.show_damage:
+            raise Damaged('a packet whose checksum is another', 'damage')
+        else:
+            if self._is_old(tag):
+                return None
+            key = tag.key
+        if not key and not self.show_damage:
+            self._check_order(tag)
+        if key and (self._needs_key or self._codec is None
+                    or (tag is not None and not _same_picture(tag, self._last))):
+            self._codec = None  # nothing of an older stream, and no frame of another size
+        if self._codec is None:
+            self._codec = _decoder(self.show_damage)
+        try:
+            frames = self._codec.decode(av.Packet(coded))
+        except (FFmpegError, ValueError) as error:
+            self._codec = None
+            raise Damaged(f'H.264: {error}', 'damage') from error
+        if len(frames) != 1 or (frames[0].is_corrupt and not self.show_damage):
+            self._codec = None
+            raise Damaged(f'{len(frames)} whole pictures in a packet', 'damage')
+        picture = self._picture(frames[0], tag)
+        self._last, self._needs_key = tag, False
+        return picture
+
+    def _check_order(self, tag: Optional[Tag]) -> None:
+        """
+        Hold a packet that isn't a key against the last one that was decoded.
+
+        :raises Missing: it isn't the next one.
+        """
+        last = self._last
+        if tag is None or last is None or self._codec is None:
+            # without tags, a loss shows in the decoder's own complaints alone
+            if self._needs_key or self._codec is None or tag is not last:
+                self._needs_key = True
+                raise Missing('waiting for a key', 'waiting')
+        elif not _follows(tag, last):
+            gap = (tag.sequence - last.sequence) & 0xffffffff
+            waiting, self._needs_key = self._needs_key, True
+            raise Missing(f'{gap - 1} packets missing', 'waiting' if waiting else 'loss')
+
+    def _is_old(self, tag: Tag) -> bool:
+        last = self._last
+        if last is None or tag.stream != last.stream or self._needs_key and tag.key:
+            return False
+        return (tag.sequence - last.sequence - 1) & 0xffffffff >= 0x80000000
+
+    def _picture(self, frame: VideoFrame, tag: Optional[Tag]) -> Picture:
+        """Return the decoded frame in the tag's encoding, cut to its size."""
+        encoding = self.encoding if tag is None else tag.encoding
+        layout = LAYOUTS.get(encoding)
+        if layout is None or layout.kind == 'deep':
+            raise Damaged(f"H.264 of encoding '{encoding}'", 'damage')
+        if tag is None:
+            width, height = frame.width, frame.height
+            step, big = width * layout.pixel_bytes, False
+        else:
+            width, height, step, big = tag.width, tag.height, tag.step, tag.is_bigendian
+            row = width * layout.pixel_bytes
+            # what was coded is larger by the pixel that makes it even, at the most
+            if not (0 <= frame.width - width <= 1 and 0 <= frame.height - height <= 1
+                    and 0 < width <= LARGEST_SIDE and row <= step <= 2 ** 20):
+                self._codec = None
+                raise Damaged(f'a picture of {frame.width}x{frame.height}, where its tag says '
+                              f'{width}x{height}', 'damage')
+        data = _pixels(frame, layout, width, height, step)
+        if tag is not None and layout.alpha:
+            _put_alpha(data, tag)
+        return Picture(width, height, encoding, step, data.reshape(-1).data, big)
+
+
+def _follows(tag: Tag, last: Tag) -> bool:
+    return tag.stream == last.stream and tag.sequence == (last.sequence + 1) & 0xffffffff
+
+
+def _same_picture(tag: Tag, last: Optional[Tag]) -> bool:
+    return last is not None and (tag.stream, tag.width, tag.height, tag.encoding) == (
+        last.stream, last.width, last.height, last.encoding)
+
+
+# --- how kinds of pictures are coded ------------------------------------------------------------
+
+@dataclasses.dataclass(frozen=True)
+class Coding:
+    """
+    A way through FFmpeg.
+
+    :param codec: FFmpeg's name of the encoder.
+    :param av_format: what it is given.
+    :param full_range: whether the luma uses all of 0 to 255; written into the stream.
+    """
+
+    codec: str
+    av_format: str
+    full_range: bool
+
+    @property
+    def even(self) -> bool:
+        """Whether sides have to be even: chroma of half the size can't be cut by one pixel."""
+        return self.av_format in ('yuv420p', 'nv12', 'yuv422p')
+
+
+def _coding(layout: Layout, settings: Settings) -> Coding:
+    # YUV from a camera keeps the range it came with; what that is, the message doesn't say
+    full = layout.kind != 'yuv422'
+    if settings.lossless:
+        codec, av_format = {
+            'rgb': ('libx264rgb', 'bgr24' if layout.av_format.startswith('bgr') else 'rgb24'),
+            'grey': (SOFTWARE, 'gray'),
+            'yuv422': (SOFTWARE, 'yuv422p'),
+        }[layout.kind]
+        return Coding(codec, av_format, full)
+    codec = settings.encoder
+    if codec == 'auto':
+        codec = working_encoders()[0]
+    return Coding(codec, 'nv12' if codec in ('h264_qsv', 'h264_amf') else 'yuv420p', full)
+
+
+def _open(coding: Coding, width: int, height: int, settings: Settings) -> VideoCodecContext:
+    """
+    Open FFmpeg's encoder.
+
+    :raises CodecError: it can't be opened.
+    """
+    try:
+        codec = CodecContext.create(coding.codec, 'w')
+        assert isinstance(codec, VideoCodecContext)
+        if coding.even:
+            width, height = width + width % 2, height + height % 2
+        codec.width, codec.height, codec.pix_fmt = width, height, coding.av_format
+        codec.time_base = Fraction(1, CLOCK)
+        codec.framerate = Fraction(settings.rate).limit_denominator(1000)
+        codec.gop_size = settings.gop
+        codec.max_b_frames = 0
+        if coding.codec != 'libx264rgb':
+            codec.colorspace = int(Colorspace.ITU601)
+            if coding.full_range:
+                codec.color_range = int(ColorRange.JPEG)
+        # slices decode on two cores as well, and cost a little size: only where it pays
+        codec.thread_type = 'SLICE'
+        codec.thread_count = min(4, os.cpu_count() or 1) if width * height >= MANY_PIXELS else 1
+        codec.options = _options(coding, settings)
+        if coding.codec not in (SOFTWARE, 'libx264rgb'):
+            codec.bit_rate = settings.bitrate
+        codec.open()
+    except (FFmpegError, ValueError) as error:
+        raise CodecError(f'{coding.codec} at {width}x{height}: {error}', 'encoder') from error
+    return codec
+
+
+def _options(coding: Coding, settings: Settings) -> dict[str, str]:
+    limits = {'maxrate': str(settings.bitrate),
+              'bufsize': str(max(1000, int(settings.bitrate * BUFFER_SECONDS)))}
+    if coding.codec in (SOFTWARE, 'libx264rgb'):
+        options = {'preset': settings.preset, 'tune': 'zerolatency', 'forced-idr': '1'}
+        if settings.lossless:
+            return options | {'qp': '0'}
+        return options | limits | {'crf': f'{settings.quality:g}'}
+    # each names zero latency its own way; options that an encoder lacks are skipped by FFmpeg
+    return limits | {
+        'forced-idr': '1', 'forced_idr': '1', 'delay': '0', 'zerolatency': '1', 'tune': 'ull',
+        'async_depth': '1', 'low_delay_brc': '1', 'usage': 'ultralowlatency',
+        'repeat-headers': '1'}
+
+
+@functools.lru_cache(maxsize=None)
+def working_encoders() -> list[str]:
+    """
+    Return the encoders that work on this computer, hardware first, libx264 last; probed once.
+
+    One works if its first packets decode at once to about the picture that went in.
+    """
+    return [*(name for name in HARDWARE if _works(name)), SOFTWARE]
+
+
+def _works(name: str) -> bool:
+    if name not in av.codec.codecs_available:
+        return False
+    ramp = numpy.linspace(40, 200, 320, dtype=numpy.uint8)
+    data = numpy.ascontiguousarray(numpy.broadcast_to(ramp[None, :, None], (240, 320, 3)))
+    picture = Picture(320, 240, 'bgr8', 960, data.reshape(-1).data)
+    encoder, decoder = Encoder(Settings(encoder=name)), Decoder()
+    try:
+        for _ in range(3):
+            shown = decoder.decode(encoder.encode(picture).data)
+    except CodecError:
+        return False
+    return shown is not None and float(
+        numpy.abs(shown.rows().astype(int) - picture.rows()).mean()) < 4
+
+
+def _decoder(show_damage: bool) -> VideoCodecContext:
+    codec = CodecContext.create('h264', 'r')
+    assert isinstance(codec, VideoCodecContext)
+    # frame threads would hold pictures back; slices don't
+    codec.thread_type, codec.thread_count = 'SLICE', min(4, os.cpu_count() or 1)
+    codec.options = {'flags': '+low_delay' + ('+output_corrupt' if show_damage else '')}
+    return codec
+
+
+# --- pixels in and out of FFmpeg's frames -------------------------------------------------------
+
+def _padded(rows: Pixels, layout: Layout, even: bool) -> Pixels:
+    """Return the rows, the last row and column repeated where sides have to be even."""
+    height, row = rows.shape
+    width = row // layout.pixel_bytes
+    if not even or not (height % 2 or width % 2):
+        return rows
+    if width % 2:
+        # of 4:2:2 the last pixel has one chroma; the other one is its neighbour's
+        tail = rows[:, -layout.pixel_bytes:]
+        if layout.kind == 'yuv422':
+            tail = tail.copy()
+            chroma = 0 if layout.av_format == 'uyvy422' else 1
+            tail[:, chroma] = rows[:, -4 + chroma] if width > 1 else 128
+        rows = numpy.concatenate([rows, tail], axis=1)
+    if height % 2:
+        rows = numpy.concatenate([rows, rows[-1:]])
+    return rows
+
+
+def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
+    """Return the picture as the encoder wants it."""
+    rows = picture.rows()
+    if layout.alpha and coding.codec == 'libx264rgb':
+        pixels = rows.reshape(picture.height, picture.width, 4) if rows.flags.c_contiguous else (
+            numpy.ascontiguousarray(rows).reshape(picture.height, picture.width, 4))
+        opaque = pixels[:, :, :3].copy()
+        return VideoFrame.from_numpy_buffer(opaque, coding.av_format)
+    rows = _padded(rows, layout, coding.even)
+    height, width = rows.shape[0], rows.shape[1] // layout.pixel_bytes
+    if layout.kind == 'grey':
+        frame = VideoFrame(width, height, coding.av_format)
+        lines(frame)[:height, :width] = rows
+        for plane in range(1, len(frame.planes)):
+            lines(frame, plane)[:] = 128
+        return frame
+    if layout.kind == 'yuv422':
+        frame = VideoFrame(width, height, layout.av_format)
+        lines(frame)[:height, :rows.shape[1]] = rows
+        return frame.reformat(format=coding.av_format)
+    # FFmpeg reads the message's own memory
+    shared = numpy.lib.stride_tricks.as_strided(
+        rows, (height, width, layout.pixel_bytes), (rows.strides[0], layout.pixel_bytes, 1),
+        writeable=False)
+    frame = VideoFrame.from_numpy_buffer(shared, layout.av_format)
+    if coding.av_format == layout.av_format:
+        return frame
+    return frame.reformat(
+        format=coding.av_format, dst_colorspace=Colorspace.ITU601,
+        dst_color_range=ColorRange.JPEG if coding.full_range else ColorRange.MPEG)
+
+
+def _pixels(frame: VideoFrame, layout: Layout, width: int, height: int, step: int) -> Pixels:
+    """Return the frame's pixels in a new array (height, step) of the layout."""
+    out = numpy.zeros((height, step), numpy.uint8) if step > width * layout.pixel_bytes else (
+        numpy.empty((height, step), numpy.uint8))
+    row = width * layout.pixel_bytes
+    if layout.kind == 'grey' and frame.format.name.startswith(('gray', 'yuv', 'nv')):
+        out[:, :row] = lines(frame)[:height, :width]
+        return out
+    if layout.kind == 'yuv422':
+        converted = frame.reformat(
+            format=layout.av_format, src_color_range=ColorRange.MPEG,
+            dst_color_range=ColorRange.MPEG)
+    else:
+        # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten
+        narrow = layout.alpha and frame.width % 16 != 0
+        av_format = layout.av_format.replace('a', '24') if narrow else layout.av_format
+        converted = frame.reformat(
+            format=av_format, src_colorspace=_colorspace(frame),
+            dst_colorspace=Colorspace.ITU601)
+        if narrow:
+            colours = lines(converted)[:height, :3 * width].reshape(height, width, 3)
+            for channel in range(3):
+                out[:, channel:row:4] = colours[:, :, channel]
+            return out
+    out[:, :row] = lines(converted)[:height, :row]
+    return out
+
+
+def _colorspace(frame: VideoFrame) -> int:
+    # what a stream doesn't say: standard definition is BT.601's, high definition BT.709's
+    told = int(frame.colorspace)
+    if told in (1, 4, 5, 6, 7, 9):
+        return told
+    return int(Colorspace.ITU601 if frame.height < 720 else Colorspace.ITU709)
+
+
+def _alpha(picture: Picture) -> tuple[Optional[int], bytes]:
+    """Return the opacity that all pixels have, or that of each, compressed."""
+    opacity = picture.rows()[:, 3::4]
+    first = int(opacity[0, 0])
+    if (opacity == first).all():
+        return first, b''
+    return None, zlib.compress(opacity.tobytes(), 1)
+
+
+def _put_alpha(data: Pixels, tag: Tag) -> None:
+    target = data[:, 3:tag.width * 4:4]
+    if tag.alpha_level is not None:
+        target[:] = tag.alpha_level
+        return
+    inflater = zlib.decompressobj()
+    try:
+        plane = inflater.decompress(tag.alpha_plane, tag.width * tag.height)
+    except zlib.error as error:
+        raise Damaged(f'opacity: {error}', 'damage') from error
+    if len(plane) != tag.width * tag.height:
+        raise Damaged('opacity of another size than the picture', 'damage')
+    target[:] = numpy.frombuffer(plane, numpy.uint8).reshape(tag.height, tag.width)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Depth and other deep images, bit by bit as they were: FFV1, an intra-only lossless codec.
+
+Of a noisy 640x480 depth image FFV1 leaves 203 kB in 15 ms, PNG 292 kB in 14 ms or 280 kB in
+68 ms; of a 32-bit one 782 kB, PNG 910 kB. Floats are coded as two 16-bit pictures, high halves
+above low ones. A packet is MAGIC, the tag, FFV1's configuration record and the coded picture,
+each with its length: every packet is a key.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+import struct
+from typing import cast, Optional
+import zlib
+
+import av
+from av.codec.context import CodecContext
+from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
+from av.video.frame import VideoFrame
+import numpy
+from numpy.typing import NDArray
+
+from image_transport_h264.annexb import Tag
+from image_transport_h264.picture import CodecError, LARGEST_SIDE, LAYOUTS, Picture, Pixels
+
+MAGIC = b'FFV1tag1'
+#: FFV1 refuses a picture of one column and two rows.
+NARROWEST = 2
+_LENGTHS = struct.Struct('>HHI')
+
+
+class DeepEncoder:
+    """Encodes pictures of kind 'deep', each on its own."""
+
+    def __init__(self) -> None:
+        self._codec: Optional[VideoCodecContext] = None
+        self._size = (0, 0)
+
+    def encode(self, picture: Picture, tag: Tag) -> bytes:
+        """Return the packet; the picture has been checked."""
+        high_low = _planes(picture)
+        height, width = high_low.shape[0], max(NARROWEST, high_low.shape[1])
+        if self._codec is None or self._size != (width, height):
+            self._codec, self._size = _open(width, height), (width, height)
+        # the pixels are 16-bit whatever they mean: no conversion, one copy into the frame
+        frame = VideoFrame(width, height, 'gray16le')
+        _fill(frame, high_low)
+        coded = b''.join(bytes(packet) for packet in self._codec.encode(frame))
+        extra = bytes(self._codec.extradata or b'')
+        packed = dataclasses.replace(tag, key=True, checksum=zlib.crc32(extra + coded)).pack()
+        return (MAGIC + _LENGTHS.pack(len(packed), len(extra), len(coded))
+                + packed + extra + coded)
+
+
+class DeepDecoder:
+    """Decodes what DeepEncoder made."""
+
+    def __init__(self) -> None:
+        self._codec: Optional[VideoCodecContext] = None
+        self._extra = b''
+
+    def decode(self, packet: bytes) -> tuple[Tag, Picture]:
+        """
+        Return the tag and the picture.
+
+        :raises CodecError: the packet is damaged.
+        """
+        tag, extra, coded = split(packet)
+        layout = LAYOUTS.get(tag.encoding)
+        if layout is None or layout.kind != 'deep':
+            raise CodecError(f"a packet of encoding '{tag.encoding}'", 'damage')
+        if not (0 < tag.width <= LARGEST_SIDE and 0 < tag.height <= LARGEST_SIDE
+                and tag.width * layout.pixel_bytes <= tag.step <= 2 ** 20):
+            raise CodecError('a packet with a size that no image has', 'damage')
+        halves = layout.pixel_bytes // 2
+        if self._codec is None or self._extra != extra:
+            codec = CodecContext.create('ffv1', 'r')
+            assert isinstance(codec, VideoCodecContext)
+            codec.extradata = extra
+            codec.width, codec.height = max(NARROWEST, tag.width), tag.height * halves
+            codec.thread_type, codec.thread_count = 'SLICE', 2
+            self._codec, self._extra = codec, extra
+        try:
+            frames = self._codec.decode(av.Packet(coded))
+        except (FFmpegError, ValueError) as error:
+            self._codec = None
+            raise CodecError(f'FFV1: {error}', 'damage') from error
+        if (len(frames) != 1 or frames[0].is_corrupt or frames[0].format.name != 'gray16le'
+                or (frames[0].width, frames[0].height) != (
+                    max(NARROWEST, tag.width), tag.height * halves)):
+            self._codec = None
+            raise CodecError('an FFV1 picture of another size than its tag says', 'damage')
+        return tag, _picture(frames[0], tag, halves)
+
+
+def split(packet: bytes) -> tuple[Tag, bytes, bytes]:
+    """
+    Return tag, configuration and coded picture.
+
+    :raises CodecError: the packet is damaged.
+    """
+    begin = len(MAGIC) + _LENGTHS.size
+    if packet[:len(MAGIC)] != MAGIC or len(packet) < begin:
+        raise CodecError('no FFV1 packet of ours', 'damage')
+    tag_length, extra_length, coded_length = _LENGTHS.unpack_from(packet, len(MAGIC))
+    if len(packet) != begin + tag_length + extra_length + coded_length:
+        raise CodecError('a packet that was cut', 'damage')
+    tag = Tag.unpack(packet[begin:begin + tag_length])
+    body = packet[begin + tag_length:]
+    if tag is None or tag.checksum != zlib.crc32(body):
+        raise CodecError('a damaged packet', 'damage')
+    return tag, body[:extra_length], body[extra_length:]
+
+
+def lines(frame: VideoFrame, plane: int = 0) -> Pixels:
+    """Return a plane's memory as an array (lines, bytes per line)."""
+    memory = frame.planes[plane]
+    flat: Pixels = numpy.frombuffer(cast(memoryview, memory), numpy.uint8)
+    return flat.reshape(-1, memory.line_size)
+
+
+def _open(width: int, height: int) -> VideoCodecContext:
+    codec = CodecContext.create('ffv1', 'w')
+    assert isinstance(codec, VideoCodecContext)
+    codec.width, codec.height, codec.pix_fmt = width, height, 'gray16le'
+    codec.time_base = Fraction(1, 30)
+    codec.gop_size = 1
+    # slices so that two cores share a picture, each with a checksum
+    codec.thread_type, codec.thread_count = 'SLICE', 2
+    codec.options = {'level': '3', 'slicecrc': '1'} | (
+        {'slices': '4'} if min(width, height) >= 64 else {})
+    codec.open()
+    return codec
+
+
+def _planes(picture: Picture) -> NDArray[numpy.uint16]:
+    """Return the pixels as 16-bit numbers, (height, width); 32-bit ones as two such pictures."""
+    order = '>' if picture.is_bigendian else '<'
+    size = picture.layout.pixel_bytes
+    rows = picture.rows()
+    if size == 2:
+        return _contiguous(rows).view(f'{order}u2').astype('<u2', copy=False)
+    bits = _contiguous(rows).view(f'{order}u4')
+    planes = numpy.empty((2 * picture.height, picture.width), '<u2')
+    planes[:picture.height] = bits >> 16
+    planes[picture.height:] = bits & 0xffff
+    return planes
+
+
+def _contiguous(rows: Pixels) -> Pixels:
+    return rows if rows.flags.c_contiguous else numpy.ascontiguousarray(rows)
+
+
+def _fill(frame: VideoFrame, pixels: NDArray[numpy.uint16]) -> None:
+    lines(frame)[:pixels.shape[0], :2 * pixels.shape[1]] = pixels.view(numpy.uint8)
+
+
+def _picture(frame: VideoFrame, tag: Tag, halves: int) -> Picture:
+    pixels = lines(frame)[:frame.height, :2 * tag.width].view('<u2')
+    order = '>' if tag.is_bigendian else '<'
+    out = numpy.zeros((tag.height, tag.step), numpy.uint8)
+    row = out[:, :tag.width * 2 * halves]
+    if halves == 1:
+        row[:] = pixels.astype(f'{order}u2').view(numpy.uint8)
+    else:
+        bits = pixels[:tag.height].astype(numpy.uint32) << 16 | pixels[tag.height:]
+        row[:] = bits.astype(f'{order}u4').view(numpy.uint8)
+    return Picture(tag.width, tag.height, tag.encoding, tag.step, out.data.cast('B'),
+                   tag.is_bigendian)

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures as ``sensor_msgs/Image`` describes them, without ROS: layouts and checks."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal, Union
+
+import numpy
+from numpy.typing import NDArray
+
+Buffer = Union[bytes, bytearray, memoryview]
+Pixels = NDArray[numpy.uint8]
+Kind = Literal['rgb', 'grey', 'yuv422', 'deep']
+
+#: Larger than any camera; a header that asks for more is damage.
+LARGEST_SIDE = 16384
+
+
+class CodecError(ValueError):
+    """
+    A picture that can't be encoded, or a packet that can't be decoded.
+
+    :param cause: a few constant words, so that a log can count causes and not messages.
+    """
+
+    def __init__(self, message: str, cause: str) -> None:
+        super().__init__(message)
+        self.cause = cause
+
+
+class BadPicture(CodecError):
+    """An image whose fields contradict each other, or whose encoding isn't known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """
+    How an encoding lies in memory.
+
+    :param kind: which way it is coded.
+    :param av_format: FFmpeg's name of the same layout.
+    :param pixel_bytes: bytes per pixel.
+    :param alpha: whether the last byte of a pixel is opacity.
+    """
+
+    kind: Kind
+    av_format: str
+    pixel_bytes: int
+    alpha: bool = False
+
+
+LAYOUTS: dict[str, Layout] = {
+    'rgb8': Layout('rgb', 'rgb24', 3),
+    'bgr8': Layout('rgb', 'bgr24', 3),
+    '8UC3': Layout('rgb', 'bgr24', 3),
+    'rgba8': Layout('rgb', 'rgba', 4, alpha=True),
+    'bgra8': Layout('rgb', 'bgra', 4, alpha=True),
+    '8UC4': Layout('rgb', 'bgra', 4, alpha=True),
+    'mono8': Layout('grey', 'gray', 1),
+    '8UC1': Layout('grey', 'gray', 1),
+    'yuv422': Layout('yuv422', 'uyvy422', 2),
+    'uyvy': Layout('yuv422', 'uyvy422', 2),
+    'yuv422_yuy2': Layout('yuv422', 'yuyv422', 2),
+    'yuyv': Layout('yuv422', 'yuyv422', 2),
+    'mono16': Layout('deep', 'gray16le', 2),
+    '16UC1': Layout('deep', 'gray16le', 2),
+    '16SC1': Layout('deep', 'gray16le', 2),
+    '32FC1': Layout('deep', 'gray16le', 4),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """
+    One image; the fields mean what they mean in ``sensor_msgs/Image``.
+
+    :param step: bytes from a row to the next; more than the pixels need where rows are padded.
+    :param data: ``step * height`` bytes; read, never changed.
+    """
+
+    width: int
+    height: int
+    encoding: str
+    step: int
+    data: Buffer
+    is_bigendian: bool = False
+
+    @property
+    def layout(self) -> Layout:
+        """
+        Return the encoding's layout.
+
+        :raises BadPicture: the encoding isn't known.
+        """
+        try:
+            return LAYOUTS[self.encoding]
+        except KeyError:
+            known = ', '.join(LAYOUTS)
+            raise BadPicture(f"encoding '{self.encoding}' isn't one of {known}",
+                             f'encoding {self.encoding!r}') from None
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's pixels, without padding."""
+        return self.width * self.layout.pixel_bytes
+
+    def check(self) -> None:
+        """
+        Hold the fields against each other.
+
+        :raises BadPicture: an unknown encoding, no pixels, a step shorter than a row, or data of
+            another length than step and height say.
+        """
+        row = self.row_bytes
+        if self.width < 1 or self.height < 1:
+            raise BadPicture(f'no pixels: {self.width}x{self.height}', 'size')
+        if max(self.width, self.height) > LARGEST_SIDE:
+            raise BadPicture(f'{self.width}x{self.height} is more than {LARGEST_SIDE} pixels wide '
+                             'or high', 'size')
+        if self.step < row:
+            raise BadPicture(f'step {self.step} is less than the {row} bytes of {self.width} '
+                             f'pixels of {self.encoding}', 'step')
+        length = memoryview(self.data).nbytes
+        if length != self.step * self.height:
+            raise BadPicture(f'{length} bytes of data, where {self.height} rows of {self.step} '
+                             f'are {self.step * self.height}', 'length')
+
+    def rows(self) -> Pixels:
+        """Return the pixels as an array (height, row_bytes) that shares the data."""
+        flat = numpy.frombuffer(self.data, numpy.uint8, self.step * self.height)
+        return flat.reshape(self.height, self.step)[:, :self.row_bytes]
