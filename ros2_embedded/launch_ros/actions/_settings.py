@@ -51,7 +51,7 @@ class PushROSNamespace(Action):
         namespace = make_namespace_absolute(prefix_namespace(previous, pushed) or '')
         try:
             check_namespace(namespace)
-        except ValueError as exc:
+        except Exception as exc:  # noqa: BLE001 - rclpy has none in common but this.
             raise SubstitutionFailure(
                 'The resulting namespace is invalid: '
                 f"[previous_namespace='{previous}', pushed_namespace='{pushed}']") from exc

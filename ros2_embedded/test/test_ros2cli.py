@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands ros2 launch, run and pkg, and how ros2 finds commands."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from ros2cli.plugin_system import PluginException, satisfies_version
+
+ROS2 = shutil.which('ros2', path=os.pathsep.join([os.path.dirname(sys.executable), os.environ[
+    'PATH']]))
+
+LAUNCH_FILE = '''
+import sys
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, LogInfo
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+def generate_launch_description():
+    return LaunchDescription([
+        DeclareLaunchArgument('word', default_value=['hel', 'lo'], description='what to say'),
+        DeclareLaunchArgument('needed', condition=IfCondition(LaunchConfiguration('word'))),
+        LogInfo(msg=['says ', LaunchConfiguration('word')]),
+        Node(package='pkg', executable='sleeper', name='one', output='screen'),
+        Node(package='pkg', executable='sleeper', name='two', output='screen')])
+'''
+
+SLEEPER = '''#!/usr/bin/env python3
+import os, sys, time
+deadline = time.monotonic() + 30
+try:
+    print('ready', *sys.argv[1:], flush=True)
+    while time.monotonic() < deadline:
+        time.sleep(0.05)
+except KeyboardInterrupt:
+    sys.exit(0)
+'''
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Install a package 'pkg' with executables and launch files; return its prefix."""
+    root = tmp_path / 'prefix'
+    share, lib = root / 'share' / 'pkg', root / 'lib' / 'pkg'
+    index = root / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    for directory in (share / 'launch', share / 'other', lib, index):
+        directory.mkdir(parents=True)
+    (index / 'pkg').write_text('')
+    for path in ('launch/a.launch.py', 'launch/twice.launch.py', 'other/twice.launch.py'):
+        (share / path).write_text(LAUNCH_FILE)
+    (share / 'launch' / 'say.launch.xml').write_text(
+        '<launch><arg name="word"/><log message="says $(var word)"/></launch>')
+    for name, text in (('sleeper', SLEEPER), ('status', '#!/bin/sh\necho "$@"; exit 7\n'),
+                       ('killed', '#!/bin/sh\nkill -USR1 $$\n')):
+        (lib / name).write_text(text)
+        (lib / name).chmod(0o755)
+    (lib / 'data').write_text('')
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    monkeypatch.setenv('TMPDIR', str(tmp_path))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
+        [str(root), os.environ.get('AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
+    return root
+
+
+def ros2(*arguments, **kwargs):
+    done = subprocess.run(
+        [ROS2, *arguments], capture_output=True, text=True, timeout=60,
+        stdin=subprocess.DEVNULL, **kwargs)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_packages(package):
+    status, out, err = ros2('pkg', 'list')
+    assert status == 0 and 'pkg' in out.split() and out.split() == sorted(out.split())
+    assert ros2('pkg', 'prefix', 'pkg') == (0, f'{package}\n', '')
+    assert ros2('pkg', 'prefix', '--share', 'pkg')[:2] == (0, f'{package}/share/pkg\n')
+    assert ros2('pkg', 'prefix', 'no-such-package') == (1, '', 'Package not found\n')
+    assert ros2('pkg', 'executables', 'pkg')[:2] == (
+        0, 'pkg killed\npkg sleeper\npkg status\n')
+    assert ros2('pkg', 'executables', '--full-path', 'pkg')[1].splitlines()[0] == (
+        f'{package}/lib/pkg/killed')
+    assert ros2('pkg', 'executables', 'nope') == (1, '', "Package 'nope' not found\n")
+
+
+def test_run(package):
+    assert ros2('run', 'pkg', 'status', 'a', '--b') == (
+        7, 'a --b\n[ros2run]: Process exited with failure 7\n', '')
+    status, out, _ = ros2('run', 'pkg', 'killed')
+    assert status == 256 - signal.SIGUSR1 and out.startswith('[ros2run]: User defined signal 1')
+    assert ros2('run', '--prefix', 'echo before', 'pkg', 'status', 'x')[:2] == (
+        0, f'before {package}/lib/pkg/status x\n')
+    assert ros2('run', 'pkg', 'data') == (1, '', 'No executable found\n')
+    assert ros2('run', 'nope', 'x') == (1, '', "Package 'nope' not found\n")
+
+
+def test_help_names_the_commands(package):
+    status, out, _ = ros2('--help')
+    assert status == 0 and out.startswith('usage: ros2 [-h]')
+    for line in ('launch', 'run', 'pkg'):
+        assert f'\n  {line} ' in out
+    assert 'Run a launch file' in out
+    assert 'prefix ' in ros2('pkg', '-h')[1]
+    assert ros2()[1] == out
+    status, _, err = ros2('no-such-command')
+    assert status == 2 and "invalid choice: 'no-such-command'" in err
+
+
+def test_launch_arguments_are_shown(package):
+    status, out, _ = ros2('launch', '-s', 'pkg', 'a.launch.py')
+    assert status == 0
+    assert out == textwrap.dedent('''\
+        Arguments (pass arguments as '<name>:=<value>'):
+
+            'word':
+                what to say
+                (default: 'hel' + 'lo')
+
+            'needed':*
+                no description given
+
+        * argument(s) which are only used if specific conditions occur
+        ''')
+    empty = package / 'empty.launch.xml'
+    empty.write_text('<launch/>')
+    assert ros2('launch', '--show-args', str(empty))[1].endswith('\n\n  No arguments.\n')
+
+
+def test_launch_description_is_printed(package):
+    status, out, _ = ros2('launch', '-p', 'pkg', 'a.launch.py')
+    assert status == 0 and "── LogInfo('says ' + LaunchConfig('word'))" in out
+    assert "── ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
+
+
+def test_a_launch_file_is_launched(package):
+    status, out, err = ros2('launch', 'pkg', 'say.launch.xml', 'word:=one', 'word:=two')
+    assert (status, err) == (0, '') and '[INFO] [launch.user]: says two' in out.splitlines()
+    path = package / 'share' / 'pkg' / 'launch' / 'say.launch.xml'
+    status, out, _ = ros2('launch', str(path), 'word:=a:=b')
+    assert status == 0 and '[INFO] [launch.user]: says a:=b' in out
+    status, out, _ = ros2('launch', str(path))
+    assert status == 1 and "missing required argument 'word'" in out
+
+
+@pytest.mark.parametrize('arguments, error', [
+    (['nope', 'x'], "Package 'nope' not found: "),
+    (['pkg', 'x'], "file 'x' was not found in the share directory of package 'pkg' which is at "),
+    (['pkg', 'twice.launch.py'], "file 'twice.launch.py' was found more than once in the share"),
+    (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "
+                                    "'<name>:=<value>'"),
+    (['--launch-prefix-filter', 'x', 'pkg', 'a.launch.py'], '--launch-prefix must be specified'),
+])
+def test_errors_are_one_line_and_status_1(package, arguments, error):
+    status, out, err = ros2('launch', *arguments)
+    assert (status, len(err.splitlines())) == (1, 1) and err.startswith(error)
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [ROS2, 'launch', *arguments], stdout=subprocess.PIPE, text=True, start_new_session=True,
+        stdin=subprocess.DEVNULL)
+
+
+def stop(process):
+    # Its children are in its group, also when it is gone.
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()
+    process.stdout.close()
+
+
+def wait_until_ready(process, count):
+    lines = []
+    while sum('] ready' in line for line in lines) < count:
+        lines.append(process.stdout.readline())
+        assert lines[-1], ''.join(lines)
+    return lines
+
+
+def test_two_nodes_until_interrupted(package):
+    process = start('pkg', 'a.launch.py', 'word:=false')
+    try:
+        lines = wait_until_ready(process, 2)
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=20)
+    finally:
+        stop(process)
+    out = ''.join(lines) + rest
+    assert process.returncode == 0
+    assert '[sleeper-1] ready --ros-args -r __node:=one' in out.splitlines()
+    assert '[sleeper-2] ready --ros-args -r __node:=two' in out.splitlines()
+    assert out.count('process has finished cleanly') == 2
+    assert 'All log files can be found below' in lines[0]
+
+
+def test_a_prefix_for_some_executables(package):
+    status, out, _ = ros2(
+        'launch', '--launch-prefix', 'echo prefixed', '--launch-prefix-filter', 'slee.*', '-a',
+        'pkg', 'a.launch.py', 'word:=0')
+    assert status == 0
+    assert f'prefixed {package}/lib/pkg/sleeper --ros-args -r __node:=one' in out
+
+
+def test_sigterm_ends_a_launch_at_once(package):
+    process = start('pkg', 'a.launch.py', 'word:=false')
+    try:
+        wait_until_ready(process, 2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == -signal.SIGTERM
+    finally:
+        stop(process)
+
+
+def test_commands_come_from_entry_points(package, tmp_path):
+    site = tmp_path / 'site'
+    metadata = site / 'fogtest-1.0.dist-info'
+    metadata.mkdir(parents=True)
+    (metadata / 'METADATA').write_text('Metadata-Version: 2.1\nName: fogtest\nVersion: 1.0\n')
+    (metadata / 'entry_points.txt').write_text(textwrap.dedent('''\
+        [ros2cli.command]
+        fogtest = fogtest:Command
+        broken = fogtest_that_is_not_there:Command
+
+        [fogtest.verb]
+        say = fogtest:Say
+        fail = fogtest:Fail
+        '''))
+    (site / 'fogtest.py').write_text(textwrap.dedent('''\
+        from ros2cli.command import add_subparsers_on_demand, CommandExtension
+        from ros2cli.verb import VerbExtension
+
+        class Command(CommandExtension):
+            """Test something."""
+
+            def add_arguments(self, parser, cli_name, *, argv=None):
+                self._subparser = parser
+                add_subparsers_on_demand(
+                    parser, cli_name, '_verb', 'fogtest.verb', required=False, argv=argv)
+
+            def main(self, *, parser, args):
+                if not hasattr(args, '_verb'):
+                    self._subparser.print_help()
+                    return 0
+                return args._verb.main(args=args)
+
+        class Say(VerbExtension):
+            """Say something."""
+
+            def add_arguments(self, parser, cli_name):
+                parser.add_argument('word', help=cli_name)
+
+            def main(self, *, args):
+                print(args.word, self.NAME)
+
+        class Fail(VerbExtension):
+            """Fail."""
+
+            def main(self, *, args):
+                raise RuntimeError('one line')
+        '''))
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
+        filter(None, [str(site), os.environ.get('PYTHONPATH')]))}
+
+    def run(*arguments):
+        return ros2(*arguments, env=environment)
+
+    assert run('fogtest', 'say', 'hello')[:2] == (0, 'hello say\n')
+    assert run('fogtest', 'fail') == (1, '', 'one line\n')
+    assert 'fogtest ' in run('-h')[1] and 'Test something' in run('-h')[1]
+    status, out, _ = run('fogtest')
+    assert status == 0 and 'say ' in out and 'Say something' in out
+    status, out, _ = run('fogtest', 'say', '-h')
+    assert status == 0 and 'usage: ros2 fogtest say [-h] word' in out
+    assert 'ros2 fogtest say' in out
+    status, _, err = run('broken')
+    assert status == 1 and "No module named 'fogtest_that_is_not_there'" in err
+
+
+def test_versions_of_extension_points():
+    satisfies_version('0.1', '^0.1')
+    satisfies_version('1.4', '^1.2')
+    for version, caret_range in (('0.1', '^0.2'), ('0.2', '^0.1'), ('2.0', '^1.2')):
+        with pytest.raises(PluginException):
+            satisfies_version(version, caret_range)
