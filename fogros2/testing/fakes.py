@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A provider and a shell that remember what they were asked, and do nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import dataclasses
+import fnmatch
+from pathlib import Path
+import queue
+import secrets
+import stat
+import threading
+import time
+from typing import ClassVar, Optional
+
+from fogros2.errors import (
+    Cancelled,
+    CommandError,
+    ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    MachineNotFound,
+    NameTaken,
+    WorkspaceError,
+)
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Result,
+    SyncReport,
+)
+from fogros2.provider import Provider
+from fogros2.shell import Stream
+
+#: Where every fake machine is; TEST-NET-2, nobody's address.
+FAKE_ENDPOINT = Endpoint('fake', '198.51.100.1', user='fog')
+
+
+class FakeClock:
+    """A clock that a test moves; calls as ``time.monotonic`` does."""
+
+    def __init__(self, now: float = 0.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        """Return the time (s)."""
+        return self.now
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += seconds
+
+
+class FakeProvider(Provider):
+    """
+    A provider whose machines are entries of a dictionary.
+
+    :param polls: how often ``describe`` says that a new machine isn't running yet.
+    :param shell: endpoint of every machine that runs.
+    :param failures: per method name the error that its next call raises.
+    """
+
+    name: ClassVar[str] = 'fake'
+
+    def __init__(
+        self, *, polls: int = 0, shell: Endpoint = FAKE_ENDPOINT,
+        failures: Optional[dict[str, FogError]] = None,
+    ) -> None:
+        self.calls: list[str] = []
+        self.failures = failures if failures is not None else {}
+        self._polls = polls
+        self._shell = shell
+        self._lock = threading.Lock()
+        self._machines: dict[str, Machine] = {}
+        self._tokens: dict[str, str] = {}
+        self._waits: dict[str, int] = {}
+
+    def check(self, spec: MachineSpec) -> None:
+        """Refuse every option but 'size'."""
+        self._called('check')
+        for name in spec.options:
+            if name != 'size':
+                raise ConfigurationError(f"a fake machine has no option '{name}'",
+                                         "did you mean 'size'?")
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Make an entry."""
+        self.check(spec)
+        with self._lock:
+            self._called('create')
+            if request.token in self._tokens:
+                return self._tokens[request.token]
+            if any(m.name == spec.name for m in self._machines.values()):
+                raise NameTaken(f"there is a fake machine '{spec.name}' already")
+            machine_id = f'fake-{secrets.token_hex(4)}'
+            self._machines[machine_id] = Machine(
+                machine_id, spec.name, self.name, MachineState.PENDING, created=time.time(),
+                tags=dict(request.tags), end_command=('true',))
+            self._tokens[request.token] = machine_id
+            self._waits[machine_id] = self._polls
+            return machine_id
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return an entry; a pending machine comes up meanwhile."""
+        with self._lock:
+            self._called('describe')
+            machine = self._found(machine_id)
+            if machine.state is MachineState.PENDING:
+                self._waits[machine_id] -= 1
+                if self._waits[machine_id] < 0:
+                    machine = dataclasses.replace(
+                        machine, state=MachineState.RUNNING, shell=self._shell,
+                        vpn_host=self._shell.host)
+                    self._machines[machine_id] = machine
+            return machine
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        """Return the entries that carry all of ``tags``."""
+        with self._lock:
+            self._called('find')
+            return [m for m in self._machines.values() if tags.items() <= m.tags.items()]
+
+    def destroy(self, machine_id: str) -> None:
+        """Drop an entry."""
+        with self._lock:
+            self._called('destroy')
+            self._machines.pop(machine_id, None)
+            self._tokens = {t: i for t, i in self._tokens.items() if i != machine_id}
+
+    def stop(self, machine_id: str) -> None:
+        """Mark an entry as stopped."""
+        with self._lock:
+            self._called('stop')
+            self._machines[machine_id] = dataclasses.replace(
+                self._found(machine_id), state=MachineState.STOPPED, shell=None)
+
+    def start(self, machine_id: str) -> None:
+        """Let a stopped entry come up again."""
+        with self._lock:
+            self._called('start')
+            self._machines[machine_id] = dataclasses.replace(
+                self._found(machine_id), state=MachineState.PENDING)
+            self._waits[machine_id] = self._polls
+
+    def _found(self, machine_id: str) -> Machine:
+        if machine_id not in self._machines:
+            raise MachineNotFound(f"there is no fake machine '{machine_id}'")
+        return self._machines[machine_id]
+
+    def _called(self, method: str) -> None:
+        self.calls.append(method)
+        if method in self.failures:
+            raise self.failures.pop(method)
+
+
+class FakeStream:
+    """
+    Both ends of a program that a test plays.
+
+    ``sent`` has what was written to it; ``say`` is what it prints.
+    """
+
+    def __init__(self, *, echo: bool = False) -> None:
+        self.sent = b''
+        self._echo = echo
+        self._lines: queue.Queue[bytes] = queue.Queue()
+        self._closed = threading.Event()
+
+    def say(self, line: bytes) -> None:
+        """Let the program print a line (with its newline)."""
+        self._lines.put(line)
+
+    def write(self, data: bytes) -> None:
+        """Take what the program is sent."""
+        if self._closed.is_set():
+            raise ConnectError('the stream is closed')
+        self.sent += data
+        if self._echo:
+            for line in data.splitlines(keepends=True):
+                self.say(line)
+
+    def readline(self) -> bytes:
+        """Return the next line, b'' at the end."""
+        line = self._lines.get()
+        if not line:
+            self._lines.put(b'')  # for the next reader
+        return line
+
+    def close(self) -> None:
+        """End it."""
+        self._closed.set()
+        self._lines.put(b'')
+
+
+Handler = Callable[[Command], Result]
+
+
+class FakeShell:
+    """
+    A shell to nowhere: it remembers what it was asked to do, and keeps files in a dictionary.
+
+    It knows a few programs (true, false, echo, cat, sleep, printenv, id, stat, seq), so that it
+    passes the same contract as real shells; ``handlers`` answer for others.
+
+    :param handlers: per program name what answers a command.
+    :param streams: what ``open`` returns, one after the other; then one that echoes.
+    """
+
+    def __init__(
+        self, *, name: str = 'fake', handlers: Optional[Mapping[str, Handler]] = None,
+        streams: Iterable[FakeStream] = (),
+    ) -> None:
+        self.name = name
+        self.commands: list[Command] = []
+        self.opened: list[Command] = []
+        self.files: dict[str, tuple[bytes, int]] = {}
+        self.closed = 0
+        self._handlers = {
+            'true': lambda c: _said(''), 'false': lambda c: Result(1, '', ''),
+            'echo': lambda c: _said(' '.join(c.argv[1:]) + '\n'), 'cat': self._cat,
+            'printenv': lambda c: _said(c.environment.get(c.argv[1], '') + '\n'),
+            'id': lambda c: _said('0\n' if c.sudo else '1000\n'), 'stat': self._stat,
+            'seq': lambda c: _said(''.join(f'{n + 1}\n' for n in range(int(c.argv[1])))),
+            **(handlers or {}),
+        }
+        self._streams = list(streams)
+        self._lock = threading.Lock()
+
+    def run(
+        self, command: Command, *, timeout: float, check: bool = True,
+        cancel: Optional[threading.Event] = None,
+        on_output: Optional[Callable[[str], None]] = None,
+    ) -> Result:
+        """Answer a command from a handler; unknown ones fail as a shell's would."""
+        with self._lock:
+            self.commands.append(command)
+        what = command.what or command.argv[0]
+        if cancel is not None and cancel.is_set():
+            raise Cancelled(what)
+        if command.argv[0] == 'sleep':
+            self._sleep(float(command.argv[1]), timeout, cancel, what)
+            return _said('')
+        handler = self._handlers.get(command.argv[0])
+        result = handler(command) if handler is not None else Result(
+            127, '', f'{command.argv[0]}: command not found\n')
+        for line in result.stdout.splitlines() if on_output is not None else ():
+            assert on_output is not None
+            on_output(line)
+        if check and result.returncode != 0:
+            raise CommandError(command, result, f"'{self.name}'")
+        return result
+
+    def _sleep(
+        self, seconds: float, timeout: float, cancel: Optional[threading.Event], what: str,
+    ) -> None:
+        if (cancel or threading.Event()).wait(min(seconds, timeout)):
+            raise Cancelled(what)
+        if seconds > timeout:
+            raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
+
+    def _cat(self, command: Command) -> Result:
+        if len(command.argv) == 1:
+            return _said(command.input.decode(errors='replace'))
+        path = command.argv[-1]
+        if path not in self.files:
+            return Result(1, '', f'cat: {path}: No such file or directory\n')
+        return _said(self.files[path][0].decode(errors='replace'))
+
+    def _stat(self, command: Command) -> Result:
+        path = command.argv[-1]
+        if path not in self.files:
+            return Result(1, '', f"stat: cannot statx '{path}': No such file or directory\n")
+        return _said(f'{self.files[path][1]:o}\n')
+
+    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
+        """Keep a file."""
+        with self._lock:
+            self.files[target] = (data, mode)
+
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
+        on_progress: Optional[Callable[[int, int], None]] = None,
+    ) -> SyncReport:
+        """Keep a folder's files; patterns are matched as names and as paths, no more."""
+        if not source.is_dir():
+            raise WorkspaceError(f'{source} is no folder that could be sent')
+        kept = {}
+        for path in sorted(source.rglob('*')):
+            relative = path.relative_to(source)
+            if path.is_file() and not _left_out(relative, excludes, includes):
+                kept[f'{target}/{relative}'] = (
+                    path.read_bytes(), stat.S_IMODE(path.stat().st_mode))
+        with self._lock:
+            changed = [data for name, (data, mode) in kept.items()
+                       if self.files.get(name) != (data, mode)]
+            for name in [n for n in self.files if n.startswith(f'{target}/') and n not in kept]:
+                relative = Path(name).relative_to(target)
+                if not _left_out(relative, excludes, includes):
+                    del self.files[name]
+            self.files.update(kept)
+        size = sum(map(len, changed))
+        if on_progress is not None:
+            on_progress(size, size)
+        return SyncReport(len(changed), size, 0.0)
+
+    def open(self, command: Command) -> Stream:
+        """Return the next stream of ``streams``, or one that echoes."""
+        with self._lock:
+            self.opened.append(command)
+            return self._streams.pop(0) if self._streams else FakeStream(echo=True)
+
+    def interactive(self, command: Optional[Command] = None) -> int:
+        """Return 0."""
+        return 0
+
+    def close(self) -> None:
+        """Count."""
+        self.closed += 1
+
+
+def _said(text: str) -> Result:
+    return Result(0, text, '')
+
+
+def _left_out(path: Path, excludes: Sequence[str], includes: Sequence[str]) -> bool:
+    def matches(patterns: Sequence[str]) -> bool:
+        parts = [path, *path.parents][:-1]
+        return any(
+            fnmatch.fnmatch(part.name, pattern.strip('/'))
+            or fnmatch.fnmatch(str(part), pattern.strip('/'))
+            for pattern in patterns for part in parts)
+    return matches(excludes) and not matches(includes)

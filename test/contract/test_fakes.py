@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fakes keep the contracts, so that tests with them hold for the real ones."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogros2.errors import ProviderError
+from fogros2.model import Command, MachineSpec, MachineState, Result
+from fogros2.testing import (
+    FakeClock,
+    FakeProvider,
+    FakeShell,
+    FakeStream,
+    ProviderContract,
+    request_for,
+    ShellContract,
+)
+
+
+class TestFakeProvider(ProviderContract):
+
+    def make(self):
+        return FakeProvider(polls=2), {'size': 'small'}
+
+
+class TestFakeShell(ShellContract):
+
+    def make(self, folder):
+        return FakeShell(), '/there'
+
+
+def test_a_fake_provider_remembers_calls_and_fails_as_told():
+    provider = FakeProvider(failures={'create': ProviderError('no more machines')})
+    spec = MachineSpec('planner', 'fake')
+    with pytest.raises(ProviderError, match='no more machines'):
+        provider.create(spec, request_for(spec))
+    machine_id = provider.create(spec, request_for(spec))
+    assert provider.calls == ['check', 'create', 'check', 'create']
+    provider.describe(machine_id)
+    provider.stop(machine_id)
+    assert provider.describe(machine_id).state is MachineState.STOPPED
+    provider.start(machine_id)
+    assert provider.describe(machine_id).state is MachineState.RUNNING
+
+
+def test_a_fake_shell_answers_as_told():
+    stream = FakeStream()
+    shell = FakeShell(handlers={'uname': lambda c: Result(0, 'Fake\n', '')}, streams=[stream])
+    assert shell.run(Command(('uname', '-s')), timeout=1).stdout == 'Fake\n'
+    assert shell.open(Command(('agent',))) is stream
+    assert shell.commands == [Command(('uname', '-s'))]
+
+
+def test_a_fake_clock_moves_when_told():
+    clock = FakeClock(5.0)
+    clock.advance(2.5)
+    assert clock() == 7.5
