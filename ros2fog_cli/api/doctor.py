@@ -186,7 +186,8 @@ def cyclone_uri() -> Check:
         except OSError as error:
             return Check(name, 'failed', f'{path}: {error.strerror}', 'correct it, or unset it')
         except ElementTree.ParseError as error:
-            return Check(name, 'failed', f'{part[:60]} is no XML: {error}',
+            what = f'{part[:60]}...' if part.startswith('<') else path
+            return Check(name, 'failed', f'{what} is no XML: {error}',
                          'correct it, or unset it')
     return Check(name, 'ok', 'readable; ours is appended')
 

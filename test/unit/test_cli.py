@@ -1,0 +1,416 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog`` through ros2cli's own entry point, over a provider that lives in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import dataclasses
+from decimal import Decimal
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+from typing import Any, Optional
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import plugin_system
+from fogros2.errors import MachineNotFound, PrerequisiteError, ProviderError, Unsupported
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.store import process_start, Record, robot_name, Store
+from ros2fog_cli.api import endings, machines, table
+from ros2fog_cli.api.machines import Entry
+
+NOW = 1_800_000_000.0
+
+
+class Memory(Provider):
+    """A provider with its machines in a dictionary."""
+
+    name = 'memory'
+    machines: dict[str, Machine] = {}
+    regions: list[str] = []
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        raise ProviderError('not in these tests')
+
+    def describe(self, machine_id: str) -> Machine:
+        if machine_id not in self.machines:
+            raise MachineNotFound(machine_id)
+        return self.machines[machine_id]
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        return [machine for machine in self.machines.values()
+                if tags.items() <= machine.tags.items()]
+
+    def destroy(self, machine_id: str) -> None:
+        if machine_id == 'stuck':
+            raise ProviderError('the cloud said no', 'ask again')
+        self.machines.pop(machine_id, None)
+
+    def set_regions(self, regions: list[str]) -> None:
+        type(self).regions = regions
+
+
+class Untagged(Memory):
+    """One that keeps no tags."""
+
+    name = 'untagged'
+    machines: dict[str, Machine] = {}
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        raise Unsupported('no tags here')
+
+
+@pytest.fixture(autouse=True)
+def providers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    classes: dict[str, type[Memory]] = {'memory': Memory, 'untagged': Untagged}
+    for provider in classes.values():
+        provider.machines = {}
+        provider.regions = []
+    names, load = plugin_system.names, plugin_system.load
+
+    def fake_names(group: str) -> list[str]:
+        return [*classes, 'nosdk'] if group == 'fogros2.provider' else names(group)
+
+    def fake_load(group: str, name: str) -> Any:
+        if group != 'fogros2.provider':
+            return load(group, name)
+        if name == 'nosdk':
+            raise PrerequisiteError("the provider 'nosdk' can't be loaded", 'pip install nosdk')
+        return classes[name]
+
+    monkeypatch.setattr(plugin_system, 'names', fake_names)
+    monkeypatch.setattr(plugin_system, 'load', fake_load)
+    yield
+
+
+def machine(name: str, machine_id: str = '', **changes: Any) -> Machine:
+    tags = {TAG_NAME: name, TAG_ROBOT: changes.pop('robot', robot_name()),
+            TAG_EXPIRES: str(int(changes.pop('expires', time.time() + 3600))),
+            TAG_LAUNCH: 'abc123'}
+    made = Machine(machine_id or f'id-{name}', name, 'memory', MachineState.RUNNING,
+                   time.time() - 600, Endpoint('ssh', '198.51.100.7', 22, 'fog'), tags=tags)
+    made = dataclasses.replace(made, **changes)
+    (Memory if made.provider == 'memory' else Untagged).machines[made.id] = made
+    return made
+
+
+def record(name: str, machine_id: Optional[str] = '', provider: str = 'memory',
+           on_exit: Any = 'delete', **changes: Any) -> Record:
+    made = Record(name, provider, MachineSpec(name, provider, on_exit=on_exit),
+                  machine_id=f'id-{name}' if machine_id == '' else machine_id,
+                  created=time.time() - 600, launch='abc123')
+    made = dataclasses.replace(made, **changes)
+    return Store().machine(name).save(made)
+
+
+def alive() -> dict[str, int]:
+    return {'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0}
+
+
+def dead() -> dict[str, int]:
+    child = subprocess.Popen([sys.executable, '-c', ''])
+    start = process_start(child.pid) or 1
+    child.wait()
+    return {'pid': child.pid, 'pid_start': start}
+
+
+def run(*words: str) -> Any:
+    return main(argv=['fog', *words])
+
+
+def entries() -> dict[str, Entry]:
+    return {entry.name: entry for entry in machines.survey(lambda text: None)}
+
+
+def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('list') == 0
+    out = capsys.readouterr()
+    assert out.out == 'no machines\n'
+    # the others are listed; the one that can't be asked is a line on stderr
+    assert out.err == "nosdk: the provider 'nosdk' can't be loaded (pip install nosdk)\n"
+
+
+def test_list_shows_what_providers_and_the_store_know(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('alive', cost_per_hour=Decimal('0.0416'))
+    record('alive', **alive())
+    machine('orphan')
+    machine('other', robot='somebody-7')
+    machine('idle', state=MachineState.STOPPED)
+    record('idle', launch='')
+    machine('widow')
+    record('widow', **dead())
+    record('ghost')
+    machine('here', provider='untagged')
+    record('here', provider='untagged', launch='')
+    (Store().root / 'machines/broken').mkdir(mode=0o700)
+    (Store().root / 'machines/broken/record.json').write_text('{')
+    assert run('list') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == [
+        'NAME', 'PROVIDER', 'STATE', 'AGE', 'ADDRESS', 'TIME', 'LEFT', 'COST/H']
+    states = {line.split()[0]: line for line in lines[1:]}
+    assert list(states) == ['alive', 'broken', 'ghost', 'here', 'idle', 'orphan', 'other', 'widow']
+    assert ' running   ' in states['alive'] and '$0.0416' in states['alive']
+    assert '10 min' in states['alive'] and '60 min' in states['alive']
+    assert 'unknown (record damaged)' in states['broken']
+    assert ' gone ' in states['ghost']
+    assert 'untagged  running' in states['here']
+    assert 'stopped (keeps its disk)' in states['idle']
+    assert 'running (orphan)' in states['orphan']
+    assert 'running (robot somebody-7)' in states['other']
+    assert 'running (launch gone)' in states['widow']
+
+
+def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a', cost_per_hour=Decimal('0.5'))
+    record('a', **alive())
+    assert run('list', '--json') == 0
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert entry['name'] == 'a' and entry['provider'] == 'memory' and entry['id'] == 'id-a'
+    assert entry['launch_alive'] is True and entry['cost_per_hour'] == '0.5'
+    assert 595 < entry['age'] < 700 and 3500 < entry['time_left'] < 3600
+
+
+def test_region_reaches_providers_that_have_some(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('list', '--region', 'eu-central-1', 'us-west-1') == 0
+    assert Memory.regions == ['eu-central-1', 'us-west-1']
+    for word in ('all', '*'):
+        assert run('list', '--region', word) == 0
+        assert Memory.regions == ['all']
+
+
+def test_another_robot_s_machine_is_not_ours_by_its_name() -> None:
+    machine('slam', 'theirs', robot='somebody-7')
+    record('slam', 'ours')
+    found = machines.survey(lambda text: None)
+    assert [(e.machine_id, e.own, e.gone) for e in found] == [
+        ('theirs', False, False), ('ours', True, True)]
+
+
+def test_delete_takes_the_machine_and_the_record(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a')
+    record('a', **dead())
+    assert run('delete', 'a', '--dry-run') == 0
+    assert 'would delete a' in capsys.readouterr().out
+    assert 'id-a' in Memory.machines and Store().machine('a').exists()
+    assert run('delete', 'a', '--yes') == 0
+    assert 'deleted a' in capsys.readouterr().out
+    assert not Memory.machines and not Store().machine('a').path.exists()
+    assert run('delete', 'a', '--yes') == 1
+    assert "no machine 'a'" in capsys.readouterr().err
+
+
+def test_delete_asks(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    machine('a')
+    assert run('delete', 'a') == 1
+    assert 'nobody is here to ask' in capsys.readouterr().err
+    for answer, status in (('n', 1), ('', 1), ('y', 0)):
+        monkeypatch.setattr('sys.stdin.isatty', lambda: True, raising=False)
+        monkeypatch.setattr('builtins.input', lambda text, answer=answer: answer)
+        assert run('delete', 'a') == status
+    assert not Memory.machines
+
+
+def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a')
+    record('a', **alive())
+    said = run('delete', 'a', '--yes')
+    assert 'has the machine' in str(said) and '--force' in str(said)
+    assert Memory.machines
+    assert run('delete', 'a', '--yes', '--force') == 0
+    assert not Memory.machines
+    # its launch takes the record down itself
+    assert Store().machine('a').exists()
+
+
+def test_delete_without_a_store(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a')
+    assert run('delete', 'a', '-y') == 0
+    assert not Memory.machines
+
+
+def test_delete_with_a_damaged_record() -> None:
+    machine('a')
+    folder = Store().machine('a').path
+    folder.mkdir(parents=True)
+    (folder / 'record.json').write_text('nonsense')
+    assert run('delete', 'a', '-y') == 0
+    assert not Memory.machines and not folder.exists()
+
+
+def test_delete_all_leaves_other_robots_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a')
+    machine('b')
+    machine('c', robot='somebody-7')
+    assert run('delete', 'all', '--yes') == 0
+    assert '1 of other robots left out' in capsys.readouterr().err
+    assert list(Memory.machines) == ['id-c']
+    assert run('delete', 'all', '--yes', '--any-robot') == 0
+    assert not Memory.machines
+
+
+def test_one_failure_stops_nothing_and_keeps_the_record(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('a', 'stuck')
+    record('a', 'stuck', **dead())
+    machine('b')
+    assert run('delete', 'all', '-y') == 1
+    out = capsys.readouterr()
+    assert 'a: the cloud said no (ask again)' in out.err and 'deleted b' in out.out
+    assert Store().machine('a').exists()
+
+
+def test_a_provider_that_can_not_be_asked_is_not_forgotten() -> None:
+    record('a', provider='nosdk', **dead())
+    assert run('delete', 'a', '-y') == 1
+    assert Store().machine('a').exists()
+    assert run('delete', 'a', '-y', '--force') == 0
+    assert not Store().machine('a').exists()
+
+
+@pytest.mark.parametrize(('changes', 'record_changes', 'reason'), [
+    ({}, {'launch': ''}, ''),
+    ({}, {'pid': 1, 'pid_start': 1}, 'its launch is gone'),
+    ({}, {'pid': 1, 'pid_start': 1, 'on_exit': 'keep'}, ''),
+    ({'expires': NOW - 600}, {'launch': ''}, 'past its lifetime'),
+    ({'expires': NOW - 30}, {'launch': ''}, ''),
+    ({'expires': NOW - 600}, 'alive', ''),
+    ({'expires': NOW - 600, 'robot': 'x-1'}, None, ''),
+    ({'expires': NOW - 600}, None, 'past its lifetime'),
+    ({'state': MachineState.STOPPED, 'created': NOW - 30 * 86400}, {'launch': ''}, 'stopped'),
+    ({'state': MachineState.STOPPED, 'created': NOW - 3600}, {'launch': ''}, ''),
+    ({'state': MachineState.DELETED}, {'launch': ''}, 'gone at its provider'),
+])
+def test_what_gc_ends(changes: Any, record_changes: Any, reason: str) -> None:
+    found = machine('a', **{'expires': NOW + 600, **changes})
+    known = None
+    if record_changes is not None:
+        known = record('a', **(alive() if record_changes == 'alive' else record_changes))
+    entry = Entry('a', 'memory', found, known)
+    said = endings.why_end(entry, NOW, endings.KEEP_STOPPED)
+    assert said.startswith(reason) and bool(said) == bool(reason)
+
+
+def test_gc_clears_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('gc') == 0
+    assert capsys.readouterr().out == 'nothing to clear\n'
+    machine('old', expires=time.time() - 600)
+    record('gone', **dead())
+    machine('kept')
+    record('kept', on_exit='keep', **dead())
+    machine('busy')
+    record('busy', **alive())
+    assert run('gc', '--dry-run', '--json') == 0
+    would = {entry['name']: entry['reason'] for entry in json.loads(capsys.readouterr().out)}
+    assert would == {'old': 'past its lifetime', 'gone': 'gone at its provider',
+                     'kept': 'its launch is gone'}
+    assert len(Memory.machines) == 3
+    assert run('gc') == 0
+    assert sorted(Memory.machines) == ['id-busy', 'id-kept']
+    assert not Store().machine('gone').exists()
+    kept = Store().machine('kept').load()
+    assert kept.launch == '' and kept.machine_id == 'id-kept'
+    assert Store().machine('busy').load().launch == 'abc123'
+    capsys.readouterr()
+    assert run('gc') == 0
+    assert capsys.readouterr().out == 'nothing to clear\n'
+
+
+def test_leftover_launch_folders_are_found_by_their_process() -> None:
+    store = Store()
+    for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None)):
+        folder = store.launch(name)
+        if about is not None:
+            (folder / 'process.json').write_text(json.dumps(about))
+    record('a', launch='dddddd', **dead())
+    store.launch('dddddd')
+    assert [left.launch for left in endings.leftovers(store)] == ['bbbbbb']
+    later = time.time() + endings.FOLDER_AGE + 60
+    assert [left.launch for left in endings.leftovers(store, later)] == ['bbbbbb', 'cccccc']
+
+
+def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
+                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    monkeypatch.setenv('CYCLONEDDS_URI', '<a b="c\'d"/>')
+    machine('a')
+    record('a', **alive())
+    assert 'no launch is running' in str(run('env', 'a'))
+    path = Store().launch('abc123') / 'dds.xml'
+    path.write_text('<x/>')
+    assert run('env', 'a') == 0
+    said = capsys.readouterr().out
+    shown = subprocess.run(
+        ['sh', '-c', f'{said}\nprintf "%s\\n" "$RMW_IMPLEMENTATION" "$CYCLONEDDS_URI"'],
+        capture_output=True, text=True, check=True).stdout.splitlines()
+    assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}']
+    assert run('env', 'a', '--json') == 0
+    assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+    record('a', **dead())
+    assert 'no launch is running' in str(run('env', 'a'))
+
+
+@pytest.mark.parametrize('verb', ['status', 'logs', 'connect', 'env', 'delete'])
+def test_an_unknown_machine_is_one_line_and_a_status(
+    verb: str, capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = [verb, 'nowhere'] + (['--yes'] if verb == 'delete' else [])
+    said = run(*words)
+    err = capsys.readouterr().err.splitlines()
+    assert said not in (0, None)
+    text = [line for line in [str(said), *err] if 'nowhere' in line]
+    assert len(text) == 1
+
+
+@pytest.mark.parametrize('name', ['a b', 'x;rm -rf', '../up', 'UPPER', ''])
+def test_a_name_that_can_not_be_one(name: str) -> None:
+    for verb in ('status', 'env', 'connect'):
+        assert 'no name for a machine' in str(run(verb, name))
+
+
+def test_names_are_completed_without_asking_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ros2fog_cli.verb import complete_names
+    monkeypatch.setattr(Memory, 'find', lambda *a: 1 / 0)
+    record('alpha')
+    record('beta')
+    assert complete_names('', None) == ['alpha', 'beta']  # type: ignore[arg-type]
+    assert complete_names('al', None) == ['alpha']  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(('seconds', 'text'), [
+    (None, '-'), (-1, 'over'), (0, '0 s'), (119, '119 s'), (120, '2 min'), (7199, '2 h 00 min'),
+    (3600 * 30 + 300, '30 h 05 min'), (86400 * 3 + 7200, '3 d 2 h')])
+def test_durations(seconds: Optional[float], text: str) -> None:
+    assert table.duration(seconds) == text
+
+
+def test_sizes_and_costs() -> None:
+    assert [table.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
+        '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
+    assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'
+
+
+def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 0
+    said = capsys.readouterr().out
+    for verb in ('connect', 'delete', 'doctor', 'env', 'gc', 'list', 'logs', 'status'):
+        assert verb in said
+
+
+def test_help_imports_no_core(tmp_path: Path) -> None:
+    code = ('import sys\nfrom ros2cli.cli import main\n'
+            "try:\n    main(argv=['fog', '-h'])\nexcept SystemExit:\n    pass\n"
+            "print([m for m in sys.modules if m.split('.')[0] in ('paramiko', 'boto3', 'yaml')"
+            " or m in ('fogros2.deploy', 'fogros2.provider')], file=sys.stderr)")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          cwd=tmp_path, check=True)
+    assert done.stderr.splitlines()[-1] == '[]'

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog doctor``: each check by what it finds, and the search for others on the LAN."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import socket
+import struct
+import subprocess
+import sys
+import threading
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import process
+from ros2fog_cli.api import doctor, lan
+
+
+def test_it_runs_here(capsys: pytest.CaptureFixture[str]) -> None:
+    status = main(argv=['fog', 'doctor', '--json', '--lan-seconds', '0'])
+    checks = json.loads(capsys.readouterr().out)
+    assert len(checks) >= 15
+    assert {check['verdict'] for check in checks} <= {'ok', 'warning', 'failed'}
+    failed = [check for check in checks if check['verdict'] == 'failed']
+    assert status == (1 if failed else 0)
+    for check in checks:
+        assert check['detail']
+        if check['verdict'] == 'failed':
+            assert check['remedy']
+
+
+def test_people_get_a_line_and_a_remedy(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_nobody_cpp')
+    assert main(argv=['fog', 'doctor', '--lan-seconds', '0']) == 1
+    lines = capsys.readouterr().out.splitlines()
+    at = next(n for n, line in enumerate(lines) if 'RMW_IMPLEMENTATION' in line)
+    assert lines[at].startswith('[FAIL]') and 'rmw_nobody_cpp' in lines[at]
+    assert 'unset it' in lines[at + 1]
+
+
+def test_missing_programs_are_named_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    which = process.which
+    monkeypatch.setattr(process, 'which', lambda p: None if p in ('wg', 'rsync') else which(p))
+    check = doctor.programs()
+    assert check.verdict == 'failed' and 'wg, rsync' in check.detail
+    assert 'apt-get install rsync wireguard-tools' in check.remedy
+
+
+def test_no_wireguard_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, '_succeeds', lambda *words: False)
+    monkeypatch.setattr(Path, 'exists', lambda self: False)
+    monkeypatch.setattr(process, 'which', lambda program: None)
+    check = doctor.wireguard()
+    assert check.verdict == 'failed' and 'apt-get install wireguard-go' in check.remedy
+
+
+@pytest.mark.parametrize(('uri', 'verdict'), [
+    ('', 'ok'), ('<CycloneDDS/>', 'ok'), ('<CycloneDDS>', 'failed'),
+    ('file:///nowhere/x.xml', 'failed'), ('/nowhere/x.xml', 'failed')])
+def test_the_user_s_cyclone_configuration(
+    uri: str, verdict: str, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('CYCLONEDDS_URI', uri)
+    assert doctor.cyclone_uri().verdict == verdict
+
+
+def test_several_cyclone_configurations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, bad = tmp_path / 'good.xml', tmp_path / 'bad.xml'
+    good.write_text('<CycloneDDS/>')
+    bad.write_text('CycloneDDS')
+    monkeypatch.setenv('CYCLONEDDS_URI', f'<CycloneDDS><a x="1,2"/></CycloneDDS>,file://{good}')
+    assert doctor.cyclone_uri().verdict == 'ok'
+    monkeypatch.setenv('CYCLONEDDS_URI', f'{good},{bad}')
+    check = doctor.cyclone_uri()
+    assert check.verdict == 'failed' and 'bad.xml' in check.detail
+
+
+def test_the_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / 'state'
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(folder))
+    assert 'will be made' in doctor.state().detail
+    folder.mkdir(mode=0o755)
+    folder.chmod(0o755)
+    assert doctor.state().verdict == 'warning'
+    folder.chmod(0o700)
+    assert doctor.state().verdict == 'ok'
+
+
+def test_a_firewall_that_drops_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = ('table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; '
+             'policy drop;\n\t\t%s\n\t}\n}\n')
+
+    def answer(text: str) -> None:
+        from fogros2.model import Result
+        monkeypatch.setattr(process, 'run', lambda *a, **k: Result(0, text, ''))
+
+    answer(rules % 'ct state established accept')
+    assert doctor.firewall().verdict == 'warning'
+    answer(rules % 'iifname "fog*" accept')
+    assert doctor.firewall().verdict == 'ok'
+    answer('')
+    assert doctor.firewall().verdict == 'ok'
+
+
+def test_the_announcement_is_what_the_specification_says() -> None:
+    message = lan.announcement(bytes(range(12)), '198.51.100.7', 5000, 3)
+    assert message[:4] == b'RTPS' and message[8:20] == bytes(range(12))
+    kind, flags, length = struct.unpack_from('<BBH', message, 20)
+    assert (kind, flags) == (0x15, 0x05) and len(message) == 24 + length
+    # the parameter list ends with its sentinel and is aligned
+    assert message[-4:] == struct.pack('<HH', 1, 0) and len(message) % 4 == 0
+    assert socket.inet_aton('198.51.100.7') in message
+
+
+def test_answers_of_others_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for another computer answers an announcement from an address of its own."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(('127.0.0.2', 0))
+        monkeypatch.setattr(lan, 'addresses', lambda: ['127.0.0.1'])
+
+        def announce(link: socket.socket, address: str, port: int, prefix: bytes,
+                     domain: int) -> None:
+            for guid in (b'a' * 12, b'b' * 12, b'a' * 12):
+                peer.sendto(b'RTPS\x02\x03\x01\x10' + guid + b'rest', ('127.0.0.1', port))
+            peer.sendto(b'noise', ('127.0.0.1', port))
+
+        monkeypatch.setattr(lan, '_announce', announce)
+        assert lan.participants(0, 0.3) == {'127.0.0.2': 2}
+    monkeypatch.setattr(lan, 'participants', lambda domain, seconds: {'10.1.2.3': 2})
+    check = doctor.lan_peers(1)
+    assert check.verdict == 'warning' and '10.1.2.3 (2)' in check.detail
+
+
+_PEER = """
+import sys, time
+from cyclonedds.domain import DomainParticipant
+participant = DomainParticipant(0)
+print('up', flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_real_participant_on_another_computer_is_found(tmp_path: Path) -> None:
+    """Two network namespaces on one wire: Cyclone DDS as it is out of the box in one of them."""
+    pytest.importorskip('cyclonedds', reason='this interpreter has no Cyclone DDS of its own')
+    if os.geteuid() != 0:
+        pytest.skip('network namespaces need root')
+    made = subprocess.run(['unshare', '-n', 'true'], capture_output=True)
+    if made.returncode:
+        pytest.skip('no network namespaces here')
+    script = tmp_path / 'both.sh'
+    # everything lives in one new namespace and goes with it; nothing of it is on this computer
+    script.write_text(f"""\
+set -e
+ip link set lo up
+unshare -n sleep 60 & other=$!
+trap 'kill $other $peer 2>/dev/null || true' EXIT
+until [ "$(readlink /proc/$other/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do :; done
+ip link add here type veth peer name there netns $other
+ip addr add 198.51.100.1/24 dev here
+ip link set here up
+nsenter -t $other -n ip addr add 198.51.100.2/24 dev there
+nsenter -t $other -n ip link set there up
+nsenter -t $other -n ip link set lo up
+mkfifo {tmp_path}/hold {tmp_path}/up
+exec 3<>{tmp_path}/hold
+nsenter -t $other -n {sys.executable} -c "$1" <{tmp_path}/hold >{tmp_path}/up & peer=$!
+read -r _ <{tmp_path}/up
+{sys.executable} -c "$2"
+""")
+    environment = {key: value for key, value in os.environ.items()
+                   if key not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
+    ask = 'from ros2fog_cli.api import lan; print(lan.participants(0, 4))'
+    done = subprocess.run(['unshare', '-n', 'sh', str(script), _PEER, ask], text=True, timeout=60,
+                          capture_output=True, env=environment, cwd=tmp_path)
+    assert done.stdout.strip() == "{'198.51.100.2': 1}", done.stderr
+
+
+def test_a_second_thread_may_ask_meanwhile() -> None:
+    threads = [threading.Thread(target=doctor.examine, kwargs={'lan_seconds': 0})
+               for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+        assert not thread.is_alive()
