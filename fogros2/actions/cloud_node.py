@@ -9,7 +9,6 @@ from typing import Any, Optional, Union
 from launch import LaunchContext, LaunchDescriptionEntity
 from launch_ros.actions import Node
 
-from fogros2 import plugin_system
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess
@@ -47,6 +46,10 @@ class CloudNode(Node, RemoteProcess):
 
         :raises ConfigurationError: no image transport is called so.
         """
+        if not self.stream_topics:
+            return []
+        # the reader of entry points is slow to import, and needed for this alone
+        from fogros2 import plugin_system
         streams = []
         for topic, transport in self.stream_topics:
             plugin_system.load('fogros2.image_transport', transport)

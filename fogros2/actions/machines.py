@@ -9,7 +9,6 @@ import inspect
 import os
 from pathlib import Path
 import re
-import secrets
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2.actions import words
@@ -206,14 +205,16 @@ class ContainerInstance(CloudInstance):
     :param image: what it is made of; None for this computer's own root, seen through an
         allow-list (podman alone).
     :param engine: 'podman' or 'docker'; None for the one that works.
+    :param user: login user, made if needed.
     :param network: name of an existing container network; None for the engine's own.
     :param ip: fixed address in that network.
     :param cpus: limit, such as 1.5.
     :param memory: limit, such as '2g'.
     :param ports: what is published on the robot, in the engine's form.
-    :param mounts: folders of this computer that the container sees, in the engine's form
-        ``source:target[:options]``.
-    :param user: login user, made if needed.
+    :param mounts: folders of this computer that the container sees: ``path`` or
+        ``path:path there``; it can't write to them.
+    :param gpus: 'all' or a number.
+    :param devices: such as '/dev/video0'.
     """
 
     provider = 'container'
@@ -228,12 +229,15 @@ class ContainerInstance(CloudInstance):
         ports: Optional[Sequence[SomeSubstitutionsType]] = None,
         mounts: Optional[Sequence[SomeSubstitutionsType]] = None,
         user: Optional[SomeSubstitutionsType] = None,
+        gpus: Optional[SomeSubstitutionsType] = None,
+        devices: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
         super().__init__(options={
-            'image': image, 'engine': engine, 'network': network, 'ip': ip, 'cpus': cpus,
-            'memory': memory, 'ports': words.items(ports), 'mounts': words.items(mounts),
-            'user': user,
+            'image': image, 'engine': engine, 'network': network, 'ip': ip,
+            'cpus': words.number(cpus), 'memory': memory, 'ports': words.items(ports),
+            'mounts': words.items(mounts), 'user': user, 'gpus': gpus,
+            'devices': words.items(devices),
         }, **common)
 
 
@@ -246,7 +250,6 @@ class SSHInstance(CloudInstance):
     :param port: TCP port of its SSH server.
     :param key: private key file to log in with; None for the user's own keys and agent.
     :param host_key: its public host key (``ssh-ed25519 AAAA...``); None lets known_hosts decide.
-    :param vpn_host: address at which the robot reaches its VPN port (UDP); None for ``host``.
     """
 
     provider = 'ssh'
@@ -254,12 +257,10 @@ class SSHInstance(CloudInstance):
     def __init__(
         self, host: SomeSubstitutionsType, user: Optional[SomeSubstitutionsType] = None,
         port: Value = 22, key: Optional[SomeSubstitutionsType] = None,
-        host_key: Optional[SomeSubstitutionsType] = None, *,
-        vpn_host: Optional[SomeSubstitutionsType] = None, **common: Any,
+        host_key: Optional[SomeSubstitutionsType] = None, **common: Any,
     ) -> None:
         super().__init__(options={
             'host': host, 'user': user, 'port': port, 'key': key, 'host_key': host_key,
-            'vpn_host': vpn_host,
         }, **common)
 
 
@@ -336,5 +337,6 @@ _NOUNS = (
 
 
 def _two_words() -> str:
-    number = secrets.token_hex(2)
-    return f'{secrets.choice(_ADJECTIVES)}-{secrets.choice(_NOUNS)}-{number}'
+    first, second, *number = os.urandom(4)
+    return (f'{_ADJECTIVES[first % len(_ADJECTIVES)]}-{_NOUNS[second % len(_NOUNS)]}-'
+            f'{bytes(number).hex()}')

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 import os
 from typing import Any, Optional, TYPE_CHECKING
 
+from fogros2.errors import ConfigurationError
+
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType
 
@@ -20,6 +22,18 @@ def items(values: Optional[Iterable[SomeSubstitutionsType]]) -> Optional[Items]:
     return None if values is None else Items(values)
 
 
+class Number:
+    """A value that is a number once it is resolved; substitutions only make texts."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+def number(value: Any) -> Optional[Number]:
+    """Return a value that resolves to a number, None for none."""
+    return None if value is None else Number(value)
+
+
 def resolve(context: LaunchContext, value: Any) -> Any:
     """
     Return a value with its substitutions performed.
@@ -29,6 +43,12 @@ def resolve(context: LaunchContext, value: Any) -> Any:
     """
     if value is None or isinstance(value, (str, int, float)):
         return value
+    if isinstance(value, Number):
+        text = resolve(context, value.value)
+        try:
+            return float(text)
+        except ValueError:
+            raise ConfigurationError(f'{text!r} is no number') from None
     if isinstance(value, Items):
         return [resolve(context, item) for item in value]
     if isinstance(value, Mapping):

@@ -39,12 +39,14 @@ def test_everything_that_a_container_takes(context):
         on_exit='keep', lifetime='1h30m', robot_timeout=30, bootstrap='none',
         environment={'A': '1'}, image='ros:jazzy',
         engine='docker', network='net', ip='198.51.100.7', cpus=1.5, memory='2g',
-        ports=['8080:80'], mounts=['/a:/b:ro'], user='me')
+        ports=['8080:80'], mounts=['/a:/b'], user='me',
+        gpus='all', devices=['/dev/video0'])
     machine.add_docker_container('docker run hello-world')
     spec = machine.spec(context)
     assert spec.options == {
         'image': 'ros:jazzy', 'engine': 'docker', 'network': 'net', 'ip': '198.51.100.7',
-        'cpus': 1.5, 'memory': '2g', 'ports': ['8080:80'], 'mounts': ['/a:/b:ro'], 'user': 'me'}
+        'cpus': 1.5, 'memory': '2g', 'ports': ['8080:80'], 'mounts': ['/a:/b'], 'user': 'me',
+        'gpus': 'all', 'devices': ['/dev/video0']}
     assert (spec.workspace, spec.on_exit, spec.lifetime) == ('/robot/ws', 'keep', 5400)
     assert (spec.robot_timeout, spec.bootstrap, spec.environment) == (30, 'none', {'A': '1'})
     assert spec.launch_foxglove and spec.containers == ('docker run hello-world',)
@@ -61,17 +63,19 @@ def test_ssh(context):
 
 def test_substitutions_are_resolved_when_executed(context):
     from launch.substitutions import LaunchConfiguration
-    context.launch_configurations.update(name='slam', memory='4g', exit='stop', life='2h', w='/w')
+    context.launch_configurations.update(
+        name='slam', memory='4g', cpus='2', exit='stop', life='2h', w='/w')
     machine = ContainerInstance(
         ros_workspace=LaunchConfiguration('w'), name=[LaunchConfiguration('name'), '-1'],
-        memory=LaunchConfiguration('memory'), on_exit=LaunchConfiguration('exit'),
+        memory=LaunchConfiguration('memory'), cpus=LaunchConfiguration('cpus'),
+        on_exit=LaunchConfiguration('exit'),
         lifetime=LaunchConfiguration('life'), mounts=[['/', LaunchConfiguration('name'), ':/x']],
         environment={'NAME': LaunchConfiguration('name')})
     assert 'name' in machine.name
     spec = machine.spec(context)
     assert (spec.name, machine.name, spec.on_exit, spec.lifetime) == (
         'slam-1', 'slam-1', 'stop', 7200)
-    assert spec.options == {'memory': '4g', 'mounts': ['/slam:/x']}
+    assert spec.options == {'memory': '4g', 'cpus': 2.0, 'mounts': ['/slam:/x']}
     assert spec.environment == {'NAME': 'slam'} and spec.workspace == '/w'
     # once: a machine doesn't change when the configuration does
     context.launch_configurations['name'] = 'other'
@@ -83,7 +87,7 @@ def test_substitutions_are_resolved_when_executed(context):
      "ContainerInstance has no attribute 'imge' (did you mean 'image'?)"),
     (lambda: ContainerInstance(lifetme=3), "did you mean 'lifetime'?"),
     (lambda: SSHInstance('host', hostkey='k'), "did you mean 'host_key'?"),
-    (lambda: ContainerInstance(zzz=1), 'there are: bootstrap, cpus, engine'),
+    (lambda: ContainerInstance(zzz=1), 'there are: bootstrap, cpus, devices'),
     (lambda: ContainerInstance(name='two words'), "'two words' is no name for a machine"),
     (lambda: ContainerInstance(name='$(reboot)'), 'is no name for a machine'),
     (lambda: ContainerInstance(name='x' * 41), 'is no name for a machine'),
@@ -106,6 +110,7 @@ def test_mistakes_in_substitutions(context):
     context.launch_configurations['x'] = 'no such thing'
     context.launch_configurations['keep'] = 'keep'
     for arguments in ({'on_exit': LaunchConfiguration('keep')},
+                      {'cpus': LaunchConfiguration('x')},
                       {'name': LaunchConfiguration('x')},
                       {'on_exit': LaunchConfiguration('x')},
                       {'lifetime': LaunchConfiguration('x')}):
