@@ -210,7 +210,7 @@ def _close_all() -> None:
 class Policies(NamedTuple):
     """DDS's values of the policies that ROS 2 knows; durations in ns (0: unspecified)."""
 
-    depth: int = 0  # 0: keep all
+    depth: int = 0  # 0: keep all; -1: unknown
     reliable: bool = True
     transient_local: bool = False
     lifespan: int = 0
@@ -254,8 +254,9 @@ def _read_qos(qos: int) -> Policies:
     def span(function: Any) -> int:
         return duration.value if function(qos, ct.byref(duration)) else INFINITE
 
-    _lib.dds_qget_history(qos, ct.byref(kind), ct.byref(number))
-    depth = number.value if kind.value == 0 else 0
+    depth = -1
+    if _lib.dds_qget_history(qos, ct.byref(kind), ct.byref(number)):
+        depth = number.value if kind.value == 0 else 0
     reliable = bool(_lib.dds_qget_reliability(qos, ct.byref(kind), ct.byref(duration))
                     and kind.value)
     durable = bool(_lib.dds_qget_durability(qos, ct.byref(kind)) and kind.value)

@@ -159,14 +159,12 @@ class QoSProfile:
             ignore_local=ignore_local)
 
     @classmethod
-    def _from_policies(cls, policies: Policies, local: bool = False) -> 'QoSProfile':
-        """Translate from DDS; of a remote endpoint nobody knows the history."""
-        history = HistoryPolicy.UNKNOWN
-        if local:
-            history = HistoryPolicy.KEEP_LAST if policies.depth else HistoryPolicy.KEEP_ALL
+    def _from_policies(cls, policies: Policies) -> 'QoSProfile':
+        """Translate from DDS."""
         return cls(
-            history=history,
-            depth=policies.depth if local else 0,
+            history=HistoryPolicy.UNKNOWN if policies.depth < 0
+            else HistoryPolicy.KEEP_LAST if policies.depth else HistoryPolicy.KEEP_ALL,
+            depth=max(policies.depth, 0),
             reliability=ReliabilityPolicy.RELIABLE if policies.reliable
             else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if policies.transient_local
