@@ -223,6 +223,10 @@ class Launch:
             if self._robot is None:
                 folder = self.store.launch(self.id)
                 self._undo.callback(shutil.rmtree, folder, ignore_errors=True)
+                # by this, `ros2 fog gc` tells the folder of a launch that was killed
+                pid = os.getpid()
+                write_private(folder / 'process.json', model.to_json(
+                    {'pid': pid, 'pid_start': process_start(pid)}).encode())
                 self._robot = RobotVpn(self, folder)
             return self._robot
 
@@ -654,7 +658,8 @@ class _Deployment:
         robot = self.launch._robot_vpn()
         agent.request(
             'keep', timeout=self.timeouts.agent, what='vpn', interval=1.0,
-            alive=list(robot.vpn.alive(member.interface).argv), repair=member.repair(robot))
+            alive=list(robot.vpn.alive(member.interface).argv), repair=member.repair(robot),
+            down=[list(c.argv) for c in robot.vpn.down(member.interface)])
 
     def _leave_vpn(self, shell: Shell, interface: VpnInterface) -> None:
         robot = self.launch._robot_vpn()
@@ -726,7 +731,8 @@ class _Deployment:
             # no cancel: it is needed on the way down as well, and each request has its deadline
             agent = AgentClient(shell, directory, agent_path=program)
             undo.callback(agent.close)
-            agent.request('configure', timeout=self.timeouts.agent, **config)
+            # the record said that the launch before is gone: its agent may not know yet
+            agent.request('configure', timeout=self.timeouts.agent, force=self.reused, **config)
             return agent
 
     def _remove_agent(self, shell: Shell, directory: str) -> None:
@@ -766,7 +772,8 @@ class _Deployment:
         """Push what comes first on the way down: the nodes end."""
         def release() -> None:
             if self._survives():
-                agent.request('release', timeout=self.timeouts.agent,
+                # answers when the nodes are gone, which takes as long as they may
+                agent.request('release', timeout=self.timeouts.delete,
                               on_exit=self.spec.on_exit, exit=not self.provider.agent_program)
 
         undo.callback(self.launch.attempt, self.name, 'nodes', release)

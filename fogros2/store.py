@@ -200,6 +200,13 @@ class Store:
                 records.append(Record(path.name, '', spec, damage=str(error)))
         return records
 
+    def sweep(self) -> None:
+        """Remove the locks of launches that were killed."""
+        for path in (self.root / 'machines').glob('.*.lock'):
+            with contextlib.suppress(NameTaken, ConfigurationError):
+                with self.machine(path.name[1:-len('.lock')]).lock():
+                    pass
+
 
 def robot_name() -> str:
     """Return this robot's name in tags: the host's name and the user's id."""

@@ -65,6 +65,8 @@ class GcVerb(VerbExtension):
                 except FogError as problem:
                     error, failed = str(problem), 1
                 note('leftovers of launch', leftover.launch, 'the launch is gone', error)
+            if not args.dry_run:
+                store.sweep()
         if args.json:
             print(json.dumps(done, indent=2))
         elif not done:

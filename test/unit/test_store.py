@@ -90,8 +90,14 @@ def test_a_killed_holder_frees_the_name(store):
             pass
     child.kill()
     child.communicate()
+    assert [p.name for p in (store.root / 'machines').iterdir()] == ['.planner.lock']
+    store.sweep()
+    assert list((store.root / 'machines').iterdir()) == []
     with store.machine('planner').lock():
-        pass
+        store.sweep()
+        with pytest.raises(NameTaken):
+            with store.machine('planner').lock():
+                pass
 
 
 def test_a_process_is_told_from_another_with_its_id():

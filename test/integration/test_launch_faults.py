@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals to ``ros2 launch`` in every step of a deployment: whatever happens, nothing is left."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import threading
+
+import pytest
+
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+LAUNCH = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name='planner', network='{network}', robot_timeout={timeout})
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen'),
+        Node(package='fogros2_examples', executable='listener', output='screen'),
+    ])
+"""
+
+#: What a launch prints as a step begins, and at last when messages arrive.
+STEPS = {
+    'create': 'planner: machine ...', 'vpn interface': 'robot: VPN interface ...',
+    'connect': 'planner: connect ...', 'ros': 'planner: ROS 2 ...', 'guard': 'planner: guard ...',
+    'vpn': 'planner: VPN ...', 'agent': 'planner: agent ...', 'running': 'I heard',
+}
+
+
+class Launched:
+    """A ``ros2 launch`` process, its output read all the time."""
+
+    def __init__(self, path: Path) -> None:
+        self.said: list[str] = []
+        self.child = subprocess.Popen(
+            ['ros2', 'launch', '--debug', str(path)], stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            # a shell that starts tests in the background has SIGINT ignored
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.child.stdout is not None
+        for line in self.child.stdout:
+            self.said.append(line)
+
+    def wait_for(self, words: str, timeout: float = 60.0) -> None:
+        """Wait until a line with ``words`` came."""
+        def there() -> bool:
+            if any(words in line for line in list(self.said)):
+                return True
+            if self.child.poll() is not None:
+                pytest.fail(f'the launch ended before {words!r}:\n{"".join(self.said)}')
+            return False
+
+        wait_until(there, timeout=timeout, what=repr(words), longest=0.005, interval=0.002)
+
+    def ended(self, timeout: float = 60.0) -> int:
+        """Return the exit status."""
+        code = self.child.wait(timeout)
+        self._reader.join(5)
+        return code
+
+
+@pytest.fixture
+def launched(tmp_path, cloud_network):
+    started = []
+
+    def start(timeout=120):
+        path = tmp_path / 'planner.launch.py'
+        path.write_text(LAUNCH.format(network=cloud_network, timeout=timeout))
+        started.append(Launched(path))
+        return started[-1]
+
+    yield start
+    for launch in started:
+        if launch.child.poll() is None:
+            os.killpg(launch.child.pid, signal.SIGKILL)
+        launch.child.wait(10)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize('step', STEPS)
+def test_a_signal_in_any_step_takes_everything_back(launched, step, number):
+    launch = launched()
+    launch.wait_for(STEPS[step])
+    launch.child.send_signal(number)
+    code = launch.ended()
+    assert 'Traceback' not in ''.join(launch.said)
+    assert code in (0, 1), ''.join(launch.said)
+
+
+def test_a_second_interrupt_does_not_stop_the_way_back(launched):
+    launch = launched()
+    launch.wait_for(STEPS['vpn'])
+    launch.child.send_signal(signal.SIGINT)
+    launch.wait_for('SIGINT')
+    launch.child.send_signal(signal.SIGINT)
+    launch.ended()
+
+
+def test_a_closed_terminal_takes_everything_back(launched):
+    launch = launched()
+    launch.wait_for(STEPS['running'])
+    launch.child.send_signal(signal.SIGHUP)
+    launch.ended()
+
+
+@pytest.mark.parametrize('step', STEPS)
+def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
+    launch = launched(timeout=3)
+    launch.wait_for(STEPS[step])
+    launch.child.kill()
+    launch.ended()
+    # orphaned robot nodes are the user's to end, as with any launch that was killed
+    end_group(launch.child.pid)
+    if step not in ('create', 'vpn interface'):
+        wait_until(lambda: not containers(), timeout=60,
+                   what='the machine to end itself')
+    # killed early, it may have had no machine yet; an engine may still be making one
+    wait_until(lambda: fog('delete', 'planner', '--yes') is not None and not containers(),
+               timeout=60, what='ros2 fog delete')
+    assert fog('gc') == 0
+
+
+def end_group(group: int) -> None:
+    try:
+        os.killpg(group, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+
+
+def containers() -> list[str]:
+    return subprocess.run(
+        ['podman', 'ps', '-aq', '--filter', 'name=fogros2-planner'], check=True,
+        capture_output=True, text=True).stdout.split()
+
+
+def fog(*words: str) -> int:
+    return subprocess.run(['ros2', 'fog', *words], capture_output=True, timeout=60).returncode
