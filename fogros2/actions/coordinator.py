@@ -174,6 +174,7 @@ class Coordinator:
         elif session.spec != spec:
             raise ConfigurationError(f"two machines of this launch are called '{spec.name}'",
                                      'give each a name= of its own')
+        session.add(machine)
         return session
 
     def begin(self) -> None:
@@ -258,7 +259,6 @@ class Coordinator:
             # at once, though other machines are still on their way
             self._fail(error)
             return
-        self._instances[session.spec.name].is_up(running)
         session.up(running)
 
     def _raise_in_launch(self, task: asyncio.Task[None]) -> None:

@@ -15,6 +15,7 @@ from fogros2.errors import FogError
 from fogros2.model import MachineSpec, NodeSpec
 
 if TYPE_CHECKING:
+    from fogros2.actions.machines import CloudInstance
     from fogros2.deploy import RunningMachine
 
 T = TypeVar('T')
@@ -64,6 +65,8 @@ class Session:
         fail: Callable[[BaseException], None], changed: Callable[[], None],
     ) -> None:
         self.spec = spec
+        #: What launch files have for the machine; told when it is up.
+        self.instances: list[CloudInstance] = []
         self.running: Optional[RunningMachine] = None
         self.deployment: Optional[asyncio.Task[None]] = None
         self._loop = loop
@@ -90,6 +93,13 @@ class Session:
         return sorted({
             (run.node.package, run.node.executable) for run in self._waiting
             if run.node.package})
+
+    def add(self, instance: CloudInstance) -> None:
+        """Have an instance stand for this machine."""
+        if instance not in self.instances:
+            self.instances.append(instance)
+            if self.running is not None:
+                instance.is_up(self.running)
 
     # -- processes ------------------------------------------------------------------------------
 
@@ -125,7 +135,9 @@ class Session:
     def up(self, running: RunningMachine) -> None:
         """Take it that the machine is up: what waited for it starts."""
         self.running = running
-        running.subscribe(self._event_in_thread)
+        for instance in self.instances:
+            instance.is_up(running)
+        self._request(self._subscribe)
         self._request(self._start_waiting)
         self._changed()
 
@@ -139,6 +151,11 @@ class Session:
         error = None if task.cancelled() else task.exception()
         if error is not None:
             self._fail(error)
+
+    async def _subscribe(self) -> None:
+        assert self.running is not None
+        async with self._order:
+            await self._in_thread(self.running.subscribe, self._event_in_thread)
 
     async def _start_waiting(self) -> None:
         # in one request, so that many nodes start at once

@@ -8,8 +8,12 @@ from collections.abc import Callable, Iterable, Iterator
 import contextlib
 from typing import Any, Optional
 
-from launch import LaunchContext, LaunchDescriptionEntity
+from launch import Event, LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import TimerAction
+from launch.events import IncludeLaunchDescription
+
+#: Methods of the context through which something can come later.
+_INTERCEPTED = ('register_event_handler', 'emit_event_sync')
 
 #: What is done with an entity before it is visited.
 Apply = Callable[[LaunchDescriptionEntity, LaunchContext], None]
@@ -19,8 +23,8 @@ class Wrapped(LaunchDescriptionEntity):
     """
     Another entity, looked at first; what its visit yields is wrapped likewise.
 
-    That holds for what comes later too: actions of a timer, and of every event handler that the
-    visit registers (``RegisterEventHandler``, ``on_exit=``).
+    That holds for what comes later too: the actions of a timer, of every event handler that the
+    visit registers (``RegisterEventHandler``, ``on_exit=``), and of an include that it emits.
     """
 
     def __init__(self, entity: LaunchDescriptionEntity, apply: Apply) -> None:
@@ -35,7 +39,7 @@ class Wrapped(LaunchDescriptionEntity):
             # the handler it registers is one for all timers of the launch, others' as well
             _wrap_result(entity, self._apply)
             return wrap(entity.visit(context), self._apply)
-        with _handlers_wrapped(context, self._apply):
+        with _intercepted(context, self._apply):
             return wrap(entity.visit(context), self._apply)
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
@@ -62,7 +66,7 @@ def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]
     """Wrap what a visit or a handler returned: nothing, an entity, or several."""
     if entities is None:
         return None
-    several = entities if isinstance(entities, Iterable) else (entities,)
+    several: Iterable[Any] = entities if isinstance(entities, Iterable) else (entities,)
     return [Wrapped(entity, apply) for entity in several if entity is not None]
 
 
@@ -71,26 +75,35 @@ def _wrap_result(handles: Any, apply: Apply) -> None:
     handle = handles.handle
 
     def wrapped(*args: Any) -> Optional[list[LaunchDescriptionEntity]]:
-        return wrap(handle(*args), apply)
+        # the context comes last: handle(context) of a timer, handle(event, context) of the rest
+        with _intercepted(args[-1], apply):
+            return wrap(handle(*args), apply)
 
     handles.handle = wrapped
 
 
 @contextlib.contextmanager
-def _handlers_wrapped(context: LaunchContext, apply: Apply) -> Iterator[None]:
-    """Wrap what the event handlers will yield that are registered meanwhile."""
-    outer = vars(context).get('register_event_handler')
-    register = context.register_event_handler
+def _intercepted(context: LaunchContext, apply: Apply) -> Iterator[None]:
+    """Wrap what will come of the handlers registered and the includes emitted meanwhile."""
+    register, emit = context.register_event_handler, context.emit_event_sync
 
-    def wrapping(event_handler: Any, append: bool = False) -> None:
+    def registering(event_handler: Any, append: bool = False) -> None:
         _wrap_result(event_handler, apply)
         register(event_handler, append=append)
 
-    vars(context)['register_event_handler'] = wrapping
+    def emitting(event: Event) -> None:
+        if isinstance(event, IncludeLaunchDescription):
+            event = IncludeLaunchDescription(
+                LaunchDescription(wrap(event.launch_description, apply)))
+        emit(event)
+
+    # launch runs one visit at a time, so the context is ours until this one is over
+    mine = vars(context)
+    outer = {name: mine[name] for name in _INTERCEPTED if name in mine}
+    mine.update(dict(zip(_INTERCEPTED, (registering, emitting))))
     try:
         yield
     finally:
-        if outer is None:
-            del vars(context)['register_event_handler']
-        else:
-            vars(context)['register_event_handler'] = outer
+        for name in _INTERCEPTED:
+            del mine[name]
+        mine.update(outer)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from launch import LaunchDescription, LaunchDescriptionSource
+from launch import events, LaunchDescription, LaunchDescriptionSource
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
@@ -177,9 +177,42 @@ def test_the_users_handlers_work_with_cloud_nodes(run, fake, planner):
     assert seen == [('ProcessStarted', talker, 4001), ('ProcessExited', talker, 4001)]
 
 
-def test_emitting_an_include_is_not_lost(run, fake, planner):
-    from launch.events import IncludeLaunchDescription as Include
+def include(*entities):
+    return events.IncludeLaunchDescription(LaunchDescription(entities))
+
+
+def test_an_include_that_is_emitted(run, fake, planner):
     fake.on_start = ends
-    later = LaunchDescription([cloud_node(planner)])
-    assert run(LaunchDescription([EmitEvent(event=Include(later))])) == 0
+    assert run(LaunchDescription([EmitEvent(event=include(cloud_node(planner)))])) == 0
     assert len(fake.noted('start')) == 1
+
+
+def test_an_include_emitted_from_a_group(run, fake, planner, capfd):
+    fake.on_start = ends
+    assert run(LaunchDescription([CloudGroup(planner, [
+        EmitEvent(event=include(node())),
+        OpaqueFunction(function=lambda context: context.emit_event_sync(
+            include(node(on_exit=lambda event, context: context.emit_event_sync(
+                include(node())))))),
+    ])])) == 0
+    assert len(fake.noted('start')) == 3
+    assert 'here' not in capfd.readouterr().out
+
+
+def test_describing_a_launch_asks_nobody(fake, planner, monkeypatch):
+    """``ros2 launch -s`` and ``--print-description`` only look."""
+    from fogros2.actions.coordinator import Coordinator
+
+    def refuse(*args, **kwargs):
+        raise AssertionError('nothing is to be executed')
+
+    monkeypatch.setattr(Coordinator, '__init__', refuse)
+    monkeypatch.setattr(ContainerInstance, 'spec', refuse)
+    description = FogROSLaunchDescription([
+        DeclareLaunchArgument('speed', default_value='1', description='how fast'),
+        cloud_node(planner),
+        CloudGroup(planner, [DeclareLaunchArgument('inner', default_value='2'), node()]),
+    ])
+    assert [a.name for a in description.get_launch_arguments()] == ['speed', 'inner']
+    for entity in description.describe_sub_entities():
+        assert entity.describe()

@@ -173,6 +173,17 @@ def test_what_a_machine_says_of_itself(run, fake, planner):
     assert planner.info()['public_ip'] == '192.0.2.7'
 
 
+def test_equal_machines_are_one(run, fake, planner):
+    """A launch file included twice makes its machine twice."""
+    fake.on_start = ends
+    twin = ContainerInstance(name='planner', ros_workspace='')
+    first = talker(planner)
+    assert run(LaunchDescription([
+        first, RegisterEventHandler(OnProcessExit(target_action=first, on_exit=[talker(twin)])),
+    ])) == 0
+    assert len(fake.noted('up')) == 1 and planner.is_created and twin.is_created
+
+
 def test_steps_are_shown_and_summed_up(run, fake, planner, capfd):
     fake.on_start = ends
     assert run(LaunchDescription([talker(planner)])) == 0
