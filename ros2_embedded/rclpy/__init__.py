@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.signals import (
-    install_signal_handlers, SignalHandlerOptions, uninstall_signal_handlers)
+from rclpy.signals import install_signal_handlers, SignalHandlerOptions, uninstall_signal_handlers
 from rclpy.task import Future
-from rclpy.utilities import get_default_context, get_rmw_implementation_identifier, ok
+from rclpy.utilities import (
+    get_default_context,
+    get_rmw_implementation_identifier,
+    ok,
+    try_shutdown,
+)
 from rclpy.utilities import shutdown as _shutdown
-from rclpy.utilities import try_shutdown
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor

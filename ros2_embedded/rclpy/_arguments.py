@@ -183,7 +183,7 @@ def _nodes(content: dict[str, Any], prefix: str, found: list[tuple[str, str, Any
     for key, value in content.items():
         if key == 'ros__parameters':
             if not prefix or not isinstance(value, dict):
-                raise ValueError("Cannot have a value before ros__parameters")
+                raise ValueError('Cannot have a value before ros__parameters')
             _flatten(prefix, value, '', found)
         elif isinstance(value, dict):
             _nodes(value, f"{prefix}/{str(key).lstrip('/')}" if prefix else str(key), found)

@@ -86,7 +86,7 @@ class _Status(ct.Structure):
 def _load() -> ct.CDLL:
     spec = importlib.util.find_spec('cyclonedds')
     if spec is None or spec.origin is None:
-        raise ImportError("rclpy needs the package 'cyclonedds' (pip install 'cyclonedds>=11,<12')")
+        raise ImportError("rclpy needs 'cyclonedds': pip install 'cyclonedds>=11,<12'")
     beside = Path(spec.origin).parent.parent / 'cyclonedds.libs'
     for path in sorted(beside.glob('libddsc*')):
         return ct.CDLL(str(path))
@@ -516,6 +516,7 @@ class Builtin:
 
     def __init__(self, participant: int, topic: int) -> None:
         self._participants = topic == BUILTIN_PARTICIPANT
+        self._kind: Any = ct.POINTER(_Participant if self._participants else _Endpoint)
         self.handle = _checked(
             _lib.dds_create_reader(participant, topic, None, None), 'read a built-in topic')
 
@@ -528,8 +529,7 @@ class Builtin:
             number = _checked(_lib.dds_take_mask(
                 self.handle, samples, infos, count, count, ANY_STATE), 'read the graph')
             for pointer, info in zip(samples[:number], infos[:number]):
-                kind = _Participant if self._participants else _Endpoint
-                one = ct.cast(pointer, ct.POINTER(kind)).contents
+                one = ct.cast(pointer, self._kind).contents  # type: ignore[arg-type]
                 key = bytes(one.key)
                 if info.instance_state != ALIVE:
                     known.pop(key, None)

@@ -7,13 +7,20 @@ from typing import Any
 import warnings
 
 from rcl_interfaces.msg import (
-    ListParametersResult, ParameterDescriptor, ParameterEvent, ParameterValue,
-    SetParametersResult)
-
+    ListParametersResult,
+    ParameterDescriptor,
+    ParameterEvent,
+    ParameterValue,
+    SetParametersResult,
+)
 from rclpy.exceptions import (
-    InvalidParameterTypeException, InvalidParameterValueException,
-    ParameterAlreadyDeclaredException, ParameterImmutableException,
-    ParameterNotDeclaredException, ParameterUninitializedException)
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterAlreadyDeclaredException,
+    ParameterImmutableException,
+    ParameterNotDeclaredException,
+    ParameterUninitializedException,
+)
 from rclpy.parameter import Parameter, PARAMETER_SEPARATOR_STRING
 from rclpy.validate_parameter_name import validate_parameter_name
 
@@ -93,7 +100,8 @@ class NodeParameters:
                     '\t- Pass a name and a default value different to "PARAMETER NOT SET"'
                     ' (and optionally a descriptor).\n'
                     '\t- Pass a name and a parameter type.\n'
-                    '\t- Pass a name and a descriptor with `dynamic_typing=True')
+                    '\t- Pass a name and a descriptor with `dynamic_typing=True',
+                    stacklevel=3)
                 descriptor.dynamic_typing = True
             value = self._default(name, given, descriptor)
             if not ignore_override and name in self._parameter_overrides:

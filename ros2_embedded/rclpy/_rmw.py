@@ -7,6 +7,8 @@ from rclpy.exceptions import RCLError
 
 _RANGES = ('SUBNET', 'LOCALHOST', 'OFF', 'SYSTEM_DEFAULT')
 _IMPLEMENTATION = 'rmw_cyclonedds_cpp'
+# an image of 6 MB arrives faster than it is read; what the kernel doesn't give is no error
+_BUFFER = '<Internal><SocketReceiveBufferSize max="10MB"/></Internal>'
 
 
 def domain_id(given: int | None) -> int:
@@ -74,5 +76,5 @@ def configuration(domain: int) -> str:
     if peers:
         listed = ''.join(f'<Peer address="{peer}"/>' for peer in peers)
         discovery += f'<Peers>{listed}</Peers>'
-    return (f'<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain>'
+    return (f'<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery>{_BUFFER}</Domain>'
             f'</CycloneDDS>,{uri}')

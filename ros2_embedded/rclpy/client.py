@@ -6,8 +6,6 @@ import threading
 import time
 from typing import Any
 
-from rosidl_embedded import cdr
-
 from rclpy import _dds
 from rclpy._dds import Reader, Writer
 from rclpy._entity import Entity, Work
@@ -18,6 +16,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile
 from rclpy.service import REQUEST_HEADER
 from rclpy.task import Future
+from rosidl_embedded import cdr
 
 _numbers = iter(range(1, 2 ** 63))
 

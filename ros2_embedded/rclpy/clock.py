@@ -107,6 +107,8 @@ class Clock:
 
     _clock_type: ClockType
     _jumps: list[JumpHandle]
+    _override: int | None  # nanoseconds, while a simulator is the source
+    _simulated: int  # the last time it gave
 
     def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> 'Clock':
         if not isinstance(clock_type, ClockType):
@@ -114,8 +116,7 @@ class Clock:
         self = super().__new__(ROSClock if clock_type is ClockType.ROS_TIME else cls)
         self._clock_type = clock_type
         self._jumps = []
-        self._override: int | None = None  # nanoseconds, while a simulator is the source
-        self._simulated = 0  # the last time it gave
+        self._override, self._simulated = None, 0
         return self
 
     @property

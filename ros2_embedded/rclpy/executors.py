@@ -360,13 +360,14 @@ class MultiThreadedExecutor(Executor):
     def __init__(self, num_threads: int | None = None, *,
                  context: Context | None = None) -> None:
         super().__init__(context=context)
-        from concurrent.futures import Future as Submitted, ThreadPoolExecutor
+        from concurrent.futures import Future as Submitted
+        from concurrent.futures import ThreadPoolExecutor
         if num_threads is None:
             num_threads = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') \
                 else os.cpu_count() or 2
         if num_threads == 1:
             warnings.warn('MultiThreadedExecutor is used with a single thread.\n'
-                          'Use the SingleThreadedExecutor instead.')
+                          'Use the SingleThreadedExecutor instead.', stacklevel=2)
         self._submitted: list[Submitted[None]] = []
         self._executor = ThreadPoolExecutor(num_threads)
 

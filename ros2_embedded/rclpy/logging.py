@@ -8,7 +8,7 @@ import re
 import sys
 import threading
 import time
-from typing import Any, TYPE_CHECKING, TextIO
+from typing import Any, TextIO, TYPE_CHECKING
 
 from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.impl.rcutils_logger import RcutilsLogger

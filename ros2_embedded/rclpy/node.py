@@ -6,7 +6,6 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
-
 from rclpy import _arguments, logging
 from rclpy._dds import Reader, Writer
 from rclpy._entity import Entity
@@ -15,7 +14,10 @@ from rclpy._names import dds_type, expand, join, REQUEST_PREFIX, RESPONSE_PREFIX
 from rclpy._node_graph import NodeGraph
 from rclpy._node_parameters import NodeParameters
 from rclpy.callback_groups import (
-    CallbackGroup, MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup)
+    CallbackGroup,
+    MutuallyExclusiveCallbackGroup,
+    ReentrantCallbackGroup,
+)
 from rclpy.client import Client
 from rclpy.clock import Clock, ROSClock
 from rclpy.constants import S_TO_NS
@@ -28,8 +30,14 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.publisher import Publisher
 from rclpy.qos import (
-    DurabilityPolicy, LivelinessPolicy, qos_profile_parameter_events,
-    qos_profile_rosout_default, qos_profile_services_default, QoSProfile, ReliabilityPolicy)
+    DurabilityPolicy,
+    LivelinessPolicy,
+    qos_profile_parameter_events,
+    qos_profile_rosout_default,
+    qos_profile_services_default,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 from rclpy.qos_overriding_options import override, QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
@@ -547,14 +555,15 @@ class Node(NodeParameters, NodeGraph):
         if logging._rosout.get(self._logger_name) is getattr(self, '_rosout', False):
             del logging._rosout[self._logger_name]
         with self._graph.held():
-            for things, destroy in ((self._publishers, self.destroy_publisher),
-                                    (self._subscriptions, self.destroy_subscription),
-                                    (self._clients, self.destroy_client),
-                                    (self._services, self.destroy_service),
-                                    (self._timers, self.destroy_timer),
-                                    (self._guards, self.destroy_guard_condition)):
+            all_things: tuple[tuple[list[Any], Callable[[Any], bool]], ...] = (
+                (self._publishers, self.destroy_publisher),
+                (self._subscriptions, self.destroy_subscription),
+                (self._clients, self.destroy_client), (self._services, self.destroy_service),
+                (self._timers, self.destroy_timer),
+                (self._guards, self.destroy_guard_condition))
+            for things, destroy in all_things:
                 while things:
-                    destroy(things[0])  # type: ignore[operator]
+                    destroy(things[0])
             self._graph.remove_node(self._record)
         executor = self.executor
         if executor is not None:

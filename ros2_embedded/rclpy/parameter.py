@@ -5,7 +5,8 @@ import array
 from enum import Enum
 from typing import Any
 
-from rcl_interfaces.msg import Parameter as ParameterMsg, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rcl_interfaces.msg import ParameterType, ParameterValue
 
 PARAMETER_SEPARATOR_STRING = '.'
 
@@ -63,7 +64,7 @@ class Parameter:
             if not many:
                 return isinstance(parameter_value, _SCALARS[kind])
             allowed = _SEQUENCES if kind in ('INTEGER', 'DOUBLE') else (list, tuple)
-            single = bytes if kind == 'BYTE' else _SCALARS[kind]
+            single: Any = bytes if kind == 'BYTE' else _SCALARS[kind]
             return isinstance(parameter_value, allowed) and all(
                 isinstance(item, single) and (kind != 'BYTE' or len(item) == 1)
                 for item in parameter_value)

@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 from rcl_interfaces import srv
-
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.node import Node

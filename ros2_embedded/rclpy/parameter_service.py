@@ -5,7 +5,6 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from rcl_interfaces import srv
-
 from rclpy.exceptions import ParameterNotDeclaredException, ParameterUninitializedException
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_parameters

@@ -3,8 +3,6 @@
 
 from typing import Any
 
-from rosidl_embedded import cdr
-
 from rclpy._dds import DDSError, Writer
 from rclpy._names import demangle_topic
 from rclpy.callback_groups import CallbackGroup
@@ -13,6 +11,9 @@ from rclpy.duration import Duration
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle, RCLError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosidl_embedded import cdr
+
+_NO_LIMIT = Duration(seconds=-1)
 
 
 class Publisher:
@@ -83,7 +84,7 @@ class Publisher:
         """Say that it is alive, for liveliness MANUAL_BY_TOPIC."""
         self._use().assert_liveliness()
 
-    def wait_for_all_acked(self, timeout: Duration = Duration(seconds=-1)) -> bool:
+    def wait_for_all_acked(self, timeout: Duration = _NO_LIMIT) -> bool:
         """Wait until all reliable subscriptions have all messages; negative: without limit."""
         writer = self._use()
         if self.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:

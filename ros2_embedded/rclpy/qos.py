@@ -104,6 +104,31 @@ DeadlineBestAvailable = Duration(nanoseconds=2 ** 63 - 2)
 LivelinessLeaseDurationeBestAvailable = Duration(nanoseconds=2 ** 63 - 2)
 
 
+def _policy(name: str, kind: type) -> Any:
+    """Make the property of a policy, which checks what it is set to."""
+    slot = '_' + name
+
+    def getter(self: 'QoSProfile') -> Any:
+        return getattr(self, slot)
+
+    def setter(self: 'QoSProfile', value: Any) -> None:
+        assert isinstance(value, (kind, int) if issubclass(kind, IntEnum) else kind)
+        if name == 'depth' and value == 0 and self.history == HistoryPolicy.KEEP_LAST:
+            warnings.warn(
+                "A zero depth with KEEP_LAST doesn't make sense; no data could be stored. "
+                'This will be interpreted as SYSTEM_DEFAULT', stacklevel=2)
+        setattr(self, slot, kind(value) if issubclass(kind, IntEnum) else value)
+
+    return property(getter, setter, doc=f"The policy '{name}'.")
+
+
+_DEFAULTS: dict[str, Any] = {
+    'history': HistoryPolicy.KEEP_LAST, 'depth': 10, 'reliability': ReliabilityPolicy.RELIABLE,
+    'durability': DurabilityPolicy.VOLATILE, 'lifespan': _UNSPECIFIED, 'deadline': _UNSPECIFIED,
+    'liveliness': LivelinessPolicy.SYSTEM_DEFAULT, 'liveliness_lease_duration': _UNSPECIFIED,
+    'avoid_ros_namespace_conventions': False}
+
+
 class QoSProfile:
     """
     A set of policies.
@@ -111,28 +136,29 @@ class QoSProfile:
     :raises InvalidQoSProfileException: without history and depth, or KEEP_LAST without depth.
     """
 
-    __slots__ = ['_history', '_depth', '_reliability', '_durability', '_lifespan', '_deadline',
-                 '_liveliness', '_liveliness_lease_duration', '_avoid_ros_namespace_conventions']
+    __slots__ = ['_' + name for name in _DEFAULTS]
+
+    history: Any = _policy('history', HistoryPolicy)
+    depth: Any = _policy('depth', int)
+    reliability: Any = _policy('reliability', ReliabilityPolicy)
+    durability: Any = _policy('durability', DurabilityPolicy)
+    lifespan: Any = _policy('lifespan', Duration)
+    deadline: Any = _policy('deadline', Duration)
+    liveliness: Any = _policy('liveliness', LivelinessPolicy)
+    liveliness_lease_duration: Any = _policy('liveliness_lease_duration', Duration)
+    avoid_ros_namespace_conventions: Any = _policy('avoid_ros_namespace_conventions', bool)
 
     def __init__(self, **kwargs: Any) -> None:
         assert all('_' + key in self.__slots__ for key in kwargs), \
             f'Invalid arguments passed to constructor: {kwargs.keys()!r}'
-        if 'history' not in kwargs:
-            if 'depth' not in kwargs:
+        if 'depth' not in kwargs:
+            if 'history' not in kwargs:
                 raise InvalidQoSProfileException('History and/or depth settings are required.')
-            kwargs['history'] = HistoryPolicy.KEEP_LAST
-        self.history = kwargs['history']
-        if self.history == HistoryPolicy.KEEP_LAST and 'depth' not in kwargs:
-            raise InvalidQoSProfileException('History set to KEEP_LAST without a depth setting.')
-        self.depth = kwargs.get('depth', 10)
-        self.reliability = kwargs.get('reliability', ReliabilityPolicy.RELIABLE)
-        self.durability = kwargs.get('durability', DurabilityPolicy.VOLATILE)
-        self.lifespan = kwargs.get('lifespan', _UNSPECIFIED)
-        self.deadline = kwargs.get('deadline', _UNSPECIFIED)
-        self.liveliness = kwargs.get('liveliness', LivelinessPolicy.SYSTEM_DEFAULT)
-        self.liveliness_lease_duration = kwargs.get('liveliness_lease_duration', _UNSPECIFIED)
-        self.avoid_ros_namespace_conventions = kwargs.get(
-            'avoid_ros_namespace_conventions', False)
+            if kwargs['history'] == HistoryPolicy.KEEP_LAST:
+                raise InvalidQoSProfileException(
+                    'History set to KEEP_LAST without a depth setting.')
+        for name, default in _DEFAULTS.items():
+            setattr(self, name, kwargs.get(name, default))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, QoSProfile) and all(
@@ -175,31 +201,6 @@ class QoSProfile:
             else LivelinessPolicy.AUTOMATIC,
             liveliness_lease_duration=Duration(nanoseconds=policies.lease))
 
-
-def _policy(name: str, kind: type) -> property:
-    """Make the property of a policy, which checks what it is set to."""
-    slot = '_' + name
-
-    def getter(self: QoSProfile) -> Any:
-        return getattr(self, slot)
-
-    def setter(self: QoSProfile, value: Any) -> None:
-        assert isinstance(value, (kind, int) if issubclass(kind, IntEnum) else kind)
-        if name == 'depth' and value == 0 and self.history == HistoryPolicy.KEEP_LAST:
-            warnings.warn(
-                "A zero depth with KEEP_LAST doesn't make sense; no data could be stored. "
-                'This will be interpreted as SYSTEM_DEFAULT')
-        setattr(self, slot, kind(value) if issubclass(kind, IntEnum) else value)
-
-    return property(getter, setter, doc=f"The policy '{name}'.")
-
-
-for _name, _kind in (
-        ('history', HistoryPolicy), ('depth', int), ('reliability', ReliabilityPolicy),
-        ('durability', DurabilityPolicy), ('lifespan', Duration), ('deadline', Duration),
-        ('liveliness', LivelinessPolicy), ('liveliness_lease_duration', Duration),
-        ('avoid_ros_namespace_conventions', bool)):
-    setattr(QoSProfile, _name, _policy(_name, _kind))
 
 qos_profile_unknown = QoSProfile(
     history=HistoryPolicy.UNKNOWN, depth=0, reliability=ReliabilityPolicy.UNKNOWN,
@@ -281,7 +282,7 @@ def qos_check_compatible(
                 f"ERROR: Subscription's {name.lower()} is shorter than the publisher's;")
     if publisher.liveliness == LivelinessPolicy.AUTOMATIC \
             and subscription.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
-        errors.append('ERROR: Publisher\'s liveliness is automatic and subscription\'s is '
+        errors.append("ERROR: Publisher's liveliness is automatic and subscription's is "
                       'manual by topic;')
     unsure = ('SYSTEM_DEFAULT', 'UNKNOWN')
     for name in ('reliability', 'durability', 'liveliness'):

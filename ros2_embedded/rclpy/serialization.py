@@ -3,10 +3,9 @@
 
 from typing import Any
 
-from rosidl_embedded import cdr
-
 from rclpy.exceptions import RCLError
 from rclpy.type_support import check_is_valid_msg_type
+from rosidl_embedded import cdr
 
 
 def serialize_message(message: Any) -> bytes:

@@ -2,11 +2,10 @@
 """Services."""
 
 from collections.abc import Callable
+from functools import partial
 import struct
 import time
 from typing import Any, NamedTuple
-
-from rosidl_embedded import cdr
 
 from rclpy._dds import Reader, Writer
 from rclpy._entity import Entity, Work
@@ -14,6 +13,7 @@ from rclpy._graph import user_data_value
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle, RCLError
 from rclpy.qos import QoSProfile
+from rosidl_embedded import cdr
 
 REQUEST_HEADER = struct.Struct('<Qq')  # rmw_cyclonedds: the client's writer, a sequence number
 READER_WAIT = 0.1  # seconds a response waits for the client's reader to be discovered
@@ -68,7 +68,7 @@ class Service(Entity):
             info = ServiceInfo(sample.source_timestamp, time.time_ns(),
                                RequestId(client, number, sample.publication))
             return (self.callback, (request, self.srv_type.Response()),
-                    lambda response: self.send_response(response, info))
+                    partial(self.send_response, header=info))
         return None
 
     def _reader_is_known(self, publication: int) -> bool | None:

@@ -7,8 +7,6 @@ import inspect
 import time
 from typing import Any
 
-from rosidl_embedded import cdr
-
 from rclpy._dds import Reader
 from rclpy._entity import Entity, Work
 from rclpy._names import demangle_topic
@@ -16,6 +14,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile
+from rosidl_embedded import cdr
 
 
 class Subscription(Entity):

@@ -88,8 +88,8 @@ class Future:
                 continue
             try:
                 callback(self)
-            except Exception as error:  # the callbacks after it are to be called, too
-                warnings.warn(f'Unhandled exception in done callback: {error}')
+            except Exception as error:  # noqa: BLE001 - those after it are called, too
+                warnings.warn(f'Unhandled exception in done callback: {error}', stacklevel=2)
 
     def _set_executor(self, executor: Any) -> None:
         with self._lock:
@@ -147,7 +147,7 @@ class Task(Future):
                     self._step()
                 else:
                     self.set_result(self._handler(*self._args, **self._kwargs))
-            except Exception as error:  # it is raised where the result is asked for
+            except Exception as error:  # noqa: BLE001 - raised where the result is asked for
                 self.set_exception(error)
             finally:
                 self._executing = False

@@ -17,7 +17,7 @@ class Waitable(Entity):
 
     def __init__(self, callback_group: CallbackGroup) -> None:
         if type(self).__module__.partition('.')[0] != 'rclpy':
-            raise NotEmbeddedError('a Waitable of one\'s own')
+            raise NotEmbeddedError("a Waitable of one's own")
         self.callback_group = callback_group
         self.callback_group.add_entity(self)
         self._futures: list[Any] = []

@@ -81,7 +81,8 @@ class _Generator:
         return name
 
     def finish(self, name: str) -> Callable[..., Any]:
-        exec(compile('\n'.join(self.lines), f'<cdr of {name}>', 'exec'), self.names)
+        code = compile('\n'.join(self.lines), f'<cdr of {name}>', 'exec')
+        exec(code, self.names)  # noqa: S102 - generated above, from our own tables
         function: Callable[..., Any] = self.names['function']
         return function
 

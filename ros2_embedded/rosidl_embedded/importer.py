@@ -12,7 +12,7 @@ def interface(module: str, name: str) -> type:
     """
     package, kind = module.split('.')
     try:
-        if kind == 'srv' and not name.rpartition('_')[2] in ('Request', 'Response', 'Event'):
+        if kind == 'srv' and name.rpartition('_')[2] not in ('Request', 'Response', 'Event'):
             return message.service_class(f'{package}/srv/{name}')
         return message.message_class(f'{package}/{kind}/{name}')
     except (KeyError, ValueError):

@@ -202,7 +202,7 @@ def _constructor(described: Definition) -> Callable[..., None]:
              "  self._check_fields = kwargs.pop('check_fields', CHECK) if kwargs else CHECK"]
     lines += [f'  self._{field.name} = {_default(field, names)}' for field in described.fields]
     lines.append('  if kwargs: assign(self, kwargs)')
-    exec('\n'.join(lines), names)
+    exec('\n'.join(lines), names)  # noqa: S102 - generated above, from our own tables
     function: Callable[..., None] = names['__init__']
     return function
 

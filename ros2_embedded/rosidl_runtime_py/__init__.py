@@ -2,9 +2,17 @@
 """Interfaces by name, and messages as text and dictionaries."""
 
 from rosidl_runtime_py.convert import (
-    get_message_slot_types, message_to_csv, message_to_ordereddict, message_to_yaml)
+    get_message_slot_types,
+    message_to_csv,
+    message_to_ordereddict,
+    message_to_yaml,
+)
 from rosidl_runtime_py.get_interfaces import (
-    get_interface_packages, get_interfaces, get_message_interfaces, get_service_interfaces)
+    get_interface_packages,
+    get_interfaces,
+    get_message_interfaces,
+    get_service_interfaces,
+)
 from rosidl_runtime_py.set_message import set_message_fields
 
 __all__ = [

@@ -8,7 +8,11 @@ from typing import Any
 from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
 from ros2cli.verb.node import (
-    get_absolute_node_name, get_node_names, parse_node_name, wait_for_node)
+    get_absolute_node_name,
+    get_node_names,
+    parse_node_name,
+    wait_for_node,
+)
 
 _LABELS = {'BOOL': 'Boolean value is:', 'INTEGER': 'Integer value is:',
            'DOUBLE': 'Double value is:', 'STRING': 'String value is:',

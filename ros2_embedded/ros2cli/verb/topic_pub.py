@@ -8,8 +8,7 @@ from typing import Any
 from ros2cli.node.direct import add_arguments as add_direct_node_arguments
 from ros2cli.node.direct import DirectNode
 from ros2cli.verb import VerbExtension
-from ros2cli.verb.topic import (
-    add_qos_arguments, positive_float, qos_from_arguments, unsigned_int)
+from ros2cli.verb.topic import add_qos_arguments, positive_float, qos_from_arguments, unsigned_int
 
 _WAIT = 0.1  # seconds between looks for subscriptions
 
