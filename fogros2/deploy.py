@@ -475,9 +475,9 @@ class _Deployment:
                 robot = pool.submit(self.launch._robot_vpn().ensure)
                 machine = self._create(undo)
                 shell = self._connect(machine, undo)
-                ros = self._prepare_host(shell)
                 interface = self._interface()
                 agent = self._arm(machine, shell, undo)
+                ros = self._prepare_host(shell)
                 robot.result()
                 joining = pool.submit(self._join_vpn, machine, shell, agent, interface, undo)
                 syncing = pool.submit(self._sync, shell, ros)
@@ -565,6 +565,7 @@ class _Deployment:
         if self.provider.agent_directory:
             config = plan.agent_config(
                 self.spec, self.launch.id, self.provider.agent_directory, [])
+            config['boot_timeout'] = self.timeouts.boot + self.timeouts.ssh
         tags = {
             TAG_NAME: self.name, TAG_ROBOT: robot_name(), TAG_LAUNCH: self.launch.id,
             TAG_EXPIRES: str(int(time.time() + self.spec.lifetime)),
@@ -712,6 +713,8 @@ class _Deployment:
         config = plan.agent_config(
             self.spec, self.launch.id, directory, machine.end_command)
         config['user'] = machine.shell.user if machine.shell else ''
+        # from here on we speak to it all the time, first to re-arm it, then by heartbeats
+        config['boot_timeout'] = self.spec.robot_timeout
         with step(self.launch.report, self.name, 'guard'):
             if not program:
                 program = f'{directory}/agent.py'
@@ -733,6 +736,8 @@ class _Deployment:
             undo.callback(agent.close)
             # the record said that the launch before is gone: its agent may not know yet
             agent.request('configure', timeout=self.timeouts.agent, force=self.reused, **config)
+            rearming = _Rearming(agent, self.launch.id, self.spec.robot_timeout / 4)
+            self.rearming = undo.enter_context(contextlib.closing(rearming))
             return agent
 
     def _remove_agent(self, shell: Shell, directory: str) -> None:
@@ -764,6 +769,7 @@ class _Deployment:
             raise VpnError(
                 f"nothing comes back from '{self.name}' through the VPN",
                 f'is UDP port {interface.port} open on the way there?') from error
+        self.rearming.close()
         return heartbeat
 
     # -- the way down ---------------------------------------------------------------------------
@@ -799,6 +805,28 @@ class _Deployment:
             if mode == 'stop' and machine_id is not None:
                 self.provider.stop(machine_id)
             self._save(launch='', pid=0, pid_start=0, robot_vpn=None)
+
+
+class _Rearming:
+    """Tells an agent that the launch lives for as long as the VPN has no heartbeat yet."""
+
+    def __init__(self, agent: AgentClient, launch_id: str, interval: float) -> None:
+        self._agent = agent
+        self._launch_id = launch_id
+        self._interval = interval
+        self._done = threading.Event()
+        threading.Thread(target=self._run, name='fog-rearm', daemon=True).start()
+
+    def _run(self) -> None:
+        while not self._done.wait(self._interval):
+            try:
+                self._agent.request('configure', launch=self._launch_id)
+            except FogError:
+                pass  # the next one may get through; the step under way says what is wrong
+
+    def close(self) -> None:
+        """Stop: heartbeats go on in its place."""
+        self._done.set()
 
 
 def provider(name: str) -> Provider:

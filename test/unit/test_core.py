@@ -7,10 +7,11 @@ import sys
 import threading
 import time
 
+import pytest
+
 from fogros2 import errors, model, plugin_system, process, report
 from fogros2.model import Command, NodeSpec, Result
 from fogros2.waiting import wait_until
-import pytest
 
 
 def test_an_error_says_what_and_what_to_do():
@@ -50,7 +51,7 @@ def test_a_step_is_reported_with_its_detail_and_its_failure():
         detail.append('fine')
     with pytest.raises(ZeroDivisionError):
         with report.step(events.append, 'm', 't'):
-            1 / 0
+            raise ZeroDivisionError('division by zero')
     kinds = [type(event) for event in events]
     assert kinds == [report.StepStarted, report.StepDone, report.StepStarted, report.StepFailed]
     assert events[1].detail == 'fine'

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of fogros2.plan: values in, values out."""
 
+import pytest
+
 from fogros2 import plan
 from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
 from fogros2.model import Peer
-import pytest
 
 NETWORK = '198.18.7.0/24'
 

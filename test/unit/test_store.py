@@ -6,10 +6,11 @@ import stat
 import subprocess
 import sys
 
+import pytest
+
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 from fogros2.store import process_start, Record, Store, write_private
-import pytest
 
 
 @pytest.fixture
