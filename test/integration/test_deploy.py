@@ -8,6 +8,7 @@ import shutil
 import sys
 import threading
 import time
+import uuid
 
 import pytest
 
@@ -28,10 +29,14 @@ class Injected(FogError):
     """The fault of these tests."""
 
 
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+
 @pytest.fixture
 def spec(cloud_network):
     def make(name='planner', **changes):
-        return MachineSpec(name, 'container', {'network': cloud_network}, **changes)
+        return MachineSpec(f'{name}-{RUN}', 'container', {'network': cloud_network}, **changes)
     return make
 
 
@@ -52,7 +57,7 @@ def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
         wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=30,
                    what='the node to end')
         text = ''.join(e['text'] for e in heard if e['event'] == 'output').split()
-        assert text[0] == 'planner'
+        assert text[0] == f'planner-{RUN}'
         assert text[1] != '0', 'nodes must not run as root'
     finally:
         assert launch.down() == []
@@ -108,7 +113,7 @@ def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
 def test_several_machines_come_up_in_parallel_and_reach_each_other(spec):
     launch = Launch()
     names = ['one', 'two', 'three']
-    launch.expect(names)
+    launch.expect(f'{name}-{RUN}' for name in names)
     machines = {}
     try:
         threads = [
@@ -136,7 +141,7 @@ def test_two_launches_at_once_do_not_meet(spec):
         with pytest.raises(NameTaken, match='another launch on this robot'):
             second.up(spec('one'))
         assert first.down() == []
-        assert two.agent.request('status')['machine'] == 'two'
+        assert two.agent.request('status')['machine'] == f'two-{RUN}'
     finally:
         assert first.down() == []
         assert second.down() == []
@@ -203,5 +208,5 @@ def wireguard_of(interface):
 def test_an_unknown_executable_is_found_before_anything_is_created(spec):
     launch = Launch()
     with pytest.raises(WorkspaceError, match="did you mean 'talker'"):
-        launch.prepare([spec()], {'planner': [('fogros2_examples', 'talkr')]})
+        launch.prepare([spec()], {spec().name: [('fogros2_examples', 'talkr')]})
     assert launch.down() == []

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import threading
+import uuid
 
 import pytest
 
@@ -19,13 +20,16 @@ pytestmark = [
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
 ]
 
+#: Other runs of these tests may be under way on the same computer.
+NAME = f'fault-{uuid.uuid4().hex[:6]}'
+
 LAUNCH = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 from launch_ros.actions import Node
 
 
 def generate_launch_description():
-    machine = ContainerInstance(name='planner', network='{network}', robot_timeout={timeout})
+    machine = ContainerInstance(name='{name}', network='{network}', robot_timeout={timeout})
     return FogROSLaunchDescription([
         CloudNode(machine=machine, package='fogros2_examples', executable='talker',
                   output='screen'),
@@ -35,9 +39,9 @@ def generate_launch_description():
 
 #: What a launch prints as a step begins, and at last when messages arrive.
 STEPS = {
-    'create': 'planner: machine ...', 'vpn interface': 'robot: VPN interface ...',
-    'connect': 'planner: connect ...', 'guard': 'planner: guard ...', 'ros': 'planner: ROS 2 ...',
-    'vpn': 'planner: VPN ...', 'agent': 'planner: agent ...', 'running': 'I heard',
+    'create': f'{NAME}: machine ...', 'vpn interface': 'robot: VPN interface ...',
+    'connect': f'{NAME}: connect ...', 'guard': f'{NAME}: guard ...', 'ros': f'{NAME}: ROS 2 ...',
+    'vpn': f'{NAME}: VPN ...', 'agent': f'{NAME}: agent ...', 'running': 'I heard',
 }
 
 
@@ -83,7 +87,7 @@ def launched(tmp_path, cloud_network):
 
     def start(timeout=120):
         path = tmp_path / 'planner.launch.py'
-        path.write_text(LAUNCH.format(network=cloud_network, timeout=timeout))
+        path.write_text(LAUNCH.format(name=NAME, network=cloud_network, timeout=timeout))
         started.append(Launched(path))
         return started[-1]
 
@@ -134,7 +138,7 @@ def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
         wait_until(lambda: not containers(), timeout=60,
                    what='the machine to end itself')
     # killed early, it may have had no machine yet; an engine may still be making one
-    wait_until(lambda: fog('delete', 'planner', '--yes') is not None and not containers(),
+    wait_until(lambda: fog('delete', NAME, '--yes') is not None and not containers(),
                timeout=60, what='ros2 fog delete')
     assert fog('gc') == 0
 
@@ -148,7 +152,7 @@ def end_group(group: int) -> None:
 
 def containers() -> list[str]:
     return subprocess.run(
-        ['podman', 'ps', '-aq', '--filter', 'name=fogros2-planner'], check=True,
+        ['podman', 'ps', '-aq', '--filter', f'name=fogros2-{NAME}'], check=True,
         capture_output=True, text=True).stdout.split()
 
 
