@@ -249,7 +249,7 @@ class Coordinator:
             self._fail(error)
             return
         await asyncio.gather(*(self._up(session) for session in sessions))
-        if self._console is not None and not self._context.is_shutdown:
+        if self._console is not None and all(session.running for session in sessions):
             self._console.table()
 
     async def _up(self, session: Session) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import stat
+import tempfile
 import threading
 from types import SimpleNamespace
 
@@ -162,6 +163,8 @@ def run(fake, package, monkeypatch, tmp_path):
     from fogros2.actions.coordinator import Coordinator
 
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    # launch leaves the parameter files it makes
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     before = dict(os.environ)
 
     def run(description, **arguments):

@@ -6,11 +6,8 @@ from __future__ import annotations
 import io
 import logging
 
-import pytest
-
-pytest.importorskip('launch.launch_context', reason='launch is not installed')
-
 import launch.logging
+import pytest
 
 from fogros2.actions.console import Console
 from fogros2.report import (

@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import os
 import pathlib
-
-import pytest
-
-pytest.importorskip('launch_ros.actions', reason='launch_ros is not installed')
+import tempfile
 
 from launch import LaunchContext
 from launch.actions import ExecuteProcess, SetEnvironmentVariable
 from launch.substitutions import FindExecutable, LaunchConfiguration
 from launch_ros.actions import Node
+import pytest
 
 from fogros2.actions import node_spec
 from fogros2.actions.node_spec import Texts
@@ -41,7 +39,9 @@ def prefix(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def context(prefix):
+def context(prefix, tmp_path, monkeypatch):
+    # launch leaves the parameter files it makes
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     before = dict(os.environ)
     context = LaunchContext()
     yield context

@@ -6,13 +6,10 @@ from __future__ import annotations
 import asyncio
 import inspect
 
-import pytest
-
-pytest.importorskip('launch.launch_context', reason='launch is not installed')
-
 from launch import LaunchContext, LaunchService
 from launch.actions import ExecuteLocal, ExecuteProcess, TimerAction
 from launch.utilities import AsyncSafeSignalManager
+import pytest
 
 from fogros2.actions import private
 
