@@ -41,7 +41,7 @@ from image_transport_h264.picture import (
 
 __all__ = [
     'BadPicture', 'CodecError', 'Damaged', 'Decoder', 'Encoder', 'Missing', 'Packet', 'Picture',
-    'Settings', 'working_encoders',
+    'Settings', 'peek', 'working_encoders',
 ]
 
 SOFTWARE = 'libx264'
@@ -325,6 +325,16 @@ class Decoder:
         if tag is not None and layout.alpha:
             _put_alpha(data, tag)
         return Picture(width, height, encoding, step, data.reshape(-1).data, big)
+
+
+def peek(data: bytes) -> Optional[Tag]:
+    """Return the tag of a packet of either format, None where there is no whole one."""
+    if data[:len(MAGIC)] != MAGIC:
+        return annexb.extract(data)[0]
+    try:
+        return split(data)[0]
+    except CodecError:
+        return None
 
 
 def _follows(tag: Tag, last: Tag) -> bool:

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes images on ``camera``: a synthetic scene, a video file, or a V4L2 device."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Iterator
+import itertools
+from pathlib import Path
+
+import cv2
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+
+from fogros2_examples.scene import Pixels, Scene
+
+
+def synthetic(width: int, height: int, rate: float) -> Iterator[Pixels]:
+    """Yield the frames of the synthetic scene."""
+    scene = Scene(width, height, rate)
+    return (scene.frame(number) for number in itertools.count())
+
+
+def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
+    """
+    Yield the frames of a device (``/dev/video0``) or of a file, again from its start at its end.
+
+    :raises RuntimeError: it can't be opened, or has no frame.
+    """
+    device = Path(source).is_char_device()
+    while True:
+        capture = cv2.VideoCapture(source, cv2.CAP_V4L2 if device else cv2.CAP_ANY)
+        if device:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        read = 0
+        try:
+            while True:
+                there, frame = capture.read()
+                if not there:
+                    break
+                read += 1
+                if not device and frame.shape[:2] != (height, width):
+                    frame = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+                yield frame
+        finally:
+            capture.release()
+        if not read or device:
+            raise RuntimeError(f'{source} gives no picture')
+
+
+class Camera(Node):
+    """A camera; each image and its CameraInfo are stamped alike."""
+
+    def __init__(self) -> None:
+        super().__init__('camera')
+        source = str(self.declare_parameter('source', 'synthetic').value)
+        width = int(self.declare_parameter('width', 640).value)
+        height = int(self.declare_parameter('height', 480).value)
+        rate = float(self.declare_parameter('rate', 30.0).value)
+        self.left = int(self.declare_parameter('count', 0).value)
+        self.counted = self.left > 0
+        self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
+        self.frames = (synthetic(width, height, rate) if source == 'synthetic'
+                       else captured(source, width, height))
+        self.info = CameraInfo(width=width, height=height, distortion_model='plumb_bob')
+        focal = float(width)
+        self.info.k = [focal, 0.0, width / 2, 0.0, focal, height / 2, 0.0, 0.0, 1.0]
+        self.info.p = [focal, 0.0, width / 2, 0.0, 0.0, focal, height / 2, 0.0, 0.0, 0.0, 1.0, 0.0]
+        self.images = self.create_publisher(Image, 'camera', 2)
+        self.infos = self.create_publisher(CameraInfo, 'camera_info', 2)
+        self.next = next(self.frames)
+        self.create_timer(1 / rate, self.shoot)
+
+    def shoot(self) -> None:
+        """Publish a frame; the next one is rendered when this one is out."""
+        stamp = self.get_clock().now().to_msg()
+        image = Image(height=self.next.shape[0], width=self.next.shape[1], encoding='bgr8',
+                      step=3 * self.next.shape[1])
+        image.header.stamp, image.header.frame_id = stamp, self.frame_id
+        # rclpy takes an array of bytes as it is; anything else it looks at byte by byte
+        image.data = array.array('B', self.next.tobytes())
+        self.info.header = image.header
+        self.images.publish(image)
+        self.infos.publish(self.info)
+        if self.counted:
+            self.left -= 1
+            if not self.left:
+                raise SystemExit(0)
+        self.next = next(self.frames)
+
+
+def main() -> None:
+    """Run until interrupted, or until ``count`` images are out."""
+    rclpy.init()
+    try:
+        rclpy.spin(Camera())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node beside the subscriber: takes a coded stream, publishes images.
+
+Publishes ``image`` (remap it) from ``<image>/h264``, or from what the parameter ``stream`` names;
+see doc/h264.md for all topics and parameters.
+"""
+
+from __future__ import annotations
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from sensor_msgs.msg import CameraInfo, Image
+
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Tap
+from image_transport_h264.message import CAMERA_INFO, camera_info_topic
+from image_transport_h264.receivers import make_receiver
+
+
+class DecoderNode(LazyNode):
+    """Decodes in a worker thread, while anybody listens to the images."""
+
+    def __init__(self) -> None:
+        super().__init__('h264_decoder')
+        topic = self.resolve_topic_name('image')
+        codec = str(self.declare_parameter('codec', 'h264').value)
+        stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
+        self._images = self.offer(Image, topic, IMAGE_QOS, self._listeners_changed)
+        self._receiver = make_receiver(self, codec, stream, self._images.publish)
+        self._infos = self.offer(
+            CameraInfo, camera_info_topic(topic), IMAGE_QOS, self._listeners_changed)
+        self._info_tap = Tap(
+            self, CameraInfo, f'{stream}/{CAMERA_INFO}', IMAGE_QOS, self._infos.publish,
+            adapt=False)
+        self._listeners_changed()
+        self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
+
+    def destroy_node(self) -> None:
+        """End the worker, then the node."""
+        self._receiver.stop()
+        super().destroy_node()
+
+    def _listeners_changed(self) -> None:
+        self._receiver.want(self._images.get_subscription_count() > 0)
+        self._info_tap.want(self._infos.get_subscription_count() > 0)
+
+
+def main() -> None:
+    """Run until interrupted."""
+    rclpy.init()
+    node = DecoderNode()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()

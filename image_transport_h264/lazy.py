@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What both nodes have: work only while somebody listens, and one log line per cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+from typing import Any, Optional
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+#: A stream's packets: those the network lost come again, if they are not too old by then.
+STREAM_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+#: Pictures: the newest.
+IMAGE_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=2, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+#: What is of no use late.
+FEEDBACK_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE)
+REQUEST_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
+
+def best_effort(qos: QoSProfile) -> QoSProfile:
+    """Return the profile without repetition of what was lost."""
+    return QoSProfile(
+        history=qos.history, depth=qos.depth, durability=qos.durability,
+        reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class LazyNode(Node):
+    """A node that subscribes while it is subscribed to."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._complained: set[str] = set()
+        self._complaining = threading.Lock()
+
+    def complain(self, cause: str, message: str) -> None:
+        """Warn of a cause, the first time it comes up."""
+        with self._complaining:
+            if cause in self._complained:
+                return
+            self._complained.add(cause)
+        self.get_logger().warning(f'{message} (further ones of this kind go unmentioned)')
+
+    def offer(
+        self, kind: Any, topic: str, qos: QoSProfile, changed: Callable[[], None],
+    ) -> Publisher:
+        """Return a publisher; ``changed`` is called when subscribers come or go."""
+        return self.create_publisher(
+            kind, topic, qos,
+            event_callbacks=PublisherEventCallbacks(matched=lambda _: changed()))
+
+    def fitting(self, topic: str, qos: QoSProfile) -> QoSProfile:
+        """Return the profile, best effort if a publisher of the topic has nothing better."""
+        told = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
+        if told and all(kind == ReliabilityPolicy.RELIABLE for kind in told):
+            return qos
+        return best_effort(qos)
+
+
+class Tap:
+    """
+    A subscription that exists while it is wanted.
+
+    Made anew if a publisher comes up that would be heard better, or not at all, otherwise.
+    """
+
+    def __init__(
+        self, node: LazyNode, kind: Any, topic: str, qos: QoSProfile,
+        heard: Callable[[Any], object], *, adapt: bool = True,
+    ) -> None:
+        self._node, self._kind, self._topic = node, kind, topic
+        self._qos, self._heard, self._adapt = qos, heard, adapt
+        self._subscription: Optional[Subscription] = None
+        self._reliability: Optional[ReliabilityPolicy] = None
+
+    @property
+    def open(self) -> bool:
+        """Whether it is subscribed."""
+        return self._subscription is not None
+
+    def want(self, wanted: bool) -> None:
+        """Subscribe or end it; in the executor's thread."""
+        if wanted and self._subscription is None:
+            self._subscribe()
+        elif not wanted and self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _subscribe(self) -> None:
+        qos = self._node.fitting(self._topic, self._qos) if self._adapt else self._qos
+        self._reliability = qos.reliability
+        events = SubscriptionEventCallbacks(matched=self._matched if self._adapt else None)
+        self._subscription = self._node.create_subscription(
+            self._kind, self._topic, self._heard, qos, event_callbacks=events)
+
+    def _matched(self, _: Any) -> None:
+        fitting = self._node.fitting(self._topic, self._qos).reliability
+        if self._subscription is not None and fitting != self._reliability:
+            self.want(False)
+            self._subscribe()

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS messages from and to pictures and packets."""
+
+from __future__ import annotations
+
+import array
+import importlib
+from typing import Any, Optional
+
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
+
+from image_transport_h264.codec import Packet, Picture
+
+#: What follows the stream's name in the names of the topics that belong to it.
+KEY_REQUEST, FEEDBACK, CAMERA_INFO = 'keyframe', 'feedback', 'camera_info'
+
+
+def picture(message: Image) -> Picture:
+    """Return the message's picture, which shares its data."""
+    return Picture(message.width, message.height, message.encoding, message.step,
+                   memoryview(message.data), bool(message.is_bigendian))
+
+
+def image(header: Header, shown: Picture) -> Image:
+    """Return a picture as a message: one copy."""
+    return Image(
+        header=header, height=shown.height, width=shown.width, encoding=shown.encoding,
+        is_bigendian=int(shown.is_bigendian), step=shown.step, data=octets(shown.data))
+
+
+def octets(data: Any) -> 'array.array[int]':
+    """Return bytes as the array that rclpy takes without looking at each of them."""
+    values = array.array('B')
+    values.frombytes(data)
+    return values
+
+
+def compressed(header: Header, packet: Packet) -> CompressedImage:
+    """
+    Return a packet as a message.
+
+    ``format`` is 'h264' alone, as viewers know it: what it was before coding is in the packet.
+    """
+    return CompressedImage(header=header, format=packet.format, data=octets(packet.data))
+
+
+def camera_info_topic(topic: str) -> str:
+    """Return the topic beside an image's on which its camera describes itself."""
+    return topic.rpartition('/')[0] + '/' + CAMERA_INFO
+
+
+def installed(package: str, name: str) -> Optional[Any]:
+    """Return a message class of a package that not every ROS 2 has, None where it hasn't."""
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name, None)
+    except ModuleNotFoundError:
+        return None
+
+
+def ffmpeg_packet(kind: Any, header: Header, packet: Packet) -> Any:
+    """Return a packet as ``ffmpeg_image_transport_msgs/FFMPEGPacket``."""
+    tag = packet.tag
+    return kind(
+        header=header, width=tag.width, height=tag.height,
+        encoding=f'h264;yuv420p;bgr8;{tag.encoding}', pts=tag.sequence, flags=int(packet.key),
+        is_bigendian=tag.is_bigendian, data=octets(packet.data))
+
+
+def compressed_video(kind: Any, header: Header, packet: Packet) -> Any:
+    """Return a packet as ``foxglove_msgs/CompressedVideo``."""
+    return kind(timestamp=header.stamp, frame_id=header.frame_id, format='h264',
+                data=octets(packet.data))

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the decoder node does with a stream, by codec: video, single pictures, as it is."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+import secrets
+import time
+
+from rcl_interfaces.msg import ParameterDescriptor
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Empty, UInt64MultiArray
+
+from image_transport_h264 import message, stills
+from image_transport_h264.codec import CodecError, Decoder, Missing, peek
+from image_transport_h264.lazy import (
+    FEEDBACK_QOS,
+    IMAGE_QOS,
+    LazyNode,
+    REQUEST_QOS,
+    STREAM_QOS,
+    Tap,
+)
+from image_transport_h264.message import FEEDBACK, KEY_REQUEST
+from image_transport_h264.worker import Worker
+
+Publish = Callable[[Image], None]
+#: Packets that may wait for the decoder; more of them means that it can't follow.
+WAITING = 8
+#: Seconds after which a request for a key is repeated.
+REQUEST_INTERVAL = 0.1
+
+
+class Receiver(abc.ABC):
+    """Hands what a stream brings to ``publish`` as images."""
+
+    @abc.abstractmethod
+    def want(self, wanted: bool) -> None:
+        """Subscribe to the stream, or end it."""
+
+    @abc.abstractmethod
+    def stop(self) -> None:
+        """End the thread, if there is one."""
+
+
+def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> Receiver:
+    """
+    Return the codec's receiver.
+
+    :raises ValueError: no such codec.
+    """
+    if codec == 'h264':
+        return VideoReceiver(node, stream, publish)
+    if codec in ('jpeg', 'png'):
+        return StillReceiver(node, stream, publish)
+    if codec == 'raw':
+        return RawReceiver(node, stream, publish)
+    raise ValueError(f"codec '{codec}' is not one of h264, jpeg, png, raw")
+
+
+class RawReceiver(Receiver):
+    """Passes images on as they are."""
+
+    def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
+        self._worker: Worker[Image] = Worker('pass', publish)
+        self._tap = Tap(node, Image, stream, IMAGE_QOS, self._worker.put)
+
+    def want(self, wanted: bool) -> None:
+        """Subscribe to the stream, or end it."""
+        self._tap.want(wanted)
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._worker.stop()
+
+
+class StillReceiver(Receiver):
+    """Decodes JPEG and PNG."""
+
+    def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
+        self._node, self._publish = node, publish
+        self._worker: Worker[CompressedImage] = Worker('decode', self._decode)
+        self._tap = Tap(node, CompressedImage, stream, IMAGE_QOS, self._worker.put)
+
+    def want(self, wanted: bool) -> None:
+        """Subscribe to the stream, or end it."""
+        self._tap.want(wanted)
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._worker.stop()
+
+    def _decode(self, coded: CompressedImage) -> None:
+        try:
+            picture = stills.decode(coded.format, memoryview(coded.data))
+        except CodecError as error:
+            self._node.complain(error.cause, f'packet not shown: {error}')
+            return
+        self._publish(message.image(coded.header, picture))
+
+
+class VideoReceiver(Receiver):
+    """Decodes H.264, acknowledges each packet, asks for a key where one is needed."""
+
+    def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
+        self._node, self._publish = node, publish
+        show = node.declare_parameter('show_damage', False, ParameterDescriptor(
+            description='show pictures that losses have left smears in', read_only=True)).value
+        encoding = node.declare_parameter('encoding', 'bgr8', ParameterDescriptor(
+            description="of images from encoders that aren't FogROS2's", read_only=True)).value
+        self._decoder = Decoder(show_damage=bool(show), encoding=str(encoding))
+        self._identity = secrets.randbits(63)
+        self._asked = -1e9
+        self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)
+        self._feedback = node.create_publisher(
+            UInt64MultiArray, f'{stream}/{FEEDBACK}', FEEDBACK_QOS)
+        self._worker: Worker[CompressedImage] = Worker('decode', self._decode, WAITING)
+        self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._worker.put)
+
+    def want(self, wanted: bool) -> None:
+        """Subscribe to the stream, or end it."""
+        self._tap.want(wanted)
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._worker.stop()
+
+    def _decode(self, coded: CompressedImage) -> None:
+        data = bytes(coded.data)
+        tag = peek(data)
+        if tag is not None:
+            self._feedback.publish(UInt64MultiArray(data=[self._identity, tag.sequence]))
+        try:
+            picture = self._decoder.decode(data)
+        except Missing as error:
+            # a loss is the network's, and repaired in a moment
+            self._node.get_logger().debug(str(error))
+            self._ask()
+            return
+        except CodecError as error:
+            self._node.complain(error.cause, f'packet not shown: {error}')
+            self._ask()
+            return
+        # of pictures that come in a burst, after a repaired loss, the last ones are of interest
+        if picture is not None and self._worker.waiting < 2:
+            self._publish(message.image(coded.header, picture))
+
+    def _ask(self) -> None:
+        """Ask for a key, and again only after a while."""
+        now = time.monotonic()
+        if now - self._asked >= REQUEST_INTERVAL:
+            self._asked = now
+            self._requests.publish(Empty())

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the encoder node does with an image, by codec: video, single pictures, as it is."""
+
+from __future__ import annotations
+
+import abc
+from collections import deque
+from collections.abc import Callable, Sequence
+import dataclasses
+import threading
+import time
+from typing import Any, Optional
+
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Empty, Header, UInt64MultiArray
+
+from image_transport_h264 import message, stills
+from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
+from image_transport_h264.lazy import (
+    best_effort,
+    FEEDBACK_QOS,
+    IMAGE_QOS,
+    LazyNode,
+    REQUEST_QOS,
+    STREAM_QOS,
+)
+from image_transport_h264.message import FEEDBACK, KEY_REQUEST
+from image_transport_h264.rate import Governor
+
+CODECS = ('h264', 'jpeg', 'png', 'raw')
+#: Receivers that say nothing for so long no longer hold the others back.
+SILENT = 3.0
+#: Seconds over which the stream's rate is taken.
+RATE_SECONDS = 1.0
+#: A higher bitrate is worth a key only from this factor on.
+WORTH = 1.4
+
+
+class Sender(abc.ABC):
+    """Publishes coded images; ``send`` runs in the worker's thread."""
+
+    publishers: Sequence[Publisher]
+
+    def listeners(self) -> int:
+        """Return how many subscriptions the stream has."""
+        return sum(publisher.get_subscription_count() for publisher in self.publishers)
+
+    @abc.abstractmethod
+    def send(self, image: Image) -> None:
+        """Code and publish an image."""
+
+
+def make_sender(
+    node: LazyNode, codec: str, stream: str, changed: Callable[[], None],
+) -> Sender:
+    """
+    Return the codec's sender.
+
+    :param changed: called when the stream's subscribers come or go.
+    :raises ValueError: no such codec.
+    """
+    if codec == 'h264':
+        return VideoSender(node, stream, changed)
+    if codec == 'raw':
+        return RawSender(node, stream, changed)
+    if codec in ('jpeg', 'png'):
+        return StillSender(node, codec, stream, changed)
+    raise ValueError(f"codec '{codec}' is not one of {', '.join(CODECS)}")
+
+
+class RawSender(Sender):
+    """Passes images on as they are."""
+
+    def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
+        self._publisher = node.offer(Image, stream, IMAGE_QOS, changed)
+        self.publishers = [self._publisher]
+
+    def send(self, image: Image) -> None:
+        """Publish the image."""
+        self._publisher.publish(image)
+
+
+class StillSender(Sender):
+    """Publishes JPEG or PNG, as the C++ ``compressed`` transport does."""
+
+    def __init__(
+        self, node: LazyNode, codec: str, stream: str, changed: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._kind: stills.Format = 'jpeg' if codec == 'jpeg' else 'png'
+        self._quality = int(node.declare_parameter('jpeg_quality', 80).value)
+        node.add_on_set_parameters_callback(self._set)
+        self._publisher = node.offer(CompressedImage, stream, IMAGE_QOS, changed)
+        self.publishers = [self._publisher]
+
+    def send(self, image: Image) -> None:
+        """Encode the image by itself."""
+        try:
+            form, data = stills.encode(message.picture(image), self._kind, self._quality)
+        except CodecError as error:
+            self._node.complain(error.cause, f'image not sent: {error}')
+            return
+        self._publisher.publish(CompressedImage(
+            header=image.header, format=form, data=message.octets(data)))
+
+    def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            if parameter.name == 'jpeg_quality':
+                if not 1 <= parameter.value <= 100:
+                    return SetParametersResult(
+                        successful=False, reason='jpeg_quality is between 1 and 100')
+                self._quality = parameter.value
+        return SetParametersResult(successful=True)
+
+
+#: name, default, what it is for
+PARAMETERS: tuple[tuple[str, Any, str], ...] = (
+    ('bitrate', 8_000_000, 'most bits per second that the stream takes'),
+    ('quality', 23.0, "libx264's constant rate factor, 0 to 51, less is better"),
+    ('preset', 'ultrafast', "libx264's preset"),
+    ('gop', 300, 'most pictures from one key to the next'),
+    ('max_rate', 0.0, 'most pictures per second, 0 for all'),
+    ('encoder', 'auto', "'auto', 'libx264' or another of FFmpeg's H.264 encoders"),
+    ('lossless', False, 'give back the identical pixels'),
+    ('adapt', True, 'lower bitrate, then rate, where the link takes less'),
+)
+
+
+class VideoSender(Sender):
+    """Publishes H.264; follows what each decoder tells of the link."""
+
+    def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        values = {name: node.declare_parameter(
+            name, default, ParameterDescriptor(description=what)).value
+            for name, default, what in PARAMETERS}
+        self._asked = _settings(values)
+        self._max_rate = _rate(values['max_rate'])
+        self._adapt = bool(values['adapt'])
+        node.add_on_set_parameters_callback(self._set)
+        self._encoder = Encoder(self._asked)
+        self._governors: dict[int, Governor] = {}
+        self._key_wanted = False
+        self._last_key = self._last_sent = self._next_due = -1e9
+        self._sent: deque[tuple[float, int]] = deque()
+        self._interval = 1 / 30
+        self._arrived: Optional[float] = None
+        self._known = 0
+        self._changed = changed
+        self._video = node.offer(CompressedImage, stream, STREAM_QOS, self._matched)
+        self.publishers = [self._video]
+        self._others: list[tuple[Publisher, Any, Callable[[Any, Header, Packet], Any]]] = []
+        # the same packets in the messages that others know, where those are installed
+        base = stream.rpartition('/')[0]
+        for package, name, topic, make in (
+            ('ffmpeg_image_transport_msgs', 'FFMPEGPacket', 'ffmpeg', message.ffmpeg_packet),
+            ('foxglove_msgs', 'CompressedVideo', 'foxglove', message.compressed_video),
+        ):
+            kind = message.installed(package, name)
+            if kind is not None:
+                publisher = node.offer(kind, f'{base}/{topic}', STREAM_QOS, self._matched)
+                self._others.append((publisher, kind, make))
+                self.publishers.append(publisher)
+        node.create_subscription(
+            Empty, f'{stream}/{KEY_REQUEST}', self._key_requested, REQUEST_QOS)
+        node.create_subscription(
+            UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, best_effort(FEEDBACK_QOS))
+
+    # --- in the executor's thread
+
+    def _matched(self) -> None:
+        known = self.listeners()
+        if known > self._known:
+            # whoever is new has nothing to begin with
+            with self._lock:
+                self._key_wanted = True
+        self._known = known
+        self._changed()
+
+    def _key_requested(self, _: Empty) -> None:
+        with self._lock:
+            trips = [governor.round_trip for governor in self._governors.values()]
+            # one that left less than a round trip ago is the answer already
+            if time.monotonic() - self._last_key > 1.5 * max(trips, default=0.0) + 0.02:
+                self._key_wanted = True
+
+    def _heard(self, feedback: UInt64MultiArray) -> None:
+        if len(feedback.data) != 2:
+            return
+        receiver, sequence = feedback.data
+        with self._lock:
+            governor = self._governors.get(receiver)
+            if governor is None:
+                governor = self._governors[receiver] = Governor(self._asked.bitrate)
+            governor.acknowledged(sequence, time.monotonic())
+
+    def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        names = {name for name, _, _ in PARAMETERS}
+        changed = {p.name: p.value for p in parameters if p.name in names}
+        with self._lock:
+            values = {**dataclasses.asdict(self._asked), 'max_rate': self._max_rate,
+                      'adapt': self._adapt, **changed}
+            try:
+                self._asked, self._max_rate = _settings(values), _rate(values['max_rate'])
+            except (TypeError, ValueError) as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            self._adapt = bool(values['adapt'])
+            for governor in self._governors.values():
+                governor.ceiling = self._asked.bitrate
+                governor.bitrate = min(governor.bitrate, governor.ceiling)
+        return SetParametersResult(successful=True)
+
+    # --- in the worker's thread
+
+    def send(self, image: Image) -> None:
+        """Encode and publish the image, unless it is one that has to be left out."""
+        now = time.monotonic()
+        picture = message.picture(image)
+        with self._lock:
+            self._time(now)
+            if not self._due(now, picture.width * picture.height):
+                return
+            self._encoder.settings = self._fit(now)
+            key, self._key_wanted = self._key_wanted, False
+        try:
+            packet = self._encoder.encode(picture, key=key, seconds=now)
+        except CodecError as error:
+            self._node.complain(error.cause, f'image not sent: {error}')
+            with self._lock:
+                self._key_wanted |= key
+            return
+        left = time.monotonic()
+        with self._lock:
+            if packet.key:
+                self._last_key = left
+            self._last_sent = now
+            self._sent.append((now, len(packet.data) * 8))
+            for governor in self._governors.values():
+                governor.sent(packet.tag.sequence, len(packet.data), left)
+        self._publish(image.header, packet)
+
+    def _publish(self, header: Header, packet: Packet) -> None:
+        self._video.publish(message.compressed(header, packet))
+        if packet.format != 'h264':
+            return
+        for publisher, kind, make in self._others:
+            if publisher.get_subscription_count():
+                publisher.publish(make(kind, header, packet))
+
+    def _time(self, now: float) -> None:
+        """Follow the rate at which images come."""
+        if self._arrived is not None:
+            self._interval += 0.1 * (min(now - self._arrived, 1.0) - self._interval)
+        self._arrived = now
+        while self._sent and self._sent[0][0] < now - RATE_SECONDS:
+            self._sent.popleft()
+
+    def _due(self, now: float, pixels: int) -> bool:
+        if self._max_rate:
+            # pictures come with jitter: one that is early by less than half its time is in time
+            if now < self._next_due - 0.5 * self._interval:
+                return False
+            self._next_due = max(self._next_due + 1 / self._max_rate, now)
+        for receiver in [r for r, g in self._governors.items()
+                         if (g.heard or 0) < now - SILENT and len(self._governors) > 1]:
+            del self._governors[receiver]
+        if not self._adapt:
+            return True
+        return all(governor.may_send(now, pixels, now - self._last_sent)
+                   for governor in self._governors.values())
+
+    def _fit(self, now: float) -> Settings:
+        """Return the settings that the slowest receiver's link takes."""
+        current = self._encoder.settings
+        used = sum(bits for _, bits in self._sent) / RATE_SECONDS
+        for governor in self._governors.values():
+            governor.grow(now, used)
+        wanted = self._asked.bitrate
+        if self._adapt:
+            wanted = min([wanted, *(g.bitrate for g in self._governors.values())])
+        settled = dataclasses.replace(
+            self._asked, bitrate=current.bitrate, rate=current.rate) == current
+        more = wanted > WORTH * current.bitrate or wanted == self._asked.bitrate
+        if settled and (wanted == current.bitrate or wanted > current.bitrate
+                        and not (more and used > 0.5 * current.bitrate)):
+            return current
+        rate = min(1000.0, max(1.0, 1 / max(self._interval, 0.001)))
+        return dataclasses.replace(self._asked, bitrate=wanted, rate=rate)
+
+
+def _settings(values: dict[str, Any]) -> Settings:
+    return Settings(
+        bitrate=int(values['bitrate']), quality=float(values['quality']),
+        preset=str(values['preset']), gop=int(values['gop']), encoder=str(values['encoder']),
+        lossless=bool(values['lossless']))
+
+
+def _rate(value: float) -> float:
+    if not 0 <= value <= 1000:
+        raise ValueError(f'max_rate {value} is not between 0 and 1000')
+    return float(value)
