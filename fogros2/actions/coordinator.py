@@ -99,6 +99,7 @@ class Coordinator:
         self._sessions: dict[str, Session] = {}
         self._new: list[Session] = []
         self._begun = True
+        self._late: set[str] = set()
         self._down: Optional[asyncio.Task[None]] = None
         self._restore_signals: Callable[[], None] = _nothing
         self._logger = launch.logging.get_logger('fogros2')
@@ -137,11 +138,12 @@ class Coordinator:
         if self._launch is not None:
             return
         context = self._context
-        self.base_environment = start = _environment_at_start(context)
+        self.base_environment = _environment_at_start(context)
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
+        # what the launch file has set so far counts: its ROS_DOMAIN_ID, its RMW_IMPLEMENTATION
         self._launch = self._make_launch(
-            report=self._console, environment=dict(start), cancel=self._cancel)
+            report=self._console, environment=dict(context.environment), cancel=self._cancel)
         self._restore_signals = signals.take_over(context)
         self._set_dds_environment()
 
@@ -210,22 +212,20 @@ class Coordinator:
             kept.update(environment)
         # what the launch sets for the robot isn't the launch file's change, and doesn't travel
         self.base_environment.update(environment)
-        late = []
         for action in self._processes():
-            details = action.process_details
-            if details is None or details.get('env') is None:
+            details, ended = action.process_details, action.get_asyncio_future()
+            if details is None or ended is None or ended.done():
                 continue
             if details['env'].items() >= environment.items():
                 continue
             if details.get('pid') is None:
                 # executed, but not started before launch gets back to its event loop
                 details['env'].update(environment)
-            else:
-                late.append(details['name'])
-        if late:
-            self._logger.warning(
-                f"{', '.join(late)} runs already and so without the cloud's DDS settings: it may "
-                'not see the cloud; use a FogROSLaunchDescription')
+            elif details['name'] not in self._late:
+                self._late.add(details['name'])
+                self._logger.warning(
+                    f"{details['name']} runs already and so without the cloud's DDS settings: it "
+                    'may not see the cloud; use a FogROSLaunchDescription')
 
     def _on_begin(self, context: LaunchContext) -> None:
         self._begun = True

@@ -8,7 +8,19 @@ import functools
 from typing import get_args, Optional, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import ExecuteLocal, IncludeLaunchDescription, TimerAction
+from launch.actions import (
+    AppendEnvironmentVariable,
+    DeclareLaunchArgument,
+    ExecuteLocal,
+    IncludeLaunchDescription,
+    LogInfo,
+    OpaqueFunction,
+    SetEnvironmentVariable,
+    SetLaunchConfiguration,
+    TimerAction,
+    UnsetEnvironmentVariable,
+    UnsetLaunchConfiguration,
+)
 
 from fogros2.actions import private
 from fogros2.actions.cloud_group import CloudGroup
@@ -17,6 +29,12 @@ from fogros2.actions.remote import RemoteProcess
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 from fogros2.model import RobotNodes
+
+#: What only sets something for what comes after it.
+_SETTINGS = (
+    AppendEnvironmentVariable, DeclareLaunchArgument, LogInfo, SetEnvironmentVariable,
+    SetLaunchConfiguration, UnsetEnvironmentVariable, UnsetLaunchConfiguration,
+)
 
 
 class FogROSLaunchDescription(LaunchDescription):
@@ -41,14 +59,20 @@ class FogROSLaunchDescription(LaunchDescription):
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Visit the content; its robot processes wait for the cloud."""
         entities = super().visit(context)
-        if context.is_shutdown:
+        if context.is_shutdown or entities is None:
             return entities
         coordinator = Coordinator.of(context)
+        cloudy = False
         for entity, certain in cloud_entities(self.entities):
             coordinator.know(entity.machine)
-            if certain:
-                # its first process may come late, from a timer; robot nodes need to know now
-                coordinator.engage()
+            cloudy = cloudy or certain
+        if cloudy:
+            # the first cloud process may come late, from a timer; the nodes here, launch's own
+            # among them, need the DDS settings before they begin. What is set first counts.
+            first = next((number for number, entity in enumerate(entities)
+                          if not isinstance(entity, _SETTINGS)), len(entities))
+            engage = OpaqueFunction(function=lambda context: coordinator.engage())
+            entities = [*entities[:first], engage, *entities[first:]]
         if self.robot_nodes == 'immediately':
             return entities
         coordinator.hold()

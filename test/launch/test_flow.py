@@ -221,6 +221,25 @@ def test_a_launch_without_cloud_keeps_its_dds_environment(run, fake, monkeypatch
     assert 'dds is mine' in capfd.readouterr().out
 
 
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+def test_the_deployment_sees_what_the_launch_file_set(run, fake, planner, description):
+    fake.on_start = ends
+    assert run(description([SetEnvironmentVariable('ROS_DOMAIN_ID', '7'), talker(planner)])) == 0
+    assert fake.environment['ROS_DOMAIN_ID'] == '7'
+
+
+def test_a_cloud_node_of_a_timer_prepares_the_robot_nodes(run, fake, planner, capfd):
+    fake.on_start = ends
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
+    assert run(FogROSLaunchDescription([
+        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=[
+            TimerAction(period=0.01, actions=[talker(planner)])])),
+        process,
+    ])) == 0
+    assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
+    assert order(fake, 'start', 'down') == ['start', 'down']
+
+
 def test_a_node_that_runs_already_is_warned_about(run, fake, planner, capfd):
     fake.on_start = ends
     process = ExecuteProcess(cmd=['sleep', '60'], name='early')
