@@ -9,7 +9,7 @@ from rclpy._names import expand
 from rclpy.exceptions import RCLInvalidROSArgsError, UnknownROSArgsError
 from rclpy.impl.logging_severity import LoggingSeverity
 
-_RULE = re.compile(r'((?P<node>[A-Za-z_]\w*):)?(?P<from>(rostopic://|rosservice://)?[^:]+)'
+_RULE = re.compile(r'((?P<node>[A-Za-z_]\w*):(?!//|=))?(?P<from>(rostopic://|rosservice://)?[^:]+)'
                    r':=(?P<to>.+)$')
 _SWITCHES = {f'--{verb}-{what}-logs': (what, verb == 'enable')
              for verb in ('enable', 'disable') for what in ('rosout', 'stdout', 'external-lib')}
