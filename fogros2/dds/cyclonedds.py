@@ -2,24 +2,36 @@
 """
 Cyclone DDS, ROS 2's ``rmw_cyclonedds_cpp``: its configuration for a robot with a VPN.
 
-Written for 0.10 (ROS 2 Jazzy) and 11: only elements that both know.
+Written for 0.10 (ROS 2 Jazzy) and 11: only elements that both know, and all of it tried with both.
+
+A process announces every address it has, in the order of its interfaces' priorities, and another
+host takes the first that isn't a loopback. So the robot prefers the loopback (its own nodes talk
+there whatever becomes of its networks), then its LAN (whose other computers send to it there),
+then the VPN. Machines don't route: the robot's LAN address isn't reachable directly from them,
+so they take the VPN's. A process asks its ``Peers`` from the socket of its first interface, which
+leads nowhere from a loopback: the robot has none, and announcements cross the VPN by multicast
+(see ``vpn/wireguard.py``), once in an interval rather than once per port that may be in use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import ipaddress
-from typing import ClassVar
+import json
+from pathlib import Path
+import re
+from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
 from fogros2.dds import DdsVendor
 from fogros2.errors import DdsError
-from fogros2.model import DdsInterface
+from fogros2.model import Command, DdsInterface
 
-#: ROS 2 processes that one host can have in a domain, and ports asked for at each peer: every
-#: participant asks every one of them again in each SPDP interval, so it costs bandwidth while
-#: nothing runs there. 32 is what Jazzy's rmw sets for itself.
-MAX_PARTICIPANTS = 32
+#: ROS 2 processes that a host can have in a domain, as its ports allow.
+MAX_PARTICIPANTS = 119
+#: The same where peers are asked by unicast: each of so many ports, by each participant in each
+#: interval, whether anything runs there or not. 32 is what Jazzy's rmw sets for itself.
+MAX_ASKED = 32
 #: Seconds between a participant's announcements: how soon a host is found again whose lease
 #: ended in a long cut, or that came up after the nodes.
 SPDP_INTERVAL = 1
@@ -33,26 +45,62 @@ RECEIVE_BUFFER = 4 * 1024 * 1024
 FRAGMENT = 1280
 MESSAGE = 1380
 LOOPBACK = '127.0.0.1'
+#: Interfaces of FogROS2's own, and the loopback.
+_NOT_LAN = re.compile('lo$|fog')
 
 
 class CycloneDds(DdsVendor):
-    """Renders CYCLONEDDS_URI: VPN first, unicast peers, patient with a link that is cut."""
+    """Renders CYCLONEDDS_URI: local first, then LAN, then VPN; patient with a link that is cut."""
 
     rmw: ClassVar[str] = 'rmw_cyclonedds_cpp'
+
+    def robot_interfaces(
+        self, vpn: str, lan: Optional[str], user: Mapping[str, str],
+    ) -> list[DdsInterface]:
+        """
+        Return the interfaces of the robot's nodes, which get no peers.
+
+        :param lan: see :func:`parse_lan`.
+        :param user: the environment as the user has it; interfaces configured there are used in
+            the LAN's place, and peers make the LAN come first, or they couldn't be asked.
+        :raises DdsError: the user's configuration can't be read, or can't be added to.
+        """
+        text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
+        if '<NetworkInterfaceAddress' in text:
+            raise DdsError(
+                "CYCLONEDDS_URI's NetworkInterfaceAddress leaves no place for the VPN",
+                'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
+        has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
+        listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
+        interfaces = []
+        if not any(re.search(r'"lo"|"127\.', attributes) for attributes in listed):
+            interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
+        if lan is not None and not listed:
+            interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
+        # below 0, which is what an interface has whose priority the user didn't think of
+        return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]
+
+    def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
+        """Return the interfaces of a machine's nodes; their peers are the other machines."""
+        return [DdsInterface(vpn, 10, required=False, multicast=True),
+                DdsInterface('lo', multicast=True)]
 
     def render(self, interfaces: Sequence[DdsInterface], peers: Sequence[str]) -> str:
         """
         Return the XML.
 
+        :param peers: left out where the preferred interface is a loopback, which can't ask them.
         :raises DdsError: no interface.
         """
         if not interfaces:
             raise DdsError('Cyclone DDS needs a network interface')
         ordered = sorted(interfaces, key=lambda interface: -interface.priority)
         multicast = any(interface.multicast for interface in interfaces)
-        # the size holds for the whole process: small only where nothing big stays on the host
-        small = len(interfaces) == 1 and not _is_loopback(interfaces[0])
-        addresses = list(dict.fromkeys([LOOPBACK, *peers]))
+        networks = [interface for interface in interfaces if not _is_loopback(interface)]
+        asked = [] if _is_loopback(ordered[0]) and networks else list(dict.fromkeys(peers))
+        limit = MAX_ASKED if asked or not multicast else MAX_PARTICIPANTS
+        if not multicast:
+            asked.insert(0, LOOPBACK)
         return '\n'.join([
             '<?xml version="1.0" encoding="UTF-8"?>',
             '<CycloneDDS xmlns="https://cdds.io/config">',
@@ -61,19 +109,28 @@ class CycloneDds(DdsVendor):
             '      <Interfaces>',
             *(f'        {_interface(interface)}' for interface in ordered),
             '      </Interfaces>',
-            f'      <AllowMulticast>{_boolean(multicast)}</AllowMulticast>',
-            *([f'      <MaxMessageSize>{MESSAGE} B</MaxMessageSize>'] if small else []),
+            # announcements alone: data goes to whom it matches, and no further
+            f'      <AllowMulticast>{"spdp" if multicast else "false"}</AllowMulticast>',
+            *_if(multicast, '      <MulticastRecvNetworkInterfaceAddresses>all'
+                            '</MulticastRecvNetworkInterfaceAddresses>'),
+            # machines: what isn't on the VPN's subnet, such as the robot's LAN, is out of reach
+            *_if(len(networks) == 1 and ordered[0] in networks,
+                 '      <DontRoute>true</DontRoute>'),
+            # the size holds for the whole process: small only where nothing big stays on the host
+            *_if(len(interfaces) == len(networks) == 1,
+                 f'      <MaxMessageSize>{MESSAGE} B</MaxMessageSize>'),
             f'      <MaxRexmitMessageSize>{MESSAGE} B</MaxRexmitMessageSize>',
             f'      <FragmentSize>{FRAGMENT} B</FragmentSize>',
             '    </General>',
             '    <Discovery>',
+            # a port that others can know: machines are asked by unicast
             '      <ParticipantIndex>auto</ParticipantIndex>',
-            f'      <MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>',
+            f'      <MaxAutoParticipantIndex>{limit}</MaxAutoParticipantIndex>',
             f'      <SPDPInterval>{SPDP_INTERVAL} s</SPDPInterval>',
             f'      <LeaseDuration>{LEASE_DURATION} s</LeaseDuration>',
-            '      <Peers>',
-            *(f'        <Peer address={quoteattr(address)}/>' for address in addresses),
-            '      </Peers>',
+            *_if(bool(asked), '      <Peers>'),
+            *(f'        <Peer address={quoteattr(address)}/>' for address in asked),
+            *_if(bool(asked), '      </Peers>'),
             '    </Discovery>',
             '    <Internal>',
             f'      <SocketReceiveBufferSize max="{RECEIVE_BUFFER} B"/>',
@@ -86,7 +143,8 @@ class CycloneDds(DdsVendor):
         """
         Return RMW_IMPLEMENTATION and CYCLONEDDS_URI: the user's fragments, then our file.
 
-        Cyclone reads them in order and the last word on a setting counts; peers add up.
+        Cyclone reads them in order and the last word on a setting counts; interfaces and peers
+        add up.
 
         :param path: absolute.
         :raises DdsError: the user's environment turns discovery off, or the path has a comma.
@@ -107,12 +165,61 @@ class CycloneDds(DdsVendor):
         return {'RMW_IMPLEMENTATION': self.rmw, 'CYCLONEDDS_URI': uri}
 
 
+def used_interfaces() -> Command:
+    """Return the command whose output :func:`parse_lan` reads."""
+    return Command(('ip', '-json', '-4', 'address', 'show', 'up'),
+                   what='look at the network interfaces')
+
+
+def parse_lan(output: str) -> Optional[str]:
+    """
+    Return the interface that Cyclone takes by itself, so that what it reaches stays in reach.
+
+    That is the first one that can multicast, in the kernel's order; None where there is none.
+
+    :param output: of :func:`used_interfaces`.
+    :raises DdsError: it isn't what ``ip`` prints.
+    """
+    try:
+        for link in json.loads(output or '[]'):
+            name, flags = link.get('ifname', ''), link.get('flags', ())
+            if (link.get('addr_info') and 'MULTICAST' in flags and 'POINTOPOINT' not in flags
+                    and not _NOT_LAN.match(name)):
+                return str(name)
+    except (ValueError, AttributeError, TypeError) as error:
+        raise DdsError(f"can't read the network interfaces: {error}") from error
+    return None
+
+
+def _fragments(uri: str) -> Iterator[str]:
+    """Yield the XML of each part of a CYCLONEDDS_URI: inline, or the file that it names."""
+    rest = uri.strip(' ,\n\t')
+    while rest:
+        if rest.startswith('<'):
+            inline, end, rest = rest.partition('</CycloneDDS>')
+            yield inline + end
+        else:
+            name, _, rest = rest.partition(',')
+            path = Path(name.removeprefix('file://'))
+            try:
+                yield path.read_text()
+            except OSError as error:
+                raise DdsError(
+                    f"CYCLONEDDS_URI names {path}, which can't be read: {error.strerror}",
+                    'nodes would refuse to start; correct or unset CYCLONEDDS_URI') from error
+        rest = rest.strip(' ,\n\t')
+
+
 def _interface(interface: DdsInterface) -> str:
     attribute = 'address' if _is_address(interface.name) else 'name'
     return (
         f'<NetworkInterface {attribute}={quoteattr(interface.name)}'
         f' priority="{interface.priority}" multicast="{_boolean(interface.multicast)}"'
         f' presence_required="{_boolean(interface.required)}"/>')
+
+
+def _if(condition: bool, line: str) -> list[str]:
+    return [line] if condition else []
 
 
 def _boolean(value: bool) -> str:

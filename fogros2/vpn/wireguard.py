@@ -28,8 +28,11 @@ KEEPALIVE = 25
 #: RTPS 2.5, 9.6.2.3: ports of a domain begin at 7400 + 250 * domain and the next one's follow.
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250
+#: RTPS 2.5, 9.6.2.4: participants announce themselves to this group.
+DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
 
+_ADDRESSES = 'ip -brief -4 address show up'
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
 _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
 
@@ -89,18 +92,22 @@ class WireGuard(Vpn):
         A TUN has a carrier as long as a program has it open; a WireGuard interface of the kernel
         always has. Without the interface, or where it is down, reading that fails.
 
-        A machine also notes where its peers are, for ``repair``: who is dialled from behind a NAT
-        couldn't dial, and the robot's side notices a lost session after 15 s only.
+        On the robot it also fails when one of the computer's addresses is gone: ``wireguard-go``
+        goes on sending from it, 15 s long, and ``repair`` makes it look again. A machine
+        notes where its peers are, for ``repair``: behind its NAT the robot can't be dialled
+        elsewhere, and would itself notice the lost session after 15 s only.
         """
         name = _name(interface)
-        carrier = f'/sys/class/net/{name}/carrier'
+        lines = [
+            f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
+            '[ "$carrier" = 1 ]']
         if interface.guarded:
-            return Command(('grep', '-q', '1', carrier), what=_what('look at', interface))
-        seen = _seen(interface)
+            lines.append(f'! {_ADDRESSES} | grep -qFxvf - {_noted(interface)}')
+        else:
+            lines.append(f'found=$(wg show {name} endpoints) && '
+                         f'printf "%s\\n" "$found" >{_noted(interface)} || :')
         return Command.script(
-            f'read -r carrier 2>/dev/null <{carrier}; [ "$carrier" = 1 ]\n'
-            f'found=$(wg show {name} endpoints) && printf "%s\\n" "$found" >{seen} || :',
-            sudo=True, what=_what('look at', interface))
+            '\n'.join(lines), sudo=not interface.guarded, what=_what('look at', interface))
 
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """
@@ -145,7 +152,7 @@ class WireGuard(Vpn):
         """Yield one script that undoes ``up`` backwards and goes on where a part fails."""
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
         lines = ['failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
-        files = f'{shlex.quote(interface.key_file)} {_seen(interface)}'
+        files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
 
@@ -199,7 +206,7 @@ def _guard(interface: VpnInterface, domain: int) -> _Step:
         '  chain input {',
         '    type filter hook input priority filter; policy accept;',
         f'    iifname != "{name}" accept',
-        f'    ip daddr != {interface.address} drop',
+        f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
         '    ct state established,related accept',
         f'    udp dport {first}-{last} accept',
         '    icmp type echo-request accept',
@@ -267,13 +274,17 @@ def _configure(
         # in the first configuration: a handshake that finds no endpoint is retried after 5 s
         lines.append(
             f'seen() {{ while read -r peer at; do case "$peer $at" in "$1 ("*) ;; "$1 "*) '
-            f'echo "Endpoint = $at";; esac; done 2>/dev/null <{_seen(interface)} || :; }}')
+            f'echo "Endpoint = $at";; esac; done 2>/dev/null <{_noted(interface)} || :; }}')
     lines += ['{', "printf '[Interface]\\nPrivateKey = %s\\n' \"$key\""]
     config = [f'ListenPort = {interface.port}']
-    for peer in peers:
+    for number, peer in enumerate(peers):
         _check(peer)
+        allowed = f'{peer.address}/32'
+        if number == 0:
+            # an address leads to one peer: the robot on machines, the only machine on most robots
+            allowed += f', {DISCOVERY_GROUP}/32'
         config += [
-            '[Peer]', f'PublicKey = {peer.public_key}', f'AllowedIPs = {peer.address}/32',
+            '[Peer]', f'PublicKey = {peer.public_key}', f'AllowedIPs = {allowed}',
             f'PersistentKeepalive = {KEEPALIVE}']
         if peer.endpoint is not None:
             config.append(f'Endpoint = {peer.endpoint}')
@@ -297,8 +308,8 @@ def _check(peer: Peer) -> None:
         raise VpnError(f'{peer.name} has no endpoint host:port, but {peer.endpoint[:50]!r}')
 
 
-def _seen(interface: VpnInterface) -> str:
-    return shlex.quote(f'{interface.key_file}.endpoints')
+def _noted(interface: VpnInterface) -> str:
+    return shlex.quote(f'{interface.key_file}.noted')
 
 
 def _print(lines: Sequence[str]) -> str:
@@ -310,5 +321,8 @@ def _address(interface: VpnInterface) -> _Step:
     prefix = interface.network.rpartition('/')[2]
     lines = [
         f'address replace {interface.address}/{prefix} dev {name}',
-        f'link set dev {name} mtu {interface.mtu} up']
-    return _Step(f'{_print(lines)} | ip -batch -')
+        f'link set dev {name} mtu {interface.mtu} multicast on up']
+    do = f'{_print(lines)} | ip -batch -'
+    if interface.guarded:
+        do += f"\n{_ADDRESSES} | grep -v '^fog' >{_noted(interface)} || :"
+    return _Step(do)

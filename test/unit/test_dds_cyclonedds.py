@@ -3,22 +3,25 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
-from fogros2.dds.cyclonedds import CycloneDds
+from fogros2 import process
+from fogros2.dds.cyclonedds import CycloneDds, parse_lan, used_interfaces
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
 VPN = DdsInterface('foga1b2c3', priority=10, required=False)
 LOOPBACK = DdsInterface('lo')
 NAMESPACE = {'c': 'https://cdds.io/config'}
+CYCLONE = CycloneDds()
 
 
 def rendered(*interfaces: DdsInterface, peers: tuple[str, ...] = ()) -> ElementTree.Element:
-    return ElementTree.fromstring(CycloneDds().render(interfaces, peers))
+    return ElementTree.fromstring(CYCLONE.render(interfaces, peers))
 
 
 def texts(root: ElementTree.Element, name: str) -> list[str | None]:
@@ -43,17 +46,99 @@ def test_an_interface_may_be_given_by_its_address() -> None:
         'presence_required': 'true'}
 
 
-def test_peers_are_asked_one_by_one() -> None:
+def test_without_multicast_peers_and_the_host_itself_are_asked() -> None:
     root = rendered(VPN, LOOPBACK, peers=('198.18.7.2', '198.18.7.3', '198.18.7.2'))
     assert [peer['address'] for peer in attributes(root, 'Peer')] == [
         '127.0.0.1', '198.18.7.2', '198.18.7.3']
     assert texts(root, 'AllowMulticast') == ['false']
     assert texts(root, 'ParticipantIndex') == ['auto']
+    assert texts(root, 'MaxAutoParticipantIndex') == ['32']
 
 
-def test_multicast_is_allowed_where_an_interface_has_it() -> None:
-    root = rendered(VPN, DdsInterface('eth0', multicast=True))
-    assert texts(root, 'AllowMulticast') == ['true']
+def test_the_robot_prefers_itself_then_its_lan_then_the_vpn() -> None:
+    root = rendered(*CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {}), peers=('198.18.7.2',))
+    found = attributes(root, 'NetworkInterface')
+    assert [interface['name'] for interface in found] == ['lo', 'eth0', 'foga1b2c3']
+    assert [interface['presence_required'] for interface in found] == ['true', 'false', 'false']
+    assert all(interface['multicast'] == 'true' for interface in found)
+    assert texts(root, 'AllowMulticast') == ['spdp']
+    assert texts(root, 'MulticastRecvNetworkInterfaceAddresses') == ['all']
+    assert texts(root, 'MaxAutoParticipantIndex') == ['119']
+    assert texts(root, 'DontRoute') == []
+    assert attributes(root, 'Peer') == []
+
+
+def test_a_robot_without_a_lan_still_takes_in_what_runs_beside() -> None:
+    interfaces = CYCLONE.robot_interfaces('foga1b2c3', None, {})
+    assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
+    assert texts(rendered(*interfaces), 'DontRoute') == []
+
+
+def test_a_machine_prefers_the_vpn_and_reaches_nothing_beyond() -> None:
+    root = rendered(*CYCLONE.machine_interfaces('foga1b2c3m0'))
+    assert [interface['name'] for interface in attributes(root, 'NetworkInterface')] == [
+        'foga1b2c3m0', 'lo']
+    assert texts(root, 'DontRoute') == ['true']
+    assert attributes(root, 'Peer') == []
+
+
+def test_machines_ask_each_other() -> None:
+    root = rendered(*CYCLONE.machine_interfaces('foga1b2c3m0'), peers=('198.18.7.3',))
+    assert attributes(root, 'Peer') == [{'address': '198.18.7.3'}]
+    assert texts(root, 'MaxAutoParticipantIndex') == ['32']
+
+
+@pytest.mark.parametrize('variable', ['CYCLONEDDS_URI', 'ROS_STATIC_PEERS'])
+def test_peers_of_the_user_are_asked_from_the_lan(variable: str) -> None:
+    user = {variable: '<CycloneDDS><Discovery><Peers><Peer address="192.168.0.7"/></Peers>'
+                      '</Discovery></CycloneDDS>'}
+    root = rendered(*CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user))
+    assert [interface['name'] for interface in attributes(root, 'NetworkInterface')] == [
+        'eth0', 'lo', 'foga1b2c3']
+
+
+def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
+    path = tmp_path / 'dds.xml'
+    path.write_text('<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/><Network'
+                    'Interface name="wlan0"/></Interfaces></General></Domain></CycloneDDS>')
+    for uri in (f'file://{path}', str(path), f'{path.read_text()},', f'{path},<CycloneDDS/>'):
+        interfaces = CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
+        # the same interface twice is an error, and one without a priority has 0
+        assert [interface.name for interface in interfaces] == ['foga1b2c3']
+        assert interfaces[0].priority < 0
+
+
+def test_a_configuration_that_leaves_no_place_for_the_vpn_is_refused() -> None:
+    uri = '<CycloneDDS><General><NetworkInterfaceAddress>eth0</NetworkInterfaceAddress></General>'
+    with pytest.raises(DdsError, match='NetworkInterfaceAddress'):
+        CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
+
+
+def test_a_configuration_that_is_not_there_is_found_before_nodes_fail() -> None:
+    with pytest.raises(DdsError, match='/nowhere/dds.xml'):
+        CYCLONE.robot_interfaces('foga1b2c3', None, {'CYCLONEDDS_URI': 'file:///nowhere/dds.xml'})
+
+
+def test_the_lan_is_the_interface_that_cyclone_would_take() -> None:
+    def link(name: str, *flags: str, address: str = '192.0.2.1') -> dict[str, object]:
+        return {'ifname': name, 'flags': ['UP', *flags], 'addr_info': [{'local': address}]}
+
+    links = [link('lo', 'LOOPBACK'), link('fogffffff', 'MULTICAST', 'POINTOPOINT'),
+             link('tun0', 'POINTOPOINT', 'MULTICAST'), {'ifname': 'eth0', 'flags': ['MULTICAST']},
+             {}, link('wlan0', 'MULTICAST'), link('docker0', 'MULTICAST')]
+    assert parse_lan(json.dumps(links)) == 'wlan0'
+    assert parse_lan(json.dumps(links[:4])) is None
+    assert parse_lan('') is None
+
+
+@pytest.mark.parametrize('text', ['nonsense', '[1]', '7'])
+def test_what_ip_does_not_print_is_an_error(text: str) -> None:
+    with pytest.raises(DdsError, match='network interfaces'):
+        parse_lan(text)
+
+
+def test_this_computers_interfaces_are_read() -> None:
+    parse_lan(process.run(used_interfaces(), timeout=10.0).stdout)
 
 
 def test_messages_are_small_only_where_all_of_them_cross_the_vpn() -> None:
@@ -70,12 +155,12 @@ def test_the_receive_buffer_asks_for_no_minimum() -> None:
 
 def test_no_interface_is_an_error() -> None:
     with pytest.raises(DdsError):
-        CycloneDds().render([], [])
+        CYCLONE.render([], [])
 
 
 def test_the_environment_holds_our_file(tmp_path: Path) -> None:
     path = tmp_path / 'a b.xml'
-    assert CycloneDds().environment(str(path), {}) == {
+    assert CYCLONE.environment(str(path), {}) == {
         'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp',
         'CYCLONEDDS_URI': f'file://{tmp_path}/a b.xml'}
 
@@ -83,17 +168,17 @@ def test_the_environment_holds_our_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize('theirs', [
     'file:///etc/dds.xml', '<CycloneDDS><Domain/></CycloneDDS>', 'file:///etc/dds.xml,'])
 def test_the_users_configuration_is_kept_before_ours(theirs: str) -> None:
-    environment = CycloneDds().environment('/state/dds.xml', {'CYCLONEDDS_URI': theirs})
+    environment = CYCLONE.environment('/state/dds.xml', {'CYCLONEDDS_URI': theirs})
     assert environment['CYCLONEDDS_URI'] == f'{theirs.rstrip(",")},file:///state/dds.xml'
-    again = CycloneDds().environment('/state/dds.xml', environment)
+    again = CYCLONE.environment('/state/dds.xml', environment)
     assert again == environment
 
 
 def test_a_path_that_cyclone_would_split_is_refused() -> None:
     with pytest.raises(DdsError, match='comma'):
-        CycloneDds().environment('/state/a,b.xml', {})
+        CYCLONE.environment('/state/a,b.xml', {})
 
 
 def test_discovery_that_is_off_is_refused() -> None:
     with pytest.raises(DdsError, match='ROS_AUTOMATIC_DISCOVERY_RANGE'):
-        CycloneDds().environment('/state/dds.xml', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'off'})
+        CYCLONE.environment('/state/dds.xml', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'off'})

@@ -1,0 +1,219 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+A UDP relay that stands for a bad network between two hosts: delay, jitter, loss, cuts, a rate.
+
+As a program it listens at one address and passes packets to another; each client gets a socket
+of its own there, so that the far side sees what it would see behind a NAT. Settings change while
+it runs: one JSON object a line on standard input, such as ``{"loss": 0.05}`` or ``{"cut": true}``
+or ``{"rebind": true}``; each is answered with a line of counters. It ends with its standard input
+or with its lifetime.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import dataclasses
+import json
+import random
+import sys
+import time
+from typing import Any, Optional
+
+Address = tuple[str, int]
+#: Bytes of Ethernet, IPv4 and UDP headers that a packet takes on the wire.
+OVERHEAD = 42
+#: Packets under way at once; more are lost, so that a mistake can't fill the memory.
+MOST = 20_000
+
+
+@dataclasses.dataclass
+class Link:
+    """
+    How one direction of the relay treats its packets.
+
+    :param delay: seconds that each packet takes.
+    :param jitter: seconds; each packet takes up to so much more or less, and overtakes others.
+    :param loss: probability from 0 to 1.
+    :param rate: bits per second, headers included; 0 for no limit.
+    :param queue: seconds that a packet waits at the most for its turn at that rate.
+    :param cut: lose everything.
+    """
+
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    rate: float = 0.0
+    queue: float = 0.1
+    cut: bool = False
+    free: float = 0.0
+
+    def schedule(self, size: int, now: float, chance: random.Random) -> Optional[float]:
+        """Return when a packet of so many bytes arrives (on ``now``'s clock); None: never."""
+        if self.cut or chance.random() < self.loss:
+            return None
+        if self.rate:
+            begin = max(now, self.free)
+            if begin - now > self.queue:
+                return None
+            self.free = begin + (size + OVERHEAD) * 8 / self.rate
+            now = self.free
+        return now + max(0.0, self.delay + chance.uniform(-self.jitter, self.jitter))
+
+
+class Relay:
+    """A relay inside an event loop: ``await start()``, change ``up`` and ``down``, ``close()``."""
+
+    def __init__(self, target: Address, *, seed: Optional[int] = None, **settings: Any) -> None:
+        self.target = target
+        #: From the clients to the target, and back.
+        self.up, self.down = Link(**settings), Link(**settings)
+        self.passed = self.lost = self.bytes = 0
+        self._chance = random.Random(seed)
+        self._inside: Optional[asyncio.DatagramTransport] = None
+        self._outside: dict[Address, asyncio.DatagramTransport] = {}
+        self._pending: set[asyncio.TimerHandle] = set()
+
+    async def start(self, listen: Address) -> Address:
+        """Listen, and return the address (port 0 takes any)."""
+        self._inside, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: _Receiver(self._from_client), local_addr=listen)
+        address: Address = self._inside.get_extra_info('sockname')
+        return address
+
+    def close(self) -> None:
+        """Drop everything."""
+        self.rebind()
+        if self._inside is not None:
+            self._inside.close()
+        for handle in self._pending:
+            handle.cancel()
+        self._pending.clear()
+
+    def rebind(self) -> None:
+        """Let the target see the clients at new addresses, as a NAT does that has forgotten."""
+        for transport in self._outside.values():
+            transport.close()
+        self._outside.clear()
+
+    def change(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """Apply settings to both directions, or to ``up_...`` or ``down_...``; return counters."""
+        for key, value in settings.items():
+            side, _, name = key.partition('_')
+            if key == 'rebind':
+                self.rebind()
+                continue
+            links = {'up': [self.up], 'down': [self.down]}.get(side, [self.up, self.down])
+            for link in links:
+                name = name if side in ('up', 'down') else key
+                if not hasattr(link, name):
+                    raise ValueError(f'no setting is called {key!r}')
+                setattr(link, name, value)
+        return {'passed': self.passed, 'lost': self.lost, 'bytes': self.bytes,
+                'under_way': len(self._pending), 'clients': len(self._outside)}
+
+    def _from_client(self, data: bytes, client: Address) -> None:
+        self._send(self.up, data, lambda: self._to_target(data, client))
+
+    def _to_target(self, data: bytes, client: Address) -> None:
+        transport = self._outside.get(client)
+        if transport is not None:
+            transport.sendto(data)
+            return
+        asyncio.get_running_loop().create_task(self._open(data, client))
+
+    async def _open(self, data: bytes, client: Address) -> None:
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: _Receiver(lambda back, _: self._from_target(back, client)),
+            remote_addr=self.target)
+        # another packet may have opened one meanwhile
+        kept = self._outside.setdefault(client, transport)
+        if kept is not transport:
+            transport.close()
+        kept.sendto(data)
+
+    def _from_target(self, data: bytes, client: Address) -> None:
+        inside = self._inside
+        if inside is not None:
+            self._send(self.down, data, lambda: inside.sendto(data, client))
+
+    def _send(self, link: Link, data: bytes, deliver: Any) -> None:
+        loop = asyncio.get_running_loop()
+        now = loop.time()
+        when = link.schedule(len(data), now, self._chance)
+        if when is None or len(self._pending) >= MOST:
+            self.lost += 1
+            return
+        self.passed += 1
+        self.bytes += len(data)
+        if when <= now:
+            deliver()
+            return
+
+        def arrive() -> None:
+            self._pending.discard(handle)
+            deliver()
+
+        handle = loop.call_at(when, arrive)
+        self._pending.add(handle)
+
+
+class _Receiver(asyncio.DatagramProtocol):
+    def __init__(self, take: Any) -> None:
+        self._take = take
+
+    def datagram_received(self, data: bytes, address: Address) -> None:
+        self._take(data, address)
+
+    def error_received(self, error: OSError) -> None:
+        """Nobody listens there at the moment: a network loses such packets without a word."""
+
+
+async def _control(relay: Relay, lifetime: float) -> None:
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    end = time.monotonic() + lifetime
+    while True:
+        try:
+            line = await asyncio.wait_for(reader.readline(), end - time.monotonic())
+        except asyncio.TimeoutError:
+            return
+        if not line:
+            return
+        try:
+            answer = relay.change(json.loads(line))
+        except ValueError as error:
+            answer = {'error': str(error)}
+        print(json.dumps(answer), flush=True)
+
+
+async def _main(arguments: argparse.Namespace) -> None:
+    relay = Relay(
+        arguments.target, seed=arguments.seed, delay=arguments.delay, jitter=arguments.jitter,
+        loss=arguments.loss, rate=arguments.rate)
+    host, port = await relay.start(arguments.listen)
+    print(json.dumps({'listen': f'{host}:{port}'}), flush=True)
+    try:
+        await _control(relay, arguments.lifetime)
+    finally:
+        relay.close()
+
+
+def _address(text: str) -> Address:
+    host, _, port = text.rpartition(':')
+    return host, int(port)
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('listen', type=_address, help='host:port; port 0 takes any')
+    parser.add_argument('target', type=_address, help='host:port')
+    parser.add_argument('--delay', type=float, default=0.0, help='seconds')
+    parser.add_argument('--jitter', type=float, default=0.0, help='seconds, more or less')
+    parser.add_argument('--loss', type=float, default=0.0, help='0 to 1')
+    parser.add_argument('--rate', type=float, default=0.0, help='bits per second, 0: no limit')
+    parser.add_argument('--seed', type=int, help='makes the losses the same each time')
+    parser.add_argument('--lifetime', type=float, default=600.0, help='seconds until it ends')
+    asyncio.run(_main(parser.parse_args()))
