@@ -9,6 +9,7 @@ import itertools
 from pathlib import Path
 
 import cv2
+import numpy
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -41,10 +42,12 @@ def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
                 there, frame = capture.read()
                 if not there:
                     break
-                read += 1
-                if not device and frame.shape[:2] != (height, width):
+                if device and not read:
+                    width, height = frame.shape[1], frame.shape[0]
+                if frame.shape[:2] != (height, width):
                     frame = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
-                yield frame
+                read += 1
+                yield numpy.asarray(frame, numpy.uint8)
         finally:
             capture.release()
         if not read or device:

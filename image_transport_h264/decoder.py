@@ -8,11 +8,13 @@ see doc/h264.md for all topics and parameters.
 
 from __future__ import annotations
 
+from typing import Optional
+
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Tap
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.receivers import make_receiver
 
@@ -27,11 +29,10 @@ class DecoderNode(LazyNode):
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
         self._images = self.offer(Image, topic, IMAGE_QOS, self._listeners_changed)
         self._receiver = make_receiver(self, codec, stream, self._images.publish)
-        self._infos = self.offer(
-            CameraInfo, camera_info_topic(topic), IMAGE_QOS, self._listeners_changed)
-        self._info_tap = Tap(
-            self, CameraInfo, f'{stream}/{CAMERA_INFO}', IMAGE_QOS, self._infos.publish,
-            adapt=False)
+        self._infos: Optional[Relay] = None
+        if self.declare_parameter('camera_info', True).value:
+            self._infos = Relay(self, CameraInfo, f'{stream}/{CAMERA_INFO}',
+                                camera_info_topic(topic), IMAGE_QOS)
         self._listeners_changed()
         self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
 
@@ -42,7 +43,6 @@ class DecoderNode(LazyNode):
 
     def _listeners_changed(self) -> None:
         self._receiver.want(self._images.get_subscription_count() > 0)
-        self._info_tap.want(self._infos.get_subscription_count() > 0)
 
 
 def main() -> None:

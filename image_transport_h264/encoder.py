@@ -8,11 +8,13 @@ names; see doc/h264.md for all topics and parameters.
 
 from __future__ import annotations
 
+from typing import Optional
+
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Tap
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
 from image_transport_h264.worker import Worker
@@ -30,10 +32,10 @@ class EncoderNode(LazyNode):
         self._worker: Worker[Image] = Worker('encode', self._sender.send)
         self._images = Tap(self, Image, topic, IMAGE_QOS, self._worker.put)
         # not every image has a camera that describes itself: this too only while it is wanted
-        self._infos = self.offer(
-            CameraInfo, f'{stream}/{CAMERA_INFO}', IMAGE_QOS, self._listeners_changed)
-        self._info_tap = Tap(
-            self, CameraInfo, camera_info_topic(topic), IMAGE_QOS, self._infos.publish)
+        self._infos: Optional[Relay] = None
+        if self.declare_parameter('camera_info', True).value:
+            self._infos = Relay(self, CameraInfo, camera_info_topic(topic),
+                                f'{stream}/{CAMERA_INFO}', IMAGE_QOS)
         self._listeners_changed()
         self.get_logger().info(f'{topic} goes out as {stream} ({codec})')
 
@@ -44,7 +46,6 @@ class EncoderNode(LazyNode):
 
     def _listeners_changed(self) -> None:
         self._images.want(self._sender.listeners() > 0)
-        self._info_tap.want(self._infos.get_subscription_count() > 0)
 
 
 def main() -> None:

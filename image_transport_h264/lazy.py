@@ -110,3 +110,16 @@ class Tap:
         if self._subscription is not None and fitting != self._reliability:
             self.want(False)
             self._subscribe()
+
+
+class Relay:
+    """Passes messages from a topic to another while the other is subscribed to."""
+
+    def __init__(
+        self, node: LazyNode, kind: Any, source: str, target: str, qos: QoSProfile,
+    ) -> None:
+        self._publisher = node.offer(kind, target, qos, self._changed)
+        self._tap = Tap(node, kind, source, qos, self._publisher.publish)
+
+    def _changed(self) -> None:
+        self._tap.want(self._publisher.get_subscription_count() > 0)

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The transports of C++ ``image_transport``, through its program ``republish``."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Optional
+
+from fogros2.image_transport import ImageTransport
+from fogros2.image_transport.topics import check, identifier, local_topic
+from fogros2.model import NodeSpec, Stream
+
+
+class Republish(ImageTransport):
+    """
+    A transport whose plugin is installed on both sides.
+
+    The stream's options become ``republish``'s parameters as they are, such as
+    ``{'.camera.theora.quality': 31}``; see ``ros2 param list`` for the plugin's own names.
+    """
+
+    plugin: ClassVar[str]
+
+    def encoder(self, stream: Stream) -> NodeSpec:
+        """Return republish from raw."""
+        image = local_topic(stream.topic, stream.source)
+        return self._node(stream, 'encoder', stream.source, 'raw', self.plugin, {
+            'in': image, f'out/{self.plugin}': f'{stream.topic}/{self.plugin}'})
+
+    def decoder(self, stream: Stream) -> NodeSpec:
+        """Return republish to raw."""
+        image = local_topic(stream.topic, stream.target)
+        return self._node(stream, 'decoder', stream.target, self.plugin, 'raw', {
+            f'in/{self.plugin}': f'{stream.topic}/{self.plugin}', 'out': image})
+
+    def _node(
+        self, stream: Stream, role: str, machine: Optional[str], source: str, target: str,
+        names: dict[str, str],
+    ) -> NodeSpec:
+        check(stream)
+        label = f'{identifier(stream.topic)}_{self.plugin}_{role}'
+        words = ['--ros-args', '-r', f'__node:={label}', '-p', f'in_transport:={source}',
+                 '-p', f'out_transport:={target}']
+        for old, new in names.items():
+            words += ['-r', f'{old}:={new}']
+        if role == 'encoder':
+            for key, value in stream.options.items():
+                words += ['-p', f'{key}:={value}']
+        return NodeSpec(
+            id=f"{machine or 'robot'}/{label}", name=label, package='image_transport',
+            executable='republish', arguments=tuple(words), respawn=True, respawn_delay=1.0)
+
+
+class Theora(Republish):
+    """``theora_image_transport``."""
+
+    plugin = 'theora'
+
+
+class Ffmpeg(Republish):
+    """``ffmpeg_image_transport``."""
+
+    plugin = 'ffmpeg'
+
+
+class RepublishedCompressed(Republish):
+    """``compressed_image_transport``, where the C++ one is preferred to ours."""
+
+    plugin = 'compressed'

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the topics of a stream are called, on the robot and on machines; pure.
+
+On the robot a topic keeps its own name, so that drivers and viewers that a launch didn't start
+work as they are. On a machine, image and camera info get a name of that machine's own
+(``/camera`` becomes ``/fogros2/planner/camera``): the two sides would find each other across the
+VPN otherwise, and the raw images cross it. Between the two is the stream (``/camera/h264``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import json
+import re
+from typing import Any, Optional
+
+from fogros2.errors import ConfigurationError
+from fogros2.model import NodeSpec, Stream
+
+_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+#: Options of a Stream that are no parameters of the encoder.
+_DECODER_PARAMETERS = ('show_damage', 'encoding')
+
+
+def check(stream: Stream) -> None:
+    """
+    Hold a stream against what can be carried.
+
+    :raises ConfigurationError: not a full topic name, or both ends on one host.
+    """
+    if not _TOPIC.fullmatch(stream.topic) or '__' in stream.topic:
+        raise ConfigurationError(f"'{stream.topic}' is not the full name of a topic",
+                                 "write it as ros2 topic list does, such as '/camera/image_raw'")
+    if stream.source == stream.target:
+        where = stream.source or 'the robot'
+        raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself')
+
+
+def local_topic(topic: str, machine: Optional[str]) -> str:
+    """Return what the topic is called on a host: its own name on the robot (None)."""
+    if machine is None:
+        return topic
+    return f'/fogros2/{identifier(machine)}{topic}'
+
+
+def camera_info_topic(topic: str) -> str:
+    """Return where the camera of an image topic describes itself."""
+    return topic.rpartition('/')[0] + '/camera_info'
+
+
+def carries_info(stream: Stream) -> bool:
+    """
+    Return whether camera info goes along: from the robot yes, else if the stream's options say so.
+
+    An annotated image that comes back is often called like a sibling of the camera's: its camera
+    info would have the camera's own name, and go round in a circle.
+    """
+    return bool(stream.options.get('camera_info', stream.source is None))
+
+
+def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:
+    """
+    Return how topics of streams are renamed for nodes on a host; nothing on the robot.
+
+    For a node that subscribes to a topic or publishes it; its camera info goes along.
+
+    :param machine: where the nodes run, None for the robot.
+    """
+    names: dict[str, str] = {}
+    if machine is None:
+        return names
+    for stream in streams:
+        if machine in (stream.source, stream.target):
+            names[stream.topic] = local_topic(stream.topic, machine)
+            if carries_info(stream):
+                info = camera_info_topic(stream.topic)
+                names[info] = local_topic(info, machine)
+    return names
+
+
+def rewrite(
+    pairs: Iterable[tuple[str, str]], names: Mapping[str, str], namespace: str = '/',
+) -> list[tuple[str, str]]:
+    """
+    Return a node's remappings so that what they lead to ends under the new names.
+
+    ROS follows one rule for a name and no further, so ``image:=/camera`` has to say where
+    ``/camera`` has gone, and rules for those who use the topic's own name go behind: the first
+    rule that matches counts.
+
+    :param pairs: the node's own, in order; from its group, SetRemap or itself.
+    :param names: see ``remappings``.
+    :param namespace: the node's, that relative names are in.
+    """
+    changed = [(old, names.get(absolute(new, namespace), new)) for old, new in pairs]
+    taken = {absolute(old, namespace) for old, _ in pairs}
+    return [*changed, *((old, new) for old, new in names.items() if old not in taken)]
+
+
+def absolute(name: str, namespace: str) -> str:
+    """Return a topic's full name; private ones (``~/x``) stay as they are."""
+    if name.startswith(('/', '~', 'rostopic://', 'rosservice://')):
+        return name
+    return f"/{namespace.strip('/')}/{name}".replace('//', '/')
+
+
+def node(
+    stream: Stream, *, role: str, codec: str, machine: Optional[str], name: str,
+) -> NodeSpec:
+    """
+    Return one of this project's pair of nodes.
+
+    :param role: 'encoder' or 'decoder'.
+    :param codec: what the nodes' parameter of that name takes.
+    :param machine: where it runs.
+    :param name: last part of the stream's topic; viewers look for 'compressed' there.
+    :raises ConfigurationError: see ``check``; or an option that has no parameter's form.
+    """
+    check(stream)
+    image = local_topic(stream.topic, machine)
+    between = f'{stream.topic}/{name}'
+    parameters: dict[str, Any] = {
+        'codec': codec, 'stream': between, 'camera_info': carries_info(stream)}
+    for key, value in stream.options.items():
+        if key != 'camera_info' and (key in _DECODER_PARAMETERS) == (role == 'decoder'):
+            parameters[key] = value
+    label = f'{identifier(stream.topic)}_{name}_{role}'
+    words = ['--ros-args', '-r', f'__node:={label}', '-r', f'image:={image}']
+    for key, value in parameters.items():
+        words += ['-p', f'{key}:={_yaml(key, value)}']
+    return NodeSpec(
+        id=f"{machine or 'robot'}/{label}", name=label, package='image_transport_h264',
+        executable=role, arguments=tuple(words), respawn=True, respawn_delay=1.0)
+
+
+def identifier(text: str) -> str:
+    """Return a name as a part of ROS names: letters, digits and underscores, no digit first."""
+    plain = re.sub('_+', '_', re.sub('[^A-Za-z0-9]', '_', text)).strip('_')
+    return plain if plain[:1].isalpha() else f'm_{plain}'
+
+
+def _yaml(key: str, value: Any) -> str:
+    if not isinstance(value, (bool, int, float, str)):
+        raise ConfigurationError(f"option '{key}' of a stream is {value!r}",
+                                 'give a number, a text, true or false')
+    # JSON is YAML; 1e-05 and such would be text there
+    return repr(value) if isinstance(value, float) and 'e' not in repr(value) else (
+        f'{value:.20f}'.rstrip('0') if isinstance(value, float) else json.dumps(value))

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Transports by value: what nodes a stream becomes, and what its topics are called where."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.compressed import Compressed
+from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.raw import Raw
+from fogros2.image_transport.republish import Theora
+from fogros2.image_transport.topics import identifier, local_topic, remappings, rewrite
+from fogros2.model import Stream, to_json
+
+TO_CLOUD = Stream('/front/image_raw', 'h264', target='planner-1',
+                  options={'bitrate': 2_000_000, 'quality': 21.5, 'lossless': False,
+                           'preset': 'superfast', 'show_damage': True})
+FROM_CLOUD = Stream('/annotated', 'h264', source='planner-1')
+
+
+def words(arguments: tuple[object, ...]) -> dict[str, str]:
+    """Return what a command line says, by name."""
+    pairs = [str(word) for word in arguments if ':=' in str(word)]
+    return dict(pair.split(':=', 1) for pair in pairs)
+
+
+def test_robot_to_cloud() -> None:
+    """The encoder takes the topic's own name, the decoder publishes the machine's."""
+    encoder, decoder = H264().encoder(TO_CLOUD), H264().decoder(TO_CLOUD)
+    assert (encoder.package, encoder.executable) == ('image_transport_h264', 'encoder')
+    assert encoder.arguments[0] == '--ros-args'
+    assert words(encoder.arguments) == {
+        '__node': 'front_image_raw_h264_encoder', 'image': '/front/image_raw',
+        'camera_info': 'true', 'codec': '"h264"',
+        'stream': '"/front/image_raw/h264"', 'bitrate': '2000000', 'quality': '21.5',
+        'lossless': 'false', 'preset': '"superfast"'}
+    assert words(decoder.arguments) == {
+        '__node': 'front_image_raw_h264_decoder',
+        'image': '/fogros2/planner_1/front/image_raw',
+        'camera_info': 'true', 'codec': '"h264"',
+        'stream': '"/front/image_raw/h264"', 'show_damage': 'true'}
+    assert encoder.id == 'robot/front_image_raw_h264_encoder'
+    assert decoder.id == 'planner-1/front_image_raw_h264_decoder'
+    assert to_json(encoder)
+
+
+def test_cloud_to_robot() -> None:
+    encoder, decoder = H264().encoder(FROM_CLOUD), H264().decoder(FROM_CLOUD)
+    assert words(encoder.arguments)['image'] == '/fogros2/planner_1/annotated'
+    assert words(decoder.arguments)['image'] == '/annotated'
+    assert words(encoder.arguments)['stream'] == words(decoder.arguments)['stream']
+
+
+def test_one_encoder_serves_two_machines() -> None:
+    streams = [Stream('/camera', 'h264', target=machine) for machine in ('a', 'b')]
+    assert H264().encoder(streams[0]) == H264().encoder(streams[1])
+    assert H264().decoder(streams[0]).id != H264().decoder(streams[1]).id
+
+
+@pytest.mark.parametrize(('options', 'codec'), [
+    ({}, 'jpeg'), ({'format': 'png'}, 'png'), ({'jpeg_quality': 60}, 'jpeg')])
+def test_compressed(options: dict[str, object], codec: str) -> None:
+    stream = Stream('/camera', 'compressed', target='m', options=options)
+    told = words(Compressed().encoder(stream).arguments)
+    assert told['codec'] == f'"{codec}"'
+    assert told['stream'] == '"/camera/compressed"'
+    assert 'format' not in told
+    assert told.get('jpeg_quality') == ('60' if 'jpeg_quality' in options else None)
+
+
+def test_raw_and_republish() -> None:
+    stream = Stream('/camera', 'raw', target='m')
+    assert words(Raw().decoder(stream).arguments)['stream'] == '"/camera/raw"'
+    theora = Stream('/camera', 'theora', target='m', options={'.camera.theora.quality': 31})
+    encoder, decoder = Theora().encoder(theora), Theora().decoder(theora)
+    assert (encoder.package, encoder.executable) == ('image_transport', 'republish')
+    assert words(encoder.arguments) == {
+        '__node': 'camera_theora_encoder', 'in_transport': 'raw', 'out_transport': 'theora',
+        'in': '/camera', 'out/theora': '/camera/theora', '.camera.theora.quality': '31'}
+    assert words(decoder.arguments) == {
+        '__node': 'camera_theora_decoder', 'in_transport': 'theora', 'out_transport': 'raw',
+        'in/theora': '/camera/theora', 'out': '/fogros2/m/camera'}
+
+
+@pytest.mark.parametrize('stream', [
+    Stream('camera', 'h264', target='m'), Stream('/camera/', 'h264', target='m'),
+    Stream('/1camera', 'h264', target='m'), Stream('/', 'h264', target='m'),
+    Stream('/camera', 'h264'), Stream('/camera', 'h264', source='m', target='m'),
+    Stream('/camera', 'h264', target='m', options={'bitrate': [1, 2]})])
+def test_what_cannot_be_carried_is_refused(stream: Stream) -> None:
+    with pytest.raises(ConfigurationError):
+        H264().encoder(stream)
+
+
+def test_an_unknown_format_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match='webp'):
+        Compressed().encoder(Stream('/c', 'compressed', target='m', options={'format': 'webp'}))
+
+
+def test_names_on_a_machine() -> None:
+    assert local_topic('/camera', None) == '/camera'
+    assert local_topic('/a/b', 'my-cloud') == '/fogros2/my_cloud/a/b'
+    assert identifier('2nd--machine') == 'm_2nd_machine'
+
+
+def test_remappings_are_of_the_machines_that_take_part() -> None:
+    streams = [TO_CLOUD, FROM_CLOUD, Stream('/other', 'h264', target='elsewhere')]
+    assert remappings(streams, None) == {}
+    assert remappings(streams, 'planner-1') == {
+        '/front/image_raw': '/fogros2/planner_1/front/image_raw',
+        '/front/camera_info': '/fogros2/planner_1/front/camera_info',
+        '/annotated': '/fogros2/planner_1/annotated'}
+
+
+def test_camera_info_comes_back_only_when_asked_for() -> None:
+    """Or that of an annotated image would take the name of the camera's, and go in a circle."""
+    assert words(H264().decoder(FROM_CLOUD).arguments)['camera_info'] == 'false'
+    asked = Stream('/left/annotated', 'h264', source='m', options={'camera_info': True})
+    assert words(H264().encoder(asked).arguments)['camera_info'] == 'true'
+    assert remappings([asked], 'm')['/left/camera_info'] == '/fogros2/m/left/camera_info'
+
+
+@pytest.mark.parametrize(('own', 'namespace', 'expected'), [
+    ([], '/', [('/camera', '/f/camera')]),
+    # a user's rule leads to the topic: it leads to the new name instead
+    ([('image', '/camera')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
+    ([('image', 'camera')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
+    # in a namespace, the relative name is another topic
+    ([('image', 'camera')], '/left', [('image', 'camera'), ('/camera', '/f/camera')]),
+    # the user has led the topic elsewhere: that stands
+    ([('/camera', '/other')], '/', [('/camera', '/other')]),
+    ([('camera', 'other')], '/', [('camera', 'other')]),
+    ([('__node', 'x')], '/', [('__node', 'x'), ('/camera', '/f/camera')]),
+])
+def test_rules_do_not_chain_so_they_are_rewritten(
+    own: list[tuple[str, str]], namespace: str, expected: list[tuple[str, str]],
+) -> None:
+    assert rewrite(own, {'/camera': '/f/camera'}, namespace) == expected
