@@ -7,6 +7,8 @@ import shlex
 
 from fogros2.model import Command
 
+_ANNOUNCE = 'echo $$; exec "$@"'
+
 
 def words(command: Command, *, root: bool) -> list[str]:
     """
@@ -22,6 +24,18 @@ def words(command: Command, *, root: bool) -> list[str]:
 def remote_line(command: Command, *, user: str) -> str:
     """Return the line that the login shell of ``user`` has to run."""
     return ' '.join(shlex.quote(word) for word in words(command, root=user == 'root'))
+
+
+def announced_line(command: Command, *, user: str) -> str:
+    """Return the same line, which first prints the number of the process it becomes."""
+    return f'exec sh -c {shlex.quote(_ANNOUNCE)} sh {remote_line(command, user=user)}'
+
+
+def end_script(pid: int) -> str:
+    """Return a script that ends a process and its group: asks first, then doesn't."""
+    return (f'kill -s TERM -- -{pid} || exit 0; n=0; '
+            f'while [ $n -lt 20 ] && kill -s 0 -- -{pid}; do sleep 0.1; n=$((n + 1)); done; '
+            f'kill -s KILL -- -{pid}')
 
 
 def remote_path(path: str) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from pathlib import Path
 import threading
 import time
@@ -14,6 +15,7 @@ from fogros2.errors import (
     CommandError,
     ConnectError,
     DeadlineExceeded,
+    FogError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, ssh_connection, ssh_terminal, Stream, sync
@@ -58,23 +60,25 @@ class SSHShell:
         """
         return wait_until(
             self._try_channel, timeout=self._timeout, what=f"a session on '{self.name}'",
-            hint='raise MaxSessions of its SSH server')
+            hint='raise MaxSessions of its SSH server', longest=0.1)
 
     def _try_channel(self) -> Optional[paramiko.Channel]:
         transport = self._connected()
         import paramiko
+        begin = time.monotonic()
         try:
             return transport.open_session(window_size=1 << 22, timeout=self._timeout)
-        except paramiko.ChannelException:
-            return None  # as many sessions as the server allows: one of ours will end
         except (paramiko.SSHException, EOFError, OSError):
-            # lost, as we find out only now; nothing has been started yet
-            self._drop(transport)
+            # Lost, as we find out only now, and nothing has been started yet; or as many
+            # sessions as the server allows, and one of ours will end. What is raised doesn't
+            # tell: paramiko keeps one exception for all threads. Nor does is_active().
+            if not transport.is_alive() or time.monotonic() - begin >= self._timeout:
+                self._drop(transport)
             return None
 
     def _connected(self) -> paramiko.Transport:
         with self._lock:
-            if self._transport is None or not self._transport.is_active():
+            if self._transport is None or not self._transport.is_alive():
                 self._transport = ssh_connection.connect(
                     self.endpoint, name=self.name, timeout=self._timeout)
             return self._transport
@@ -100,26 +104,21 @@ class SSHShell:
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
         """Run a command there and wait for it; see the protocol."""
-        line = command_line.remote_line(command, user=self.user)
-        return self._run(command, line, timeout=timeout, check=check, cancel=cancel,
-                         on_output=on_output)
-
-    def _run(
-        self, command: Command, line: str, *, timeout: float, check: bool,
-        cancel: Optional[threading.Event] = None,
-        on_output: Optional[Callable[[str], None]] = None,
-    ) -> Result:
+        line = command_line.announced_line(command, user=self.user)
         begin = time.monotonic()
         if cancel is not None and cancel.is_set():
             raise Cancelled(_what(command))
         channel = self.start(line)
+        output = _Output(on_output)
         try:
             feeder = _feed(channel, command.input)
-            output = _Output(on_output)
             self._collect(channel, output, begin + timeout, cancel, command)
             returncode = self._status(channel, command)
             if feeder is not None:
                 feeder.join(_DRAIN)
+        except (Cancelled, DeadlineExceeded):
+            self._end(output.pid, command.sudo)
+            raise
         finally:
             channel.close()
         result = Result(returncode, *output.text(), time.monotonic() - begin)
@@ -144,7 +143,7 @@ class SSHShell:
                 return channel
             except (paramiko.SSHException, EOFError, OSError) as error:
                 transport = channel.get_transport()
-                if attempt == 2 or transport.is_active():
+                if attempt == 2 or transport.is_alive():
                     raise ConnectError(f"'{self.name}' can not start a command: {error}") \
                         from error
                 self._drop(transport)
@@ -159,10 +158,8 @@ class SSHShell:
         while True:
             now = time.monotonic()
             if cancel is not None and cancel.is_set():
-                _signal(channel, 'TERM')
                 raise Cancelled(_what(command))
             if now >= deadline:
-                _signal(channel, 'TERM')
                 raise DeadlineExceeded(
                     f"{_what(command)} took too long on '{self.name}'")
             channel.settimeout(min(0.05, deadline - now))
@@ -189,7 +186,7 @@ class SSHShell:
                     output.stderr += more
             except TimeoutError:
                 pass
-            lost = channel.closed or not channel.get_transport().is_active()
+            lost = channel.closed or not channel.get_transport().is_alive()
             if lost or channel.exit_status_ready():
                 return
             _pause(channel, min(deadline, now + 0.05))
@@ -199,10 +196,17 @@ class SSHShell:
             raise ConnectError(f"the connection to '{self.name}' was lost while "
                                f'{_what(command)} ran there', "check the robot's network")
         status = channel.recv_exit_status()
-        if status == -1 and not channel.get_transport().is_active():
+        if status == -1 and not channel.eof_received:  # a signal ended it, if there was one
             raise ConnectError(f"the connection to '{self.name}' was lost while "
                                f'{_what(command)} ran there', "check the robot's network")
         return int(status)
+
+    def _end(self, pid: int, sudo: bool) -> None:
+        """End what a command that was given up started: closing its streams doesn't."""
+        if pid:
+            with contextlib.suppress(FogError):  # the machine may be what doesn't answer
+                self.run(Command(('sh', '-c', command_line.end_script(pid)), sudo=sudo),
+                         timeout=5.0, check=False)
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file there (folders made as needed): aside first, then moved into place."""
@@ -272,20 +276,35 @@ class SSHStream:
 
     def close(self) -> None:
         """End it; a ``readline`` in another thread returns b''."""
-        _signal(self._channel, 'TERM')
         self._channel.close()
 
 
 class _Output:
-    """What a command wrote, and its lines as they become whole."""
+    """
+    What a command wrote, and its lines as they become whole.
+
+    The first line isn't the command's: it is the number of its process.
+    """
 
     def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
         self._on_output = on_output
         self._parts: list[bytes] = []
         self._rest = b''
+        self._head: Optional[bytes] = b''
+        self.pid = 0
         self.stderr = b''
 
     def add(self, data: bytes) -> None:
+        """Take what has arrived of standard output."""
+        if self._head is not None:
+            first, newline, data = (self._head + data).partition(b'\n')
+            if not newline:
+                self._head = first
+                return
+            self._head = None
+            self.pid = int(first) if first.isdigit() else 0
+            if not data:
+                return
         self._parts.append(data)
         if self._on_output is not None:
             *lines, self._rest = (self._rest + data).split(b'\n')
@@ -301,6 +320,7 @@ class _Output:
         return found
 
     def text(self) -> tuple[str, str]:
+        """Return standard output and standard error; the last line goes out, if not whole."""
         if self._on_output is not None and self._rest:
             self._on_output(self._rest.decode(errors='replace'))
             self._rest = b''
@@ -316,9 +336,12 @@ def _feed(
     channel: paramiko.Channel, data: bytes, *, end: bool = True,
 ) -> Optional[threading.Thread]:
     def send() -> None:
+        rest = memoryview(data)
         try:
-            if data:
-                channel.sendall(data)
+            while rest:
+                # the reader's time-out is the channel's, and meant for reading alone
+                with contextlib.suppress(TimeoutError):
+                    rest = rest[channel.send(bytes(rest[:1 << 15])):]
             if end:
                 channel.shutdown_write()
         except (OSError, EOFError):
@@ -335,21 +358,3 @@ def _feed(
 def _pause(channel: paramiko.Channel, until: float) -> None:
     """Wait a little for the exit status, which may come after the output's end."""
     channel.status_event.wait(max(0.0, until - time.monotonic()))
-
-
-def _signal(channel: paramiko.Channel, name: str) -> None:
-    """Ask the server to send the command a signal (RFC 4254, 6.9); it may not listen."""
-    import paramiko
-
-    message = paramiko.Message()
-    message.add_byte(bytes([98]))  # SSH_MSG_CHANNEL_REQUEST
-    message.add_int(channel.remote_chanid)
-    message.add_string('signal')
-    message.add_boolean(False)
-    message.add_string(name)
-    try:
-        if not channel.closed:
-            # paramiko has no public name for it
-            channel.get_transport()._send_user_message(message)  # type: ignore[attr-defined]
-    except (paramiko.SSHException, EOFError, OSError):
-        pass  # the connection is gone, and with it the command's input and output

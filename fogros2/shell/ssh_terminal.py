@@ -58,7 +58,7 @@ def attach(channel: paramiko.Channel, line: Optional[str], name: str) -> int:
 @contextlib.contextmanager
 def _raw() -> Iterator[None]:
     before = termios.tcgetattr(0)
-    tty.setraw(0)
+    tty.setraw(0, termios.TCSADRAIN)  # what was typed ahead is kept
     try:
         yield
     finally:

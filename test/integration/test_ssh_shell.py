@@ -1,0 +1,405 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of the SSH shell against a real server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import (
+    AuthenticationError,
+    Cancelled,
+    ConnectError,
+    DeadlineExceeded,
+    HostKeyError,
+)
+from fogros2.model import Command, Endpoint
+from fogros2.shell import connect
+from fogros2.shell.ssh import SSHShell
+from fogros2.testing import ShellContract
+from fogros2.testing.sshd import free_port, private_sshd, PrivateSshd
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.skipif(
+    process.which('sshd') is None, reason='needs sshd (openssh-server)')
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[PrivateSshd]:
+    with private_sshd(tmp_path / 'sshd') as running:
+        yield running
+
+
+@pytest.fixture
+def shell(server: PrivateSshd) -> Iterator[SSHShell]:
+    with contextlib.closing(SSHShell(server.endpoint, name='planner', timeout=10.0)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """Return a home without keys or known hosts, and no agent."""
+    monkeypatch.setenv('HOME', str(tmp_path / 'home'))
+    monkeypatch.delenv('SSH_AUTH_SOCK', raising=False)
+    (tmp_path / 'home/.ssh').mkdir(parents=True, mode=0o700)
+    return tmp_path / 'home'
+
+
+class TestSSHShell(ShellContract):
+
+    sudo = os.geteuid() == 0 or process.run(
+        Command(('sudo', '-n', 'true')), timeout=10.0, check=False).returncode == 0
+
+    @contextlib.contextmanager
+    def connected(self, folder):
+        there = folder / 'there'
+        there.mkdir()
+        with private_sshd(folder / 'sshd') as running, contextlib.closing(
+                SSHShell(running.endpoint, name='planner', timeout=10.0)) as opened:
+            yield opened, str(there)
+
+
+def test_the_plugin_is_found_by_the_endpoint_s_kind(server):
+    shell = connect(server.endpoint, name='planner')
+    assert isinstance(shell, SSHShell)
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+    shell.close()
+
+
+def test_another_host_key_than_the_pinned_one_is_refused(server, tmp_path):
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
+                         str(tmp_path / 'other'))), timeout=10.0)
+    pinned = dataclasses.replace(
+        server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
+    with pytest.raises(HostKeyError, match='another host key than the pinned one'):
+        SSHShell(pinned, name='planner').run(Command(('true',)), timeout=10.0)
+
+
+def test_a_pinned_key_of_another_type_is_refused(server, tmp_path):
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ecdsa', '-N', '', '-f',
+                         str(tmp_path / 'other'))), timeout=10.0)
+    pinned = dataclasses.replace(
+        server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
+    with pytest.raises(HostKeyError):
+        SSHShell(pinned, name='planner').run(Command(('true',)), timeout=10.0)
+
+
+def test_an_unknown_host_is_refused_with_the_line_to_add(server, home):
+    shell = SSHShell(dataclasses.replace(server.endpoint, host_key=None), name='planner')
+    with pytest.raises(HostKeyError, match='unknown') as refused:
+        shell.run(Command(('true',)), timeout=10.0)
+    line = refused.value.hint.partition('known_hosts: ')[2]
+    assert line == f'[127.0.0.1]:{server.port} {server.host_key}'
+    (home / '.ssh/known_hosts').write_text(f'{line}\n')
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+    shell.close()
+    # as ssh writes it where HashKnownHosts is set
+    process.run(Command(('ssh-keygen', '-H', '-f', str(home / '.ssh/known_hosts'))), timeout=10.0)
+    assert '127.0.0.1' not in (home / '.ssh/known_hosts').read_text()
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+    shell.close()
+
+
+def test_a_changed_host_is_refused_with_the_way_out(server, home):
+    other = 'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9'
+    (home / '.ssh/known_hosts').write_text(
+        f'[127.0.0.1]:{server.port} ssh-ed25519 {other}\n')
+    with pytest.raises(HostKeyError, match=r'ssh-keygen -R') as refused:
+        SSHShell(dataclasses.replace(server.endpoint, host_key=None), name='planner').run(
+            Command(('true',)), timeout=10.0)
+    assert f"'[127.0.0.1]:{server.port}'" in refused.value.hint
+
+
+def test_a_refused_key_is_said_to_be_refused(server, tmp_path):
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
+                         str(tmp_path / 'stranger'))), timeout=10.0)
+    endpoint = dataclasses.replace(server.endpoint, key_file=str(tmp_path / 'stranger'))
+    with pytest.raises(AuthenticationError, match='does not accept .*authorized_keys'):
+        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=10.0)
+
+
+@pytest.mark.parametrize('kind', ['ed25519', 'ecdsa', 'rsa'])
+def test_keys_of_every_type_log_in(server, tmp_path, kind):
+    path = tmp_path / 'own'
+    process.run(Command(('ssh-keygen', '-q', '-t', kind, '-N', '', '-f', str(path))), timeout=60.0)
+    with open(server.folder / 'authorized_keys', 'a') as keys:
+        keys.write(path.with_suffix('.pub').read_text())
+    endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
+    with contextlib.closing(SSHShell(endpoint, name='planner')) as shell:
+        assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+
+
+def test_the_user_s_own_keys_are_tried(server, home):
+    (home / '.ssh/id_ed25519').write_text((server.folder / 'id').read_text())
+    (home / '.ssh/id_ed25519').chmod(0o600)
+    endpoint = dataclasses.replace(server.endpoint, key_file=None)
+    with contextlib.closing(SSHShell(endpoint, name='planner')) as shell:
+        assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+
+
+def test_no_key_at_all_is_said(server, home):
+    endpoint = dataclasses.replace(server.endpoint, key_file=None)
+    with pytest.raises(AuthenticationError, match='no key to log in'):
+        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=10.0)
+
+
+@pytest.mark.parametrize('content, words', [
+    (None, 'can not be read'), ('no key', 'no private key'),
+])
+def test_a_useless_key_file_is_named(server, tmp_path, content, words):
+    path = tmp_path / 'key'
+    if content is not None:
+        path.write_text(content)
+    endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
+    with pytest.raises(AuthenticationError, match=words) as refused:
+        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=10.0)
+    assert str(path) in str(refused.value)
+
+
+def test_a_key_with_a_passphrase_is_the_agent_s_part(server, tmp_path):
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', 'secret', '-f',
+                         str(tmp_path / 'locked'))), timeout=10.0)
+    endpoint = dataclasses.replace(server.endpoint, key_file=str(tmp_path / 'locked'))
+    with pytest.raises(AuthenticationError, match='ssh-add'):
+        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=10.0)
+
+
+def test_a_port_where_nobody_listens_refuses_at_once():
+    shell = SSHShell(Endpoint('ssh', '127.0.0.1', free_port(), 'fog', 'ssh-ed25519 AAAA'),
+                     name='planner', timeout=10.0)
+    begin = time.monotonic()
+    with pytest.raises(ConnectError, match='refuses connections'):
+        shell.run(Command(('true',)), timeout=10.0)
+    assert time.monotonic() - begin < 2.0
+
+
+def test_an_unknown_host_name_is_named():
+    shell = SSHShell(Endpoint('ssh', 'no-such-host.invalid', 22, 'fog', 'ssh-ed25519 AAAA'),
+                     name='planner', timeout=10.0)
+    with pytest.raises(ConnectError, match='no-such-host.invalid'):
+        shell.run(Command(('true',)), timeout=10.0)
+
+
+@pytest.mark.parametrize('greeting', [b'', b'HTTP/1.1 400 Bad Request\r\n\r\n'])
+def test_a_server_of_another_kind_is_said_to_be_none(greeting, capfd):
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                peer, _ = listener.accept()
+                peer.sendall(greeting)
+                peer.close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        port = listener.getsockname()[1]
+        shell = SSHShell(Endpoint('ssh', '127.0.0.1', port, 'fog', 'ssh-ed25519 AAAA'),
+                         name='planner', timeout=3.0)
+        with pytest.raises(ConnectError, match='does not answer as an SSH server'):
+            shell.run(Command(('true',)), timeout=10.0)
+        thread.join(5.0)
+    assert capfd.readouterr().err == ''
+
+
+def test_a_lost_connection_is_opened_again(server, shell):
+    shell.run(Command(('true',)), timeout=10.0)
+    for _ in range(3):
+        server.cut()
+        assert shell.run(Command(('echo', 'again')), timeout=10.0).stdout == 'again\n'
+
+
+def test_a_server_that_was_restarted_is_connected_to_again(server, shell):
+    shell.run(Command(('true',)), timeout=10.0)
+    server.stop()
+    with pytest.raises(ConnectError, match='refuses connections'):
+        shell.run(Command(('true',)), timeout=10.0)
+    server.start()
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+
+
+def test_a_connection_lost_under_a_command_is_an_error(server, shell, tmp_path):
+    started = tmp_path / 'started'
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            shell.run(Command.script(f'touch {started}; exec sleep 60', what='a long one'),
+                      timeout=30.0)
+        except ConnectError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    wait_until(started.exists, timeout=10.0, what='the command to run')
+    server.cut()
+    thread.join(10.0)
+    assert 'lost while a long one ran' in str(failed[0])
+
+
+def test_a_stream_ends_with_its_connection(server, shell):
+    stream = shell.open(Command(('cat',)))
+    stream.write(b'hello\n')
+    assert stream.readline() == b'hello\n'
+    server.cut()
+    assert stream.readline() == b''
+    with pytest.raises(ConnectError):
+        wait_until(lambda: stream.write(b'more\n'), timeout=10.0, what='the loss to be noticed')
+
+
+@pytest.mark.parametrize('how', ['timeout', 'cancel'])
+def test_a_command_given_up_ends_there(server, shell, how):
+    words = ('sleep', '4711.25')
+    cancel = threading.Event()
+    timer = threading.Timer(0.2, cancel.set)
+    timer.start()
+    with pytest.raises((Cancelled, DeadlineExceeded)):
+        shell.run(Command(words), timeout=0.2 if how == 'timeout' else 30.0,
+                  cancel=cancel if how == 'cancel' else None)
+    timer.join()
+    wait_until(lambda: '4711.25' not in process.run(
+        Command(('ps', '-eo', 'args')), timeout=10.0).stdout.replace('ps -eo args', ''),
+        timeout=10.0, what='the command to end')
+
+
+def test_a_flood_on_standard_error_blocks_nothing(shell):
+    result = shell.run(Command.script('head -c 9000000 /dev/zero >&2; echo done'), timeout=60.0)
+    assert result.stdout == 'done\n'
+    assert len(result.stderr) == 9_000_000
+
+
+def test_a_flood_on_a_stream_s_standard_error_blocks_nothing(shell):
+    stream = shell.open(Command.script(
+        'for i in 1 2 3 4 5 6 7 8; do head -c 1000000 /dev/zero >&2; echo $i; done'))
+    assert [stream.readline() for _ in range(8)] == [b'%d\n' % (n + 1) for n in range(8)]
+    stream.close()
+
+
+def test_a_command_that_leaves_a_daemon_behind_returns(shell):
+    begin = time.monotonic()
+    result = shell.run(Command.script('sleep 20 & echo $!'), timeout=30.0)
+    assert time.monotonic() - begin < 10.0
+    shell.run(Command(('kill', result.stdout.strip())), timeout=10.0)
+
+
+def test_a_command_that_reads_nothing_takes_much_input(shell):
+    result = shell.run(Command(('true',), input=b'x' * 5_000_000), timeout=30.0)
+    assert result.returncode == 0
+
+
+def test_a_command_ended_by_a_signal_has_failed(shell):
+    assert shell.run(Command.script('kill -KILL $$'), timeout=10.0, check=False).returncode != 0
+
+
+def test_few_sessions_are_waited_for(tmp_path):
+    with private_sshd(tmp_path / 'sshd', 'MaxSessions 2\n') as server:
+        with contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell:
+            codes = []
+
+            def run() -> None:
+                codes.append(shell.run(Command(('sleep', '0.1')), timeout=30.0).returncode)
+
+            threads = [threading.Thread(target=run) for _ in range(6)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(30.0)
+            assert codes == [0] * 6
+
+
+def test_one_connection_serves_many_threads(server, shell):
+    threads = [threading.Thread(target=shell.run, args=(Command(('true',)),),
+                                kwargs={'timeout': 30.0}) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30.0)
+    peers = process.run(Command(('ss', '-Htn', 'state', 'established', 'dport', '=',
+                                 f':{server.port}')), timeout=10.0).stdout.splitlines()
+    assert len(peers) == 1
+
+
+_INTERACTIVE = """
+import sys
+from fogros2.model import Command, Endpoint
+from fogros2.shell.ssh import SSHShell
+shell = SSHShell(Endpoint('ssh', '127.0.0.1', {port}, {user!r}, {host_key!r}, {key!r}),
+                 name='planner', timeout=10.0)
+sys.exit(shell.interactive({command}))
+"""
+
+
+def interactive(server: PrivateSshd, command: str) -> list[str]:
+    endpoint = server.endpoint
+    code = _INTERACTIVE.format(
+        port=endpoint.port, user=endpoint.user, host_key=endpoint.host_key,
+        key=endpoint.key_file, command=command)
+    return [sys.executable, '-c', code]
+
+
+def read_until(terminal: int, text: bytes) -> bytes:
+    """Return a terminal's output up to ``text``."""
+    got = b''
+    os.set_blocking(terminal, False)
+
+    def more() -> bool:
+        nonlocal got
+        with contextlib.suppress(BlockingIOError):
+            got += os.read(terminal, 4096)
+        return text in got
+
+    wait_until(more, timeout=20.0, what=f'{text!r} on the terminal')
+    return got
+
+
+def test_a_terminal_is_given_with_its_size_and_keys(server):
+    ours, theirs = os.openpty()
+    try:
+        termios.tcsetwinsize(ours, (33, 99))
+        child = subprocess.Popen(
+            interactive(server, "Command(('sh', '-c', 'stty size; read x; stty size; exit 7'))"),
+            stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+            preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)))
+        read_until(ours, b'33 99\r\n')
+        termios.tcsetwinsize(ours, (44, 111))
+        wait_until(lambda: termios.tcgetwinsize(theirs) == (44, 111), timeout=5.0, what='resize')
+        os.write(ours, b'go\r')
+        read_until(ours, b'44 111\r\n')
+        assert child.wait(20.0) == 7
+        # cooked again
+        assert termios.tcgetattr(theirs)[3] & termios.ICANON
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_a_login_shell_is_given(server):
+    ours, theirs = os.openpty()
+    try:
+        child = subprocess.Popen(interactive(server, ''), stdin=theirs, stdout=theirs,
+                                 stderr=theirs, start_new_session=True)
+        os.write(ours, b'echo $((6 * 7)); exit 3\r')
+        read_until(ours, b'42\r\n')
+        assert child.wait(20.0) == 3
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_without_a_terminal_bytes_go_as_they_are(server):
+    data = bytes(range(256)) * 5000
+    child = subprocess.run(
+        interactive(server, "Command(('sh', '-c', 'cat; echo no >&2; exit 5'))"), input=data,
+        capture_output=True, timeout=60, check=False)
+    assert (child.returncode, child.stderr) == (5, b'no\n')
+    assert child.stdout == data
