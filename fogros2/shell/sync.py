@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 BULK = 64 << 20
 #: Exit status of rsync for source files that vanished meanwhile: editors and compilers do that.
 _VANISHED = 24
+#: Errors in the socket or in the protocol's stream, and the remote shell's own.
+_LOST = (10, 12, 255)
 
 
 class Connection(Protocol):
@@ -228,7 +230,7 @@ def explained(result: Result, source: Path, where: str) -> FogError:
                           'make room there, or leave more out')
     if 'command not found' in text or 'remote command not found' in text:
         return missing_there(where)
-    if result.returncode == 255 or 'connection unexpectedly closed' in text:
+    if result.returncode in _LOST:
         return ConnectError(f'the connection to {where} was lost while {source} was sent',
                             "check the robot's network")
     lines = [line for line in text.splitlines() if line.startswith('rsync:')] or \

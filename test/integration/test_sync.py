@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of sync over a real SSH server: both transports, and what can go wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import os
+from pathlib import Path
+import shutil
+import threading
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import Cancelled, CommandError, ConnectError, PrerequisiteError, ShellError
+from fogros2.model import Command
+from fogros2.shell import relay, sync
+from fogros2.shell.ssh import SSHShell
+from fogros2.testing.sshd import private_sshd, PrivateSshd
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)'),
+    pytest.mark.skipif(process.which('rsync') is None, reason='needs rsync'),
+]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[PrivateSshd]:
+    with private_sshd(tmp_path / 'sshd') as running:
+        yield running
+
+
+@pytest.fixture
+def shell(server: PrivateSshd) -> Iterator[SSHShell]:
+    with contextlib.closing(SSHShell(server.endpoint, name='planner', timeout=10.0)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    folder = tmp_path / 'source'
+    for number in range(200):
+        path = folder / f'{number % 10}' / f'{number}'
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(os.urandom(5000))
+    return folder
+
+
+def compare(source: Path, target: Path) -> str:
+    return process.run(Command(('diff', '-r', str(source), str(target))), timeout=30.0,
+                       check=False).stdout
+
+
+def rsyncs() -> list[str]:
+    """Return the rsync processes of this computer that have to do with these tests."""
+    lines = process.run(Command(('ps', '-eo', 'args')), timeout=10.0).stdout.splitlines()
+    return [line for line in lines if 'rsync' in line and 'sync-target' in line]
+
+
+@pytest.mark.parametrize('bulk', [True, False])
+def test_both_ways_make_the_folder_equal(shell, source, tmp_path, monkeypatch, bulk):
+    if bulk:
+        monkeypatch.setattr(sync, 'BULK', 1000)
+        monkeypatch.delattr(relay, 'remote_shell')  # it has to do without
+    else:
+        monkeypatch.delattr(sync, 'open_ssh')
+    target = tmp_path / 'sync-target'
+    report = shell.sync(source, str(target), excludes=[], timeout=60.0)
+    assert report.files == 200
+    assert report.bytes > 1_000_000
+    assert not compare(source, target)
+
+
+def test_the_second_time_goes_over_the_open_connection(shell, source, tmp_path, monkeypatch):
+    monkeypatch.setattr(sync, 'BULK', 1000)
+    target = tmp_path / 'sync-target'
+    shell.sync(source, str(target), excludes=[], timeout=60.0)
+    monkeypatch.delattr(sync, 'open_ssh')
+    (source / '3/3').write_text('changed')
+    report = shell.sync(source, str(target), excludes=[], timeout=60.0)
+    assert report.files == 1
+    assert report.bytes < 20_000
+    assert not compare(source, target)
+
+
+def test_another_key_in_known_hosts_doesn_t_matter_to_a_pinned_one(
+    shell, source, tmp_path, monkeypatch,
+):
+    monkeypatch.setattr(sync, 'BULK', 1000)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
+    assert not (tmp_path / '.ssh').exists()
+
+
+def test_a_wrong_host_key_stops_openssh_too(server, shell, source, tmp_path, monkeypatch):
+    monkeypatch.setattr(sync, 'BULK', 1000)
+    shell.run(Command(('true',)), timeout=10.0)
+    # the connection stands, and for the second one another machine answers
+    for name in ('host_key', 'host_key.pub'):
+        (server.folder / name).unlink()
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
+                         str(server.folder / 'host_key'))), timeout=10.0)
+    listener = server.child
+    assert listener is not None
+    listener.terminate()
+    listener.wait(10.0)
+    server.start()
+    shell.endpoint = server.endpoint.__class__(**{
+        **vars(shell.endpoint), 'host_key': 'ssh-ed25519 '
+        'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9'})
+    with pytest.raises(ConnectError):
+        shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
+    assert not list((tmp_path / 'sync-target').iterdir())
+
+
+def test_links_modes_and_odd_names_arrive(shell, tmp_path):
+    source = tmp_path / 'the source'
+    (source / 'a b').mkdir(parents=True)
+    (source / "a b/it's").write_text('x')
+    (source / 'run').write_text('#!/bin/sh')
+    (source / 'run').chmod(0o751)
+    (source / 'link').symlink_to('run')
+    (source / 'new\nline').write_text('y')
+    (source / '-n').write_text('z')
+    target = tmp_path / "sync-target $HOME `id` 'x'"
+    shell.sync(source, str(target), excludes=[], timeout=60.0)
+    assert not compare(source, target)
+    assert (target / 'run').stat().st_mode & 0o777 == 0o751
+    assert os.readlink(target / 'link') == 'run'
+
+
+def test_a_target_in_the_home_is_found(server, source, tmp_path):
+    name = f'.sync-target-{os.getpid()}'
+    with contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell:
+        shell.sync(source / '1', f'~/{name}/x', excludes=[], timeout=60.0)
+        home = shell.run(Command(('printenv', 'HOME')), timeout=10.0).stdout.strip()
+        try:
+            assert not compare(source / '1', Path(home, name, 'x'))
+        finally:
+            shutil.rmtree(Path(home, name))
+
+
+def test_a_machine_without_rsync_is_told_so(source, tmp_path):
+    programs = tmp_path / 'bin'
+    programs.mkdir()
+    for name in ('sh', 'bash', 'mkdir', 'ls', 'head', 'env'):
+        (programs / name).symlink_to(process.which(name))
+    with private_sshd(tmp_path / 'sshd', f'SetEnv PATH={programs}\n') as server, \
+            contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell:
+        with pytest.raises(ShellError, match="'planner' has no rsync .*apt-get install rsync"):
+            shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
+
+
+def test_this_computer_without_rsync_is_told_so(shell, source, tmp_path, monkeypatch):
+    real = process.which
+    monkeypatch.setattr(process, 'which', lambda p: None if p == 'rsync' else real(p))
+    with pytest.raises(PrerequisiteError, match='rsync not found on this computer'):
+        shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
+
+
+def test_a_full_disk_is_said_to_be_full(shell, tmp_path, root):
+    """Tests that the machine's full disk is told from all other failures."""
+    disk = tmp_path / 'sync-target'
+    disk.mkdir()
+    (tmp_path / 'source').mkdir()
+    (tmp_path / 'source/big').write_bytes(os.urandom(3 << 20))
+    if process.run(Command(('mount', '-t', 'tmpfs', '-o', 'size=1m,mode=777', 'tmpfs', str(disk)),
+                           sudo=True), timeout=10.0, check=False).returncode != 0:
+        pytest.skip('needs the right to mount a file system')
+    try:
+        with pytest.raises(ShellError, match="disk of 'planner' is full"):
+            shell.sync(tmp_path / 'source', f'{disk}/here', excludes=[], timeout=60.0)
+        with pytest.raises(CommandError, match="disk of 'planner' is full"):
+            shell.put(os.urandom(2 << 20), f'{disk}/there', mode=0o600)
+    finally:
+        process.run(Command(('umount', str(disk)), sudo=True), timeout=10.0)
+
+
+def test_a_folder_that_can_t_be_made_is_named(shell, source):
+    with pytest.raises(CommandError, match='making /proc/sync-target/x failed'):
+        shell.sync(source, '/proc/sync-target/x', excludes=[], timeout=60.0)
+
+
+@pytest.mark.parametrize('bulk', [True, False])
+def test_a_lost_connection_under_sync_is_an_error(
+    server, shell, tmp_path, monkeypatch, bulk,
+):
+    monkeypatch.setattr(sync, 'BULK', 1000 if bulk else 1 << 40)
+    source = sized(tmp_path / 'source', 256 << 20)
+    failed: list[BaseException] = []
+    going = threading.Event()
+
+    def run() -> None:
+        try:
+            shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
+                       on_progress=lambda done, total: going.set())
+        except ShellError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert going.wait(20.0)
+    server.cut()
+    thread.join(20.0)
+    assert isinstance(failed[0], ConnectError), failed
+    wait_until(lambda: not rsyncs(), timeout=10.0, what='rsync to end')
+
+
+@pytest.mark.parametrize('bulk', [True, False])
+def test_sync_can_be_cancelled(shell, tmp_path, monkeypatch, bulk):
+    monkeypatch.setattr(sync, 'BULK', 1000 if bulk else 1 << 40)
+    source = sized(tmp_path / 'source', 256 << 20)
+    cancel = threading.Event()
+    with pytest.raises(Cancelled):
+        shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
+                   cancel=cancel, on_progress=lambda done, total: cancel.set())
+    wait_until(lambda: not rsyncs(), timeout=10.0, what='rsync to end')
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+
+
+def sized(folder: Path, size: int) -> Path:
+    """Return a folder with one file of a size, made of nothing."""
+    folder.mkdir()
+    with open(folder / 'big', 'wb') as file:
+        file.truncate(size)
+    return folder
