@@ -22,7 +22,16 @@ from rosidl_runtime_py import (
 )
 from rosidl_runtime_py.utilities import get_message, get_service
 from sensor_msgs.msg import CameraInfo, Image, NavSatStatus, PointCloud2
-from std_msgs.msg import Bool, ByteMultiArray, Empty, Float64, Header, Int8, String, UInt8MultiArray
+from std_msgs.msg import (
+    Bool,
+    ByteMultiArray,
+    Empty,
+    Float64,
+    Header,
+    Int8,
+    String,
+    UInt8MultiArray,
+)
 from std_srvs.srv import Empty as EmptyService
 from std_srvs.srv import SetBool, Trigger
 
@@ -92,7 +101,7 @@ def test_keyword_constructor():
     (lambda: Float64(data=1), "The 'data' field must be of type 'float'"),
     (lambda: Int8(data=128), r"The 'data' field must be an integer in \[-128, 127\]"),
     (lambda: Int8(data=1.0), "The 'data' field must be of type 'int'"),
-    (lambda: Time(nanosec=-1), r"must be an unsigned integer in \[0, 4294967295\]"),
+    (lambda: Time(nanosec=-1), r'must be an unsigned integer in \[0, 4294967295\]'),
     (lambda: Header(stamp=3), "The 'stamp' field must be a sub message of type 'Time'"),
     (lambda: ParameterValue(string_array_value=[1]),
      "The 'string_array_value' field must be a set or sequence and each value of type 'str'"),

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What takes part in a node's transitions."""
+
+from collections.abc import Callable
+from enum import Enum
+from functools import wraps
+from typing import Any
+
+
+class TransitionCallbackReturn(Enum):
+    """How a transition went."""
+
+    SUCCESS = 97
+    FAILURE = 98
+    ERROR = 99
+
+
+class ManagedEntity:
+    """Takes part in transitions; does nothing by default."""
+
+    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+        """Configure."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+        """Clean up."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+        """Shut down."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+        """Become active."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+        """Become inactive."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: Any) -> TransitionCallbackReturn:
+        """Handle an error in a transition."""
+        return TransitionCallbackReturn.SUCCESS
+
+
+class SimpleManagedEntity(ManagedEntity):
+    """Knows whether it is active."""
+
+    def __init__(self) -> None:
+        self._enabled = False
+
+    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+        """Note it."""
+        self._enabled = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+        """Note it."""
+        self._enabled = False
+        return TransitionCallbackReturn.SUCCESS
+
+    @property
+    def is_activated(self) -> bool:
+        """Whether it is active."""
+        return self._enabled
+
+    @staticmethod
+    def when_enabled(wrapped: Any = None, *,
+                     when_not_enabled: Callable[[], None] | None = None) -> Any:
+        """Decorate a method that does nothing while inactive."""
+        def decorate(method: Any) -> Any:
+            @wraps(method)
+            def call(self: SimpleManagedEntity, *args: Any, **kwargs: Any) -> None:
+                if self._enabled:
+                    method(self, *args, **kwargs)
+                elif when_not_enabled is not None:
+                    when_not_enabled()
+            return call
+        return decorate if wrapped is None else decorate(wrapped)
