@@ -74,6 +74,7 @@ class Relay:
         self._inside: Optional[asyncio.DatagramTransport] = None
         self._outside: dict[Address, asyncio.DatagramTransport] = {}
         self._pending: set[asyncio.TimerHandle] = set()
+        self._opening: set[asyncio.Task[None]] = set()
 
     async def start(self, listen: Address) -> Address:
         """Listen, and return the address (port 0 takes any)."""
@@ -121,7 +122,9 @@ class Relay:
         if transport is not None:
             transport.sendto(data)
             return
-        asyncio.get_running_loop().create_task(self._open(data, client))
+        task = asyncio.get_running_loop().create_task(self._open(data, client))
+        self._opening.add(task)
+        task.add_done_callback(self._opening.discard)
 
     async def _open(self, data: bytes, client: Address) -> None:
         transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
@@ -163,10 +166,10 @@ class _Receiver(asyncio.DatagramProtocol):
     def __init__(self, take: Any) -> None:
         self._take = take
 
-    def datagram_received(self, data: bytes, address: Address) -> None:
-        self._take(data, address)
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        self._take(data, addr)
 
-    def error_received(self, error: OSError) -> None:
+    def error_received(self, exc: Exception) -> None:
         """Nobody listens there at the moment: a network loses such packets without a word."""
 
 

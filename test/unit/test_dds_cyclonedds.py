@@ -99,8 +99,9 @@ def test_peers_of_the_user_are_asked_from_the_lan(variable: str) -> None:
 
 def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
     path = tmp_path / 'dds.xml'
-    path.write_text('<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/><Network'
-                    'Interface name="wlan0"/></Interfaces></General></Domain></CycloneDDS>')
+    names = '<NetworkInterface name="lo"/><NetworkInterface name="wlan0"/>'
+    path.write_text('<CycloneDDS><Domain><General>'
+                    f'<Interfaces>{names}</Interfaces></General></Domain></CycloneDDS>')
     for uri in (f'file://{path}', str(path), f'{path.read_text()},', f'{path},<CycloneDDS/>'):
         interfaces = CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
         # the same interface twice is an error, and one without a priority has 0

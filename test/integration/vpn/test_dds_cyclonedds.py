@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Cyclone DDS on a robot with a VPN that is cut, killed, absent or moved: real nodes and WireGuard.
+
+The nodes run on whatever ROS 2 the tests run on, the embedded default or the real one.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from fogros2 import process
+from fogros2.model import Command
+
+if TYPE_CHECKING:
+    from conftest import Child, Lab
+
+#: Messages a second that the nodes send unless told otherwise.
+RATE = 10
+#: Seconds after the link's return within which messages flow again.
+PROMPT = 1.0
+
+
+def start(lab: Lab) -> tuple[Child, Child, Child]:
+    """Start a robot node, another beside it, and a machine's; return them when all are heard."""
+    machine = lab.node('machine', 'from:/up', 'to:/down')
+    robot = lab.node('robot', 'to:/up', 'from:/down', 'to:/local')
+    beside = lab.node('robot', 'from:/local')
+    for child, topic in ((machine, '/up'), (robot, '/down'), (beside, '/local')):
+        child.wait('topic', topic, count=3, timeout=10.0)
+    return robot, beside, machine
+
+
+def heard(child: Child, topic: str, begin: float, end: float) -> float:
+    """Return which part of the messages of a time arrived in it."""
+    lines = [line for line in child.lines('topic', topic) if begin <= line['arrival'] < end]
+    return len(lines) / ((end - begin) * RATE)
+
+
+def heals(robot: Child, machine: Child, since: float) -> None:
+    """Check that messages sent after the link's return arrive, both ways."""
+    for child, topic in ((machine, '/up'), (robot, '/down')):
+        line = child.wait('topic', topic, after=since, timeout=10.0)[0]
+        assert line['arrival'] - since < PROMPT, f'{topic} took {line["arrival"] - since:.1f} s'
+
+
+def pause(seconds: float) -> tuple[float, float]:
+    """Let messages come for a while that is itself what the test looks at."""
+    begin = time.monotonic()
+    time.sleep(seconds)
+    return begin, time.monotonic()
+
+
+def test_the_lan_and_terminals_talk_with_robot_nodes_as_before(vpn: Lab) -> None:
+    vpn.lan()
+    # a LAN other than the robot's own network: what a node without a configuration takes
+    vpn.ip('-n', vpn.spaces['robot'], 'link', 'set', 'e0', 'multicast', 'off')
+    lan = vpn.node('lan', 'from:/to_lan', 'to:/from_lan', uri='')
+    robot = vpn.node('robot', 'to:/to_lan', 'from:/from_lan', 'to:/up', 'from:/down')
+    terminal = vpn.node('robot', 'from:/to_lan', uri='')
+    machine = vpn.node('machine', 'from:/up', 'to:/down')
+    for child, topic in ((lan, '/to_lan'), (robot, '/from_lan'), (terminal, '/to_lan'),
+                         (machine, '/up'), (robot, '/down')):
+        child.wait('topic', topic, count=5, timeout=15.0)
+    # a new address of the LAN's is the end of that, as ever, but of nothing else
+    vpn.ip('-n', vpn.spaces['robot'], 'address', 'delete', '192.168.77.1/24', 'dev', 'lan0')
+    heals(robot, machine, time.monotonic())
+
+
+def test_a_cut_is_survived(vpn: Lab) -> None:
+    robot, beside, machine = start(vpn)
+    vpn.bad(cut=True)
+    begin, end = pause(8.0)
+    vpn.bad(cut=False)
+    heals(robot, machine, time.monotonic())
+    assert heard(beside, '/local', begin, end) > 0.9
+    assert heard(machine, '/up', begin + 0.5, end) == 0.0
+
+
+def test_lost_packets_are_sent_again(vpn: Lab) -> None:
+    _, _, machine = start(vpn)
+    vpn.bad(loss=0.05)
+    begin, end = pause(5.0)
+    vpn.bad(loss=0.0)
+    last = machine.wait('topic', '/up', after=end)[0]['number']
+    numbers = [line['number'] for line in machine.lines('topic', '/up', after=begin)
+               if line['number'] < last]
+    assert numbers == list(range(numbers[0], last))
+
+
+@pytest.mark.parametrize('host', ['robot', 'machine'])
+def test_nodes_survive_a_killed_wireguard_go(vpn: Lab, host: str) -> None:
+    if not vpn.wireguard_go(host):
+        pytest.skip('this kernel has WireGuard itself')
+    robot, beside, machine = start(vpn)
+    assert vpn.alive(host)
+    process.run(Command(('kill', '-9', str(vpn.wireguard_go(host))), sudo=True), timeout=5.0)
+    begin, end = pause(1.0)
+    since = time.monotonic()
+    vpn.repair(host)
+    heals(robot, machine, since)
+    assert heard(beside, '/local', begin, end) > 0.8
+
+
+def test_a_moving_robot_stays_in_touch(vpn: Lab) -> None:
+    robot, beside, machine = start(vpn)
+    space = vpn.spaces['robot']
+    vpn.ip('-n', space, 'address', 'delete', '198.51.100.2/24', 'dev', 'e0')
+    begin, end = pause(1.0)
+    vpn.ip('-n', space, 'address', 'add', '198.51.100.9/24', 'dev', 'e0')
+    since = time.monotonic()
+    assert not vpn.alive('robot')
+    vpn.repair('robot')
+    heals(robot, machine, since)
+    assert heard(beside, '/local', begin, end) > 0.8
+    vpn.bad(rebind=True)
+    heals(robot, machine, time.monotonic())
+
+
+def test_robot_nodes_talk_without_the_vpn(lab: Lab) -> None:
+    early = lab.node('robot', 'to:/local')
+    beside = lab.node('robot', 'from:/local', 'from:/late')
+    beside.wait('topic', '/local', count=5)
+    lab.connect()
+    begin, end = pause(1.0)
+    assert heard(beside, '/local', begin, end) > 0.8
+    # nodes of before don't have the VPN, nodes of after do, and all have each other
+    lab.node('robot', 'to:/late', 'to:/up')
+    machine = lab.node('machine', 'from:/up')
+    beside.wait('topic', '/late', count=5)
+    machine.wait('topic', '/up', count=5)
+    assert early.process.poll() is None
+
+
+def test_an_interface_that_is_taken_away_harms_no_node(vpn: Lab) -> None:
+    robot, beside, machine = start(vpn)
+    vpn.ip('-n', vpn.spaces['robot'], 'link', 'delete', vpn.interfaces['robot'].name)
+    begin, end = pause(2.0)
+    assert heard(beside, '/local', begin + 0.5, end) > 0.8
+    assert not vpn.alive('robot')
+    since = time.monotonic()
+    vpn.repair('robot')
+    heals(robot, machine, since)
+
+
+def test_nothing_but_announcements_crosses_unless_it_is_read_there(vpn: Lab) -> None:
+    idle = 20_000.0
+    camera = vpn.node('robot', 'to:/camera', '--size', '50000')
+    beside = vpn.node('robot', 'from:/camera')
+    machine = vpn.node('machine', 'to:/down')
+    beside.wait('topic', '/camera', count=3)
+    machine.wait('ready')
+
+    def rate() -> float:
+        before = vpn.carried('robot')
+        begin, end = pause(2.0)
+        return (vpn.carried('robot') - before) / (end - begin)
+
+    assert rate() < idle
+    reader = vpn.node('machine', 'from:/camera')
+    reader.wait('topic', '/camera', count=3)
+    assert rate() > 50_000 * RATE * 0.8
+    reader.stop()
+    # what is under way when the reader leaves still counts
+    pause(1.0)
+    assert rate() < idle
+    assert camera.process.poll() is None

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""WireGuard between two hosts: up, down, killed, moved, and what a hijacked machine reaches."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+import stat
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import CommandError
+from fogros2.model import Command, Peer
+from fogros2.waiting import wait_until
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
+#: Answers UDP at ports 7411 (DDS's) and 9000, and TCP at 22, of the addresses given.
+SERVER = '''
+import itertools, selectors, socket, sys
+chosen = selectors.DefaultSelector()
+kinds = (socket.SOCK_DGRAM, 7411), (socket.SOCK_DGRAM, 9000), (socket.SOCK_STREAM, 22)
+for address, (kind, port) in itertools.product(sys.argv[1:], kinds):
+    one = socket.socket(socket.AF_INET, kind)
+    one.bind((address, port))
+    if kind == socket.SOCK_STREAM:
+        one.listen()
+    chosen.register(one, selectors.EVENT_READ)
+print('{"ready": true}', flush=True)
+while True:
+    for key, _ in chosen.select():
+        if key.fileobj.type == socket.SOCK_STREAM:
+            key.fileobj.accept()[0].close()
+        else:
+            data, sender = key.fileobj.recvfrom(100)
+            key.fileobj.sendto(data, sender)
+'''
+#: Prints which of its arguments (udp:host:port, tcp:host:port) answer within half a second.
+CLIENT = '''
+import select, socket, sys, time
+waiting = {}
+for word in sys.argv[1:]:
+    kind, host, port = word.split(':')
+    one = socket.socket(type=socket.SOCK_DGRAM if kind == 'udp' else socket.SOCK_STREAM)
+    one.setblocking(False)
+    try:
+        one.connect((host, int(port)))
+    except BlockingIOError:
+        pass
+    if kind == 'udp':
+        one.send(b'x')
+    waiting[one] = word
+end = time.monotonic() + 0.5
+while waiting and time.monotonic() < end:
+    streams = [one for one in waiting if one.type == socket.SOCK_STREAM]
+    readable, writable, _ = select.select(list(waiting), streams, [], 0.05)
+    for one in {*readable, *writable}:
+        word = waiting.pop(one)
+        if not one.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            print(word)
+'''
+
+
+def traces(lab: Lab, host: str) -> list[str]:
+    """Return what an interface has made on a host."""
+    interface = lab.interfaces[host]
+    found = [name for name in lab.shell(host, 'ls /sys/class/net').split()
+             if name == interface.name]
+    found += [line for line in lab.shell(host, 'nft list tables').splitlines()
+              if interface.name in line]
+    found += [str(path) for path in Path('/var/run/wireguard').glob(f'{interface.name}*')]
+    found += [str(path) for path in Path(interface.key_file).parent.glob('*')]
+    return found + ([f'process {lab.wireguard_go(host)}'] if lab.wireguard_go(host) else [])
+
+
+def test_up_carries_and_down_leaves_nothing(vpn: Lab) -> None:
+    assert vpn.ping('robot', MACHINE) and vpn.ping('machine', ROBOT)
+    assert vpn.alive('robot') and vpn.alive('machine')
+    assert traces(vpn, 'robot') and traces(vpn, 'machine')
+    for host, interface in vpn.interfaces.items():
+        for _ in range(2):
+            vpn.do(host, vpn.vpn.down(interface))
+        assert traces(vpn, host) == []
+
+
+def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
+    process_id = vpn.wireguard_go('robot')
+    begin = time.monotonic()
+    vpn.do('robot', vpn.vpn.up(vpn.interfaces['robot'], vpn.peers()['robot']))
+    assert time.monotonic() - begin < 1.0
+    assert vpn.wireguard_go('robot') == process_id
+    assert vpn.ping('robot', MACHINE)
+    assert vpn.shell('robot', f'nft list table inet {vpn.interfaces["robot"].name}').count(
+        'chain') == 2
+
+
+def test_up_takes_over_what_a_killed_launch_left(lab: Lab) -> None:
+    interface = lab.interfaces['machine']
+    lab.run('machine', lab.vpn.keys(interface))
+    lab.shell('machine', f'ip tuntap add dev {interface.name} mode tun; '
+                         f'mkdir -p /var/run/wireguard; touch /var/run/wireguard/'
+                         f'{interface.name}.sock')
+    lab.connect()
+    assert lab.ping('robot', MACHINE)
+
+
+def test_keys_are_made_once_and_stay_where_they_are(lab: Lab) -> None:
+    interface = lab.interfaces['robot']
+    command = lab.vpn.keys(interface)
+    public = [lab.run('robot', command).stdout for _ in range(2)]
+    assert public[0] == public[1] and len(public[0].strip()) == 44
+    path = Path(interface.key_file)
+    if os.geteuid() == 0:
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        private = path.read_text().strip()
+        lab.connect()
+        said = lab.run('robot', lab.vpn.status(interface)).stdout
+        words = [' '.join(c.argv) for c in lab.vpn.up(interface, [])]
+        assert all(private not in text for text in [said, *words])
+
+
+def test_another_peer_doesnt_disturb_the_first(vpn: Lab) -> None:
+    interface = vpn.interfaces['robot']
+    before = vpn.vpn.parse_status(vpn.run('robot', vpn.vpn.status(interface)).stdout)
+    second = Peer('second', f'{"A" * 43}=', '198.18.7.3', '198.51.100.1:9')
+    peers = [*vpn.peers()['robot'], second]
+    vpn.do('robot', vpn.vpn.peers(interface, peers))
+    assert vpn.ping('robot', MACHINE)
+    after = vpn.vpn.parse_status(vpn.run('robot', vpn.vpn.status(interface)).stdout)
+    assert len(after) == 2
+    for key, peer in before.items():
+        assert after[key]['handshake'] == peer['handshake']
+        assert after[key]['received'] > peer['received']
+    vpn.do('robot', vpn.vpn.peers(interface, [second]))
+    assert not vpn.ping('robot', MACHINE)
+
+
+@pytest.mark.parametrize('host', ['robot', 'machine'])
+def test_a_killed_wireguard_go_is_repaired_on_the_same_interface(vpn: Lab, host: str) -> None:
+    if not vpn.wireguard_go(host):
+        pytest.skip('this kernel has WireGuard itself')
+    assert vpn.ping('robot', MACHINE) and vpn.alive('robot') and vpn.alive('machine')
+    index = vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
+    process.run(Command(('kill', '-9', str(vpn.wireguard_go(host))), sudo=True), timeout=5.0)
+    wait_until(lambda: not vpn.alive(host), timeout=5.0, what='the process to be missed')
+    vpn.repair(host)
+    assert vpn.alive(host)
+    assert vpn.ping('robot', MACHINE, timeout=3.0)
+    assert index == vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
+
+
+def test_a_new_address_of_the_robot_is_taken_up(vpn: Lab) -> None:
+    assert vpn.ping('robot', MACHINE)
+    space = vpn.spaces['robot']
+    vpn.ip('-n', space, 'address', 'delete', '198.51.100.2/24', 'dev', 'e0')
+    vpn.ip('-n', space, 'address', 'add', '198.51.100.9/24', 'dev', 'e0')
+    assert not vpn.alive('robot')
+    vpn.repair('robot')
+    assert vpn.ping('robot', MACHINE, timeout=3.0)
+    assert vpn.alive('robot')
+    vpn.bad(rebind=True)
+    assert vpn.ping('robot', MACHINE, timeout=3.0)
+
+
+def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
+    vpn.lan()
+    at_robot = [ROBOT, '192.168.77.1', '198.51.100.2']
+    for host, at in (('robot', at_robot), ('lan', ['192.168.77.2']), ('machine', [MACHINE])):
+        vpn.start(host, [sys.executable, '-c', SERVER, *at]).wait('ready')
+    vpn.shell('robot', 'echo 1 >/proc/sys/net/ipv4/ip_forward')
+    vpn.shell('lan', 'ip route add default via 192.168.77.1')
+    # root there sends what it likes to whom it likes
+    name = vpn.interfaces['machine'].name
+    robot = vpn.peers()['machine'][0].public_key
+    vpn.shell('machine', f'wg set {name} peer {robot} allowed-ips 0.0.0.0/0; '
+                         f'ip route add 192.168.77.0/24 dev {name}; '
+                         f'ip route add 198.51.100.0/24 dev {name}')
+    targets = [f'{kind}:{address}:{port}'
+               for address in (*at_robot, '192.168.77.2')
+               for kind, port in (('udp', 7411), ('udp', 9000), ('tcp', 22))]
+
+    def reached() -> list[str]:
+        return vpn.run('machine', Command((sys.executable, '-c', CLIENT, *targets))
+                       ).stdout.split()
+
+    assert reached() == [f'udp:{ROBOT}:7411']
+    assert vpn.ping('machine', ROBOT)
+    assert not vpn.ping('machine', '192.168.77.2')
+    # and the other way the robot is answered
+    answered = vpn.run('robot', Command((
+        sys.executable, '-c', CLIENT, f'udp:{MACHINE}:9000', f'tcp:{MACHINE}:22'))).stdout
+    assert len(answered.split()) == 2
+    # without the filter all of it would be open, or this test would prove nothing
+    vpn.shell('robot', f'nft delete table inet {vpn.interfaces["robot"].name}')
+    assert sorted(reached()) == sorted(targets)
+
+
+def test_the_failure_of_a_step_is_told(lab: Lab) -> None:
+    interface = dataclasses.replace(lab.interfaces['machine'], network='198.18.7.0/99')
+    lab.run('machine', lab.vpn.keys(interface))
+    with pytest.raises(CommandError, match='set the VPN interface .* up failed'):
+        lab.do('machine', lab.vpn.up(interface, []))
+    lab.do('machine', lab.vpn.down(interface))
+    assert traces(lab, 'machine') == []
