@@ -134,7 +134,9 @@ class Launch:
                                          'give each a name= of its own')
         prefixes = plan.ament_prefixes(self.user_environment)
         for spec in specs:
-            provider(spec.provider).check(spec)
+            machines = provider(spec.provider)
+            shells.warm(machines.shell_kind)
+            machines.check(spec)
             if spec.workspace is not None:
                 workspace.inspect(Path(spec.workspace))
             for package, executable in programs.get(spec.name, ()):

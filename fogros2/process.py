@@ -16,6 +16,8 @@ from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, Prerequisi
 from fogros2.model import Command, Result
 
 HERE = 'this computer'
+#: launch empties ``os.environ`` for a moment whenever a scoped group ends, while our threads run.
+_ENVIRONMENT = dict(os.environ)
 
 
 def argv(command: Command) -> list[str]:
@@ -41,7 +43,7 @@ def require(programs: Sequence[str], *, package_of: Optional[dict[str, str]] = N
 
 def which(program: str) -> Optional[str]:
     """Return a program's path, looking into the sbin folders too, or None."""
-    path = os.environ.get('PATH', os.defpath)
+    path = _ENVIRONMENT.get('PATH', os.defpath)
     return shutil.which(program, path=f'{path}:/usr/local/sbin:/usr/sbin:/sbin')
 
 
@@ -69,8 +71,8 @@ def run(
     """
     words = argv(command)
     begin = time.monotonic()
-    path = os.environ.get('PATH', os.defpath)
-    environment = {**os.environ, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
+    path = _ENVIRONMENT.get('PATH', os.defpath)
+    environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
         child = subprocess.Popen(
             words, env=environment, start_new_session=True,

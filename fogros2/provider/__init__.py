@@ -28,6 +28,8 @@ class Provider(abc.ABC):
     """
 
     name: ClassVar[str]
+    #: Kind of shell that its machines are reached by, so that it can be loaded beforehand.
+    shell_kind: ClassVar[str] = 'ssh'
     #: Folder of the agent that ``create`` starts at boot, and its program on the machine; ''
     #: where it starts none, and the deployment does as soon as it has a shell.
     agent_directory: ClassVar[str] = ''

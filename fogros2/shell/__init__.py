@@ -81,6 +81,17 @@ class Shell(Protocol):
         """Drop the connection; the next call would open it again."""
 
 
+def warm(kind: str) -> None:
+    """
+    Begin to load what shells of a kind need, without waiting for it.
+
+    :raises PrerequisiteError: it isn't installed.
+    """
+    begin = getattr(plugin_system.load('fogros2.shell', kind), 'warm', None)
+    if begin is not None:
+        begin()
+
+
 def connect(endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> Shell:
     """
     Return the Shell for an endpoint, by its kind; connects when first used.

@@ -41,6 +41,11 @@ class SSHShell:
     :param timeout: seconds one attempt to connect may take.
     """
 
+    @staticmethod
+    def warm() -> None:
+        """Begin to import paramiko; see :func:`fogros2.shell.warm`."""
+        warm()
+
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint
         self.name = name

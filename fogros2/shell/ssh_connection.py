@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import getpass
+import importlib.util
 import logging
 import os
 from pathlib import Path
@@ -12,7 +13,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING
 
-from fogros2.errors import AuthenticationError, ConnectError, HostKeyError
+from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
 from fogros2.model import Endpoint
 
 if TYPE_CHECKING:
@@ -47,7 +48,14 @@ class PromptSocket(socket.socket):
 
 
 def warm() -> threading.Thread:
-    """Import paramiko in a thread, so that the first connection needn't wait for it."""
+    """
+    Import paramiko in a thread, so that the first connection needn't wait for it.
+
+    :raises PrerequisiteError: it isn't installed.
+    """
+    if importlib.util.find_spec('paramiko') is None:
+        raise PrerequisiteError("the Python package 'paramiko' is missing here",
+                                'python3 -m pip install paramiko')
     thread = threading.Thread(target=_import, name='fog-warm', daemon=True)
     thread.start()
     return thread

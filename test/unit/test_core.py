@@ -121,3 +121,9 @@ def test_a_missing_program_is_named():
         run('no-such-tool')
     with pytest.raises(errors.PrerequisiteError, match='sudo apt-get install iproute2'):
         process.require(['no-such-tool', sys.executable], package_of={'no-such-tool': 'iproute2'})
+
+
+def test_a_command_finds_its_programs_while_launch_has_the_environment_empty(monkeypatch):
+    for name in list(os.environ):
+        monkeypatch.delenv(name)
+    assert run('sh', '-c', 'ls / >/dev/null; echo fine').stdout == 'fine\n'
