@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
+import functools
 import os
 from pathlib import Path
 import shlex
@@ -116,9 +117,9 @@ def ensure(
     """
     question = host.probe(under.prefixes)
     with ThreadPoolExecutor(1, 'fog-probe') as pool:
-        here = pool.submit(process.run, question, timeout=timeout, cancel=cancel)
+        here = pool.submit(_robot_facts, under.prefixes, timeout)
         there = shell.run(question, timeout=timeout, cancel=cancel)
-        robot = host.parse_facts(here.result().stdout)
+        robot = here.result()
     facts = host.parse_facts(there.stdout)
     workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
     todo = plan_alike(spec, facts, robot, under, workspace)
@@ -135,6 +136,20 @@ def ensure(
     for command in todo.commands:
         shell.run(command, timeout=timeout, cancel=cancel)
     return todo.install, todo.note
+
+
+_asking = threading.Lock()
+
+
+def _robot_facts(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
+    """Return the facts of this computer, asked once for all machines of a launch."""
+    with _asking:
+        return _ask_robot(prefixes, timeout)
+
+
+@functools.lru_cache(maxsize=8)
+def _ask_robot(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
+    return host.parse_facts(process.run(host.probe(prefixes), timeout=timeout).stdout)
 
 
 def plan_alike(

@@ -54,9 +54,13 @@ done
 for e in "$@"; do
     [ -d "$e" ] || continue
     if [ -e "$e/pyvenv.cfg" ]; then
-        w=$("$e/bin/python" -c 'import importlib.util as u
-print(*u.find_spec("fogros2").submodule_search_locations)' 2>/dev/null) || continue
-        [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+        "$e/bin/python" -ISc '' 2>/dev/null || continue
+        # a glob costs nothing; only a development install has it elsewhere
+        for w in "$e"/lib/python3*/site-packages/fogros2; do
+            [ -d "$w" ] || w=$("$e/bin/python" -c 'import importlib.util as u
+print(*u.find_spec("fogros2").submodule_search_locations)' 2>/dev/null) || continue 2
+            [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+        done
     fi
     s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD "$e"/share/*/package.xml \
         2>/dev/null | cksum)

@@ -47,4 +47,4 @@ def load(group: str, name: str) -> Any:
     except ImportError as error:
         raise PrerequisiteError(
             f"the {GROUPS.get(group, group)} '{name}' can't be loaded: {error}",
-            f"python3 -m pip install {error.name or name}") from error
+            f'python3 -m pip install {error.name or name}') from error
