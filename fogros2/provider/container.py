@@ -30,7 +30,6 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     MachineState,
-    Result,
 )
 from fogros2.provider import container_engine, container_entry, container_root, Provider
 from fogros2.provider.container_engine import Engine
@@ -74,14 +73,24 @@ failed() {
     rmdir -- "${top%/*}" 2>/dev/null
     exit $code
 }
+tries=0
+until mkdir "$top" 2>/dev/null; do
+    # there already: another attempt with this token, or one that was cut short
+    [ -e "$top" ] || [ $tries -gt 9 ] && exit 17  # as _THERE
+    mkdir -p "${top%/*}"
+    tries=$((tries + 1))
+done
 trap failed EXIT
-mkdir -p "$top/root" "$top/hooks"
+mkdir "$top/root" "$top/hooks"
 chmod 711 "$top"
 [ -z "$hook" ] || echo "$hook" > "$top/hooks/remove.json"
 for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/work"; done
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
+
+#: What it exits with when the token has been used.
+_THERE = 17
 
 _DESTROY = """\
 engine=$1 identity=$2 top=$3
@@ -148,6 +157,11 @@ def _check_values(options: Options) -> None:
                                  "name an image with image='...', or take engine='podman'")
     if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
         raise ConfigurationError(f"'{options.user}' can't be a user name")
+    for name in ('image', 'network', 'ip', 'memory', 'gpus'):
+        word = getattr(options, name)
+        # the engine would take it for an option of its own
+        if word.startswith('-') or any(c.isspace() for c in word):
+            raise ConfigurationError(f"option '{name}' can't be '{word}'")
     if options.ip and not options.network:
         raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
     for name, value in options.env.items():
@@ -198,15 +212,20 @@ class ContainerProvider(Provider):
             else:
                 identity = self._create_from_root(engine, spec, request, options)
         except ProviderError as error:
-            taken = self._by_name(engine, container_name(spec.name))
-            if taken is None:
-                raise
-            if labels_of(taken).get(ATTEMPT) != request.token:
-                raise NameTaken(
-                    f"there is a container machine '{spec.name}' already",
-                    f'ros2 fog delete {spec.name}') from error
-            identity = str(taken['Id'])
+            identity = self._existing(engine, spec.name, request.token, error)
         return f'{engine.name}:{identity[:12]}:{request.token}'
+
+    def _existing(
+        self, engine: Engine, name: str, token: str, error: ProviderError,
+    ) -> str:
+        """Return the container that an earlier attempt with this token made, or raise."""
+        found = engine.inspect([container_name(name)])
+        if not found:
+            raise error
+        if labels_of(found[0]).get(ATTEMPT) != token:
+            raise NameTaken(f"there is a container machine '{name}' already",
+                            f'ros2 fog delete {name}') from error
+        return str(found[0]['Id'])
 
     def _create_from_root(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
@@ -231,14 +250,21 @@ class ContainerProvider(Provider):
         container_entry.add(
             archive, user=options.user, authorized_key=request.authorized_key,
             environment=options.env, agent_config=request.agent_config)
-        result = self._run(Command(
+        command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), '' if kept else removal_hook(top),
              ' '.join(system) if kept else '',
              engine.name, *flags, 'run', '-d', '--cidfile', f'{top}/cid', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
             sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
-            input=container_root.skeleton(options.user) + archive.data()))
-        return result.stdout.split()[-1]
+            input=container_root.skeleton(options.user) + archive.data())
+        try:
+            return process.run(command, timeout=120.0).stdout.split()[-1]
+        except CommandError as error:
+            if error.result.returncode != _THERE:
+                raise container_engine.translate(error) from error
+            raise ProviderError(
+                f'an attempt to create {spec.name} that was cut short left {top}',
+                f'sudo rm -rf {top}') from error
 
     def _create_from_image(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
@@ -263,16 +289,6 @@ class ContainerProvider(Provider):
             engine.call('rm', '-f', identity, what='removing it again', check=False)
             raise
         return identity
-
-    def _run(self, command: Command) -> Result:
-        try:
-            return process.run(command, timeout=120.0)
-        except CommandError as error:
-            raise container_engine.translate(error) from error
-
-    def _by_name(self, engine: Engine, name: str) -> Optional[dict[str, Any]]:
-        found = engine.inspect([name])
-        return found[0] if found else None
 
     def describe(self, machine_id: str) -> Machine:
         """Return what the engine knows of a container now."""

@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of container machines with a real engine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import uuid
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import (
+    ConfigurationError,
+    HostKeyError,
+    MachineNotFound,
+    ProviderError,
+    ShellError,
+    Unsupported,
+)
+from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
+from fogros2.provider import container
+from fogros2.provider.container import ContainerProvider
+from fogros2.shell.ssh import SSHShell
+from fogros2.testing import ProviderContract
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.usefixtures('engine'),
+    pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)'),
+]
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    path = tmp_path / 'id'
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(path))),
+                timeout=10.0)
+    return path
+
+
+@dataclasses.dataclass
+class Cloud:
+    """What the tests do with machines."""
+
+    provider: ContainerProvider
+    key: Path
+    options: dict[str, object]
+    ids: list[str]
+    names: list[str]
+
+    def traces(self) -> list[str]:
+        """Return what is left of the machines on this computer."""
+        def lines(*words: str) -> list[str]:
+            return process.run(Command(words, sudo=True), timeout=30.0,
+                               check=False).stdout.split()
+
+        mounts = Path('/proc/self/mountinfo').read_text()
+        parts = [machine_id.split(':') for machine_id in self.ids]
+        return [
+            *(n for n in lines('podman', 'ps', '-a', '--format', '{{.Names}}')
+              if n in [f'fogros2-{name}' for name in self.names]),
+            *(t for t in lines('ls', str(container.ROOTS)) if t in [p[2] for p in parts]),
+            *(p[1] for p in parts if p[1] in mounts)]
+
+    def create(self, spec: MachineSpec, **changes: object) -> str:
+        request = CreateRequest(**{
+            'token': str(uuid.uuid4()), 'authorized_key': self.key.with_suffix('.pub').read_text(),
+            'tags': {'fogros2-name': spec.name}, 'vpn_port': 51820, **changes})  # type: ignore
+        self.ids.append(self.provider.create(spec, request))
+        return self.ids[-1]
+
+    def spec(self, **changes: object) -> MachineSpec:
+        name = f't{uuid.uuid4().hex[:6]}'
+        self.names.append(name)
+        options = {**self.options, **changes.pop('options', {})}  # type: ignore
+        return MachineSpec(name, 'container', options, **changes)  # type: ignore
+
+    def reached(self, machine_id: str) -> Machine:
+        def look() -> Machine | None:
+            machine = self.provider.describe(machine_id)
+            return machine if machine.shell else None
+        return wait_until(look, timeout=20.0, what='the machine')
+
+    @contextlib.contextmanager
+    def shell(self, machine: Machine, user: str = '') -> Iterator[SSHShell]:
+        assert machine.shell is not None
+        endpoint = dataclasses.replace(machine.shell, key_file=str(self.key))
+        if user:
+            endpoint = dataclasses.replace(endpoint, user=user)
+        shell = SSHShell(endpoint, name=machine.name, timeout=5.0)
+
+        def answers() -> bool:
+            with contextlib.suppress(ShellError):
+                return shell.run(Command(('true',)), timeout=5.0).returncode == 0
+            return False
+
+        try:
+            if not user:
+                wait_until(answers, timeout=20.0, what='the SSH server')
+            yield shell
+        finally:
+            shell.close()
+
+    @contextlib.contextmanager
+    def machine(self, **changes: object) -> Iterator[tuple[Machine, SSHShell]]:
+        machine = self.reached(self.create(self.spec(**changes)))
+        with self.shell(machine) as shell:
+            yield machine, shell
+
+
+@pytest.fixture
+def cloud(cloud_network: str, key: Path) -> Iterator[Cloud]:
+    made = Cloud(ContainerProvider(), key, {'network': cloud_network}, [], [])
+    yield made
+    for machine_id in made.ids:
+        made.provider.destroy(machine_id)
+    wait_until(lambda: not made.traces(), timeout=10.0, what='all traces to be gone')
+
+
+class TestContainerProvider(ProviderContract):
+
+    @pytest.fixture(autouse=True)
+    def network(self, cloud_network):
+        self.options = {'network': cloud_network}
+
+    def make(self):
+        return ContainerProvider(), self.options
+
+
+def said(shell: SSHShell, *words: str, sudo: bool = False) -> str:
+    return shell.run(Command(words, sudo=sudo), timeout=20.0).stdout.strip()
+
+
+def test_a_machine_has_its_own_name_address_users_and_processes(cloud):
+    with cloud.machine() as (machine, shell):
+        assert said(shell, 'hostname') == machine.name
+        assert machine.vpn_host in said(shell, 'hostname', '-I').split()
+        assert said(shell, 'id', '-un') == 'fog'
+        assert said(shell, 'id', '-u', sudo=True) == '0'
+        assert said(shell, 'pwd') == '/home/fog'
+        assert len(said(shell, 'ps', '-e', '-o', 'pid=').splitlines()) < 12
+        assert said(shell, 'printenv', 'LANG') == 'C.UTF-8'
+
+
+def test_nothing_of_this_computer_s_own_is_seen(cloud, tmp_path):
+    secret = tmp_path / 'secret'
+    secret.write_text('secret')
+    with cloud.machine() as (_, shell):
+        assert said(shell, 'ls', '-A', '/home') == 'fog'
+        for folder in ('/srv', '/mnt', '/media', '/root/.ssh'):
+            assert not said(shell, 'sh', '-c', f'ls -A {folder} 2>/dev/null || :', sudo=True)
+        # where Python's environment is mounted, its folder and nothing beside it
+        hidden = said(shell, 'sh', '-c', (
+            f'ls -d {secret} /etc/ssh/ssh_host* /etc/wireguard /etc/kubernetes /etc/fstab '
+            '/var/lib/containers /etc/ssl/private 2>/dev/null || :'), sudo=True)
+        assert hidden == ''
+        shadow = said(shell, 'cat', '/etc/shadow', sudo=True)
+        assert all(line.split(':')[1] == '*' for line in shadow.splitlines())
+        people = [line for line in said(shell, 'cat', '/etc/passwd').splitlines()
+                  if 1000 <= int(line.split(':')[2]) < 65534]
+        assert [line.split(':')[0] for line in people] == ['fog']
+        assert os.uname().nodename not in said(shell, 'cat', '/etc/hosts').split()
+
+
+def test_system_folders_can_be_written_there_and_stay_as_they_are_here(cloud):
+    mark = f'/usr/local/bin/fogros2-{uuid.uuid4().hex}'
+    with cloud.machine() as (_, shell):
+        said(shell, 'touch', mark, '/etc/fogros2-mark', sudo=True)
+        assert said(shell, 'ls', mark) == mark
+        assert not os.path.exists(mark)
+        if shutil.which('dpkg'):
+            assert 'installed' in said(shell, 'dpkg-query', '-W', '-f', '${Status}', 'bash')
+            # a package can be configured: scripts, database, alternatives, all there
+            said(shell, 'sh', '-c', 'dpkg --configure -a && update-alternatives --get-selections',
+                 sudo=True)
+
+
+def test_a_machine_may_make_interfaces_and_no_more(cloud):
+    with cloud.machine() as (_, shell):
+        said(shell, 'ip', 'tuntap', 'add', 'fogtest', 'mode', 'tun', sudo=True)
+        assert 'fogtest' in said(shell, 'ip', 'link', 'show', 'fogtest')
+        mounted = shell.run(Command(('mount', '-t', 'tmpfs', 'none', '/mnt'), sudo=True),
+                            timeout=10.0, check=False)
+        assert mounted.returncode != 0
+
+
+def test_the_python_of_this_process_is_there_read_only(cloud):
+    with cloud.machine() as (_, shell):
+        assert said(shell, sys.executable, '-c', 'import paramiko, sys; print(sys.prefix)') \
+            == sys.prefix
+        if not sys.prefix.startswith('/usr'):
+            written = shell.run(Command(('touch', f'{sys.prefix}/x'), sudo=True), timeout=10.0,
+                                check=False)
+            assert 'Read-only' in written.stderr
+
+
+def test_the_host_key_is_the_machine_s_own_and_pinned(cloud):
+    with cloud.machine() as (machine, shell):
+        own = said(shell, 'cat', '/etc/ssh/fogros2_host_ed25519_key.pub').split()[:2]
+        assert machine.shell.host_key.split() == own
+        pinned = dataclasses.replace(
+            machine, shell=dataclasses.replace(machine.shell, host_key=(
+                'ssh-ed25519 '
+                'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9')))
+        with cloud.shell(pinned, user='fog') as other, pytest.raises(HostKeyError):
+            other.run(Command(('true',)), timeout=10.0)
+        with cloud.shell(machine, user='root') as other, pytest.raises(ShellError):
+            other.run(Command(('true',)), timeout=10.0)
+
+
+def test_options_reach_the_machine(cloud, tmp_path):
+    (tmp_path / 'data').mkdir()
+    (tmp_path / 'data/file').write_text('here')
+    (tmp_path / 'data').chmod(0o755)
+    with cloud.machine(options={
+        'user': 'rosuser', 'mounts': [f'{tmp_path}/data:/data'], 'env': {'COLOUR': 'blue sky'},
+        'memory': '200m', 'cpus': 0.5,
+    }) as (machine, shell):
+        assert machine.shell.user == 'rosuser'
+        assert said(shell, 'pwd') == '/home/rosuser'
+        assert said(shell, 'id', '-u', sudo=True) == '0'
+        assert said(shell, 'cat', '/data/file') == 'here'
+        assert said(shell, 'printenv', 'COLOUR') == 'blue sky'
+        assert shell.run(Command(('touch', '/data/x'), sudo=True), timeout=10.0,
+                         check=False).returncode != 0
+        told = process.run(Command(('podman', 'inspect', f'fogros2-{machine.name}'), sudo=True),
+                           timeout=10.0).stdout
+        host = json.loads(told)[0]['HostConfig']
+        assert host['Memory'] == 200 << 20
+        assert host['NanoCpus'] == 500_000_000
+        assert host['Privileged'] is False
+
+
+def test_the_end_command_ends_it_for_good(cloud):
+    with cloud.machine() as (machine, shell):
+        with contextlib.suppress(ShellError):
+            shell.run(Command(machine.end_command, sudo=True), timeout=10.0)
+
+        def gone() -> bool:
+            try:
+                cloud.provider.describe(machine.id)
+            except MachineNotFound:
+                return True
+            return False
+
+        wait_until(gone, timeout=10.0, what='the machine to end')
+        wait_until(lambda: process.run(
+            Command(('test', '-e', str(container.directory(machine.id.split(':')[2]))), sudo=True),
+            timeout=10.0, check=False).returncode, timeout=10.0, what='its root to go')
+        cloud.provider.destroy(machine.id)
+
+
+def test_a_stopped_machine_keeps_its_disk_and_its_key(cloud):
+    spec = cloud.spec(on_exit='stop')
+    first = cloud.reached(cloud.create(spec))
+    with cloud.shell(first) as shell:
+        shell.put(b'kept', '~/file', mode=0o600)
+        said(shell, 'touch', '/usr/local/bin/kept', '/var/lib/kept', '/etc/kept', sudo=True)
+    cloud.provider.stop(first.id)
+    stopped = cloud.provider.describe(first.id)
+    assert stopped.state is MachineState.STOPPED
+    assert stopped.shell is None
+    assert [m.state for m in cloud.provider.find({'fogros2-name': spec.name})] == [
+        MachineState.STOPPED]
+    cloud.provider.start(first.id)
+    again = cloud.reached(first.id)
+    assert again.id == first.id
+    assert again.shell.host_key == first.shell.host_key
+    with cloud.shell(again) as shell:
+        assert said(shell, 'cat', 'file') == 'kept'
+        said(shell, 'ls', '/usr/local/bin/kept', '/var/lib/kept', '/etc/kept')
+        # by itself too it ends as stopped
+        with contextlib.suppress(ShellError):
+            shell.run(Command(again.end_command, sudo=True), timeout=10.0)
+    wait_until(lambda: cloud.provider.describe(first.id).state is MachineState.STOPPED,
+               timeout=10.0, what='the machine to stop')
+
+
+def test_a_machine_made_to_be_deleted_isn_t_stopped(cloud):
+    machine_id = cloud.create(cloud.spec())
+    with pytest.raises(Unsupported, match="on_exit='stop'"):
+        cloud.provider.stop(machine_id)
+    assert cloud.provider.describe(machine_id).state is MachineState.RUNNING
+
+
+def test_what_can_t_be_created_leaves_nothing(cloud):
+    with pytest.raises(ProviderError, match='no-such-network'):
+        cloud.create(cloud.spec(options={'network': 'no-such-network'}))
+    with pytest.raises(ConfigurationError):
+        cloud.create(cloud.spec(options={'nets': 'x'}))
+
+
+def test_many_come_up_at_once(cloud):
+    specs = [cloud.spec() for _ in range(4)]
+    threads = [threading.Thread(target=cloud.create, args=(spec,)) for spec in specs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60.0)
+    machines = [cloud.reached(machine_id) for machine_id in cloud.ids]
+    assert sorted(m.name for m in machines) == sorted(spec.name for spec in specs)
+    assert len({m.vpn_host for m in machines}) == 4
+    assert len({m.shell.host_key for m in machines}) == 4
+
+
+_KILLED = """
+import sys
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider.container import ContainerProvider
+spec = MachineSpec({name!r}, 'container', {options!r})
+print('ready', flush=True)
+sys.stdin.readline()
+ContainerProvider().create(spec, CreateRequest(
+    {token!r}, 'ssh-ed25519 AAAA', {{'fogros2-name': {name!r}}}, 51820))
+"""
+
+
+@pytest.mark.parametrize('delay', [0.005, 0.05, 0.12, 0.2])
+def test_a_launch_killed_while_it_creates_leaves_all_or_nothing(cloud, cloud_network, delay):
+    """Tests that whatever the moment, ``find`` knows what there is and ``destroy`` takes it."""
+    spec, token = cloud.spec(), str(uuid.uuid4())
+    child = subprocess.Popen(
+        [sys.executable, '-c', _KILLED.format(name=spec.name, options=spec.options, token=token)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdin is not None
+    child.stdout.readline()
+    child.stdin.write(b'go\n')
+    child.stdin.flush()
+    threading.Event().wait(delay)  # the fault's moment, not a wait for something
+    child.send_signal(signal.SIGKILL)
+    child.wait(10.0)
+
+    def settled() -> bool:
+        running = process.run(Command(('pgrep', '-f', token)), timeout=10.0, check=False).stdout
+        return not running or bool(list(cloud.provider.find({'fogros2-name': spec.name})))
+
+    wait_until(settled, timeout=20.0, what='the engine to finish')
+    for machine in cloud.provider.find({'fogros2-name': spec.name}):
+        cloud.provider.destroy(machine.id)
+
+
+def test_the_guard_is_armed_at_boot_and_comes_back(cloud):
+    config = {'machine': 'm', 'launch': 'abc', 'directory': container.ContainerProvider.
+              agent_directory, 'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': 60,
+              'boot_timeout': 600, 'end_command': []}
+    machine = cloud.reached(cloud.create(cloud.spec(), agent_config=config))
+    with cloud.shell(machine) as shell:
+        def guard() -> str:
+            return shell.run(Command(('pgrep', '-f', 'agent.py serve')), timeout=10.0,
+                             check=False).stdout.strip()
+
+        first = wait_until(lambda: guard() or None, timeout=10.0, what='the guard')
+        wait_until(lambda: shell.run(
+            Command(('test', '-S', '/run/fogros2/agent.sock')), timeout=10.0,
+            check=False).returncode == 0, timeout=10.0, what="the guard's socket")
+        said(shell, 'kill', '-KILL', first, sudo=True)
+        second = wait_until(lambda: guard() or None, timeout=10.0, what='the guard to come back')
+        assert first != second
+
+
+def test_a_guard_that_waits_in_vain_ends_the_machine(cloud):
+    config = {'machine': 'm', 'launch': 'abc', 'directory': container.ContainerProvider.
+              agent_directory, 'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': 1,
+              'boot_timeout': 1, 'end_command': []}
+    machine_id = cloud.create(cloud.spec(), agent_config=config)
+
+    def gone() -> bool:
+        try:
+            cloud.provider.describe(machine_id)
+        except MachineNotFound:
+            return True
+        return False
+
+    wait_until(gone, timeout=20.0, what='the machine to end itself')
+
+
+def test_a_full_disk_of_a_machine_is_said_to_be_full(cloud, tmp_path):
+    source = tmp_path / 'source'
+    source.mkdir()
+    with open(source / 'big', 'wb') as file:
+        file.truncate(80 << 20)
+    with cloud.machine() as (machine, shell):
+        with pytest.raises(ShellError, match=f"disk of '{machine.name}' is full"):
+            shell.sync(source, '/dev/shm/x', excludes=[], timeout=60.0)

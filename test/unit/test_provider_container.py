@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of what container machines see, are asked for, and run; by value."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+import stat
+import subprocess
+import tarfile
+
+import pytest
+
+from fogros2.errors import CommandError, ConfigurationError, MachineNotFound, PrerequisiteError
+from fogros2.model import Command, CreateRequest, MachineSpec, Result
+from fogros2.provider import container, container_engine, container_entry, container_root
+from fogros2.provider.container import Options
+
+REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
+
+
+def content(data: bytes) -> dict[str, tarfile.TarInfo]:
+    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
+        return {member.name: member for member in tar.getmembers()}
+
+
+def text(data: bytes, name: str) -> str:
+    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
+        file = tar.extractfile(name)
+        assert file is not None
+        return file.read().decode()
+
+
+@pytest.fixture
+def etc(tmp_path: Path) -> Path:
+    """Return settings with secrets in every corner."""
+    folder = tmp_path / 'etc'
+    for name, mode in {
+        'passwd': 0o644, 'group': 0o644, 'nsswitch.conf': 0o644, 'ssl/certs/ca.crt': 0o644,
+        'skel/.bashrc': 0o644, 'shadow': 0o640, 'gshadow': 0o640,
+        'ssh/ssh_host_ed25519_key': 0o600, 'ssh/sshd_config': 0o644,
+        'wireguard/wg0.conf': 0o600, 'kubernetes/admin.conf': 0o644, 'fstab': 0o644,
+        'environment': 0o644, 'pip.conf': 0o644, 'ssl/private/server.key': 0o640,
+        'ssl/certs/own.key': 0o644, 'apt/sources.list.d/a.list': 0o644,
+        'apt/sources.list.d/private.list': 0o644, 'apt/auth.conf.d/x.conf': 0o644,
+        'apt/auth.conf': 0o644, 'security/opasswd': 0o600, 'profile.d/token.sh': 0o600,
+        'profile.d/ros.sh': 0o644, 'pam.d/common-password': 0o644, 'passwd-': 0o644,
+        'ca-certificates/hidden/open': 0o644, 'profile': 0o755,
+    }.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f'content of {name}')
+        path.chmod(mode)
+    (folder / 'ca-certificates/hidden').chmod(0o700)
+    (folder / 'localtime').symlink_to('/usr/share/zoneinfo/UTC')
+    (folder / 'apt/sources.list.d/private.list').write_text(
+        'deb https://me:secret@example.org/ stable main')
+    (folder / 'passwd').write_text(
+        'root:x:0:0:root:/root:/bin/bash\n'
+        'alice:x:1000:1000:Alice Doe:/home/alice:/bin/zsh\n'
+        'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin\n'
+        'nobody:x:65534:65534:nobody:/nonexistent:/usr/sbin/nologin\n')
+    (folder / 'group').write_text('root:x:0:\nsudo:x:27:alice\nalice:x:1000:\n')
+    return folder
+
+
+def test_settings_hold_what_is_allowed_and_nothing_else(etc):
+    archive = container_root.Archive()
+    container_root.settings(archive, str(etc))
+    names = {name for name, member in content(archive.data()).items() if not member.isdir()}
+    assert names == {
+        'etc/nsswitch.conf', 'etc/ssl/certs/ca.crt', 'etc/skel/.bashrc',
+        'etc/apt/sources.list.d/a.list', 'etc/profile.d/ros.sh', 'etc/profile',
+        'etc/pam.d/common-password', 'etc/localtime',
+    }
+
+
+def test_settings_keep_links_and_programs(etc):
+    archive = container_root.Archive()
+    container_root.settings(archive, str(etc))
+    found = content(archive.data())
+    assert found['etc/localtime'].linkname == '/usr/share/zoneinfo/UTC'
+    assert found['etc/profile'].mode == 0o755
+    assert found['etc/nsswitch.conf'].mode == 0o644
+
+
+def test_large_folders_are_mounted_only_if_all_of_them_may_be_seen(etc):
+    for number in range(container_root.MANY):
+        (etc / f'ssl/certs/{number}').symlink_to('ca.crt')
+        (etc / f'profile.d/{number}.sh').write_text('')
+    (etc / 'ssl/certs/own.key').unlink()
+    assert container_root.many_settings(str(etc)) == (f'{etc}/ssl/certs',)
+    archive = container_root.Archive()
+    container_root.settings(archive, str(etc))
+    found = content(archive.data())
+    assert 'etc/ssl/certs' in found
+    assert 'etc/ssl/certs/ca.crt' not in found
+    assert 'etc/profile.d/0.sh' in found
+    assert 'etc/profile.d/token.sh' not in found
+
+
+def test_accounts_are_the_system_s_and_the_login_user_s(etc):
+    archive = container_root.Archive()
+    container_root.accounts(archive, 'fog', etc)
+    data = archive.data()
+    assert text(data, 'etc/passwd').splitlines() == [
+        'root:x:0:0:root:/root:/bin/bash',
+        'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin',
+        'nobody:x:65534:65534:nobody:/nonexistent:/usr/sbin/nologin',
+        'fog:x:1000:1000::/home/fog:/bin/bash']
+    assert 'alice' not in text(data, 'etc/group')
+    assert text(data, 'etc/shadow').splitlines()[0] == 'root:*:::::::'
+    found = content(data)
+    assert found['etc/shadow'].mode == 0o600
+    assert found['etc/sudoers'].mode == 0o440
+    assert (found['home/fog'].uid, found['home/fog'].mode) == (1000, 0o750)
+    assert found['home/fog/.bashrc'].uid == 1000
+
+
+def test_the_skeleton_of_this_computer_holds_no_home_and_no_key():
+    data = container_root.skeleton('fog') + container_root.Archive().data()
+    found = content(data)
+    for name in ('home', 'root', 'srv', 'opt', 'mnt', 'media', 'var/lib', 'run', 'tmp'):
+        assert found[name].isdir()
+    files = [name for name, member in found.items() if not member.isdir()]
+    allowed = ('etc/', 'home/fog/.', 'var/run', 'var/lock')
+    assert all(name.startswith(allowed) or '/' not in name for name in files)
+    secret = ('etc/ssh/', 'etc/wireguard', 'etc/kubernetes')
+    assert not any(name.startswith(secret) for name in files)
+    assert found['tmp'].mode == 0o1777
+
+
+def test_system_mounts_are_system_folders():
+    allowed = ('/usr', '/bin', '/sbin', '/lib', '/var/lib/dpkg', '/etc/')
+    assert '/usr' in container_root.system_mounts()
+    assert all(mount.startswith(allowed) for mount in container_root.system_mounts())
+
+
+def test_outermost_folders_are_mounted_once():
+    assert container_root.outermost(
+        ['/a/b/c', '/a/b', '/a/bc', '/usr/lib/x', '/lib/y', '/', '/a/b/']) == ['/a/b', '/a/bc']
+
+
+def test_the_environment_is_prefix_underlays_and_editable_packages(tmp_path, monkeypatch):
+    site = tmp_path / 'venv/lib/python3.11/site-packages'
+    site.mkdir(parents=True)
+    for name in ('ros/share', 'work/install/pkg', 'work/.git', 'source/one', 'source/test'):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / 'source/one/__init__.py').write_text('')
+    (tmp_path / 'source/setup.py').write_text('')
+    (site / 'one.pth').write_text(f'{tmp_path}/source\nimport sys\n')
+    (tmp_path / 'two').mkdir()
+    (site / '__editable___two_finder.py').write_text(
+        f"MAPPING: dict[str, str] = {{'two': '{tmp_path}/two', 'gone': '/nowhere'}}\n")
+    monkeypatch.setattr('sys.prefix', str(tmp_path / 'venv'))
+    monkeypatch.setattr('sys.base_prefix', '/usr')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
+        [f'{tmp_path}/work/install/pkg', f'{tmp_path}/ros', f'{tmp_path}/absent']))
+    assert container_root.environment_mounts(f'{tmp_path}/work') == [
+        f'{tmp_path}/ros', f'{tmp_path}/source/one', f'{tmp_path}/two', f'{tmp_path}/venv']
+
+
+def test_the_file_system_of_a_path_is_the_innermost_mount(tmp_path):
+    table = tmp_path / 'mountinfo'
+    table.write_text(
+        '1 0 8:1 / / rw - ext4 /dev/a rw\n'
+        '2 1 0:5 / /var/lib/cont\\040ainers rw,relatime shared:3 - overlay none rw\n'
+        '3 1 0:6 / /var rw - xfs /dev/b rw\n')
+    assert container_root.file_system(Path('/etc'), table) == 'ext4'
+    assert container_root.file_system(Path('/var/log'), table) == 'xfs'
+    assert container_root.file_system(Path('/var/lib/cont ainers/x'), table) == 'overlay'
+
+
+def test_a_root_that_can_t_be_overlaid_is_refused(monkeypatch):
+    monkeypatch.setattr(container_root, 'file_system', lambda path: 'overlay')
+    with pytest.raises(PrerequisiteError, match="can't be overlaid: .* is on overlay .*image="):
+        container.check_root()
+
+
+@pytest.mark.parametrize('given, words', [
+    ({'imag': 'x'}, "no option 'imag' .*did you mean 'image'"),
+    ({'colour': 'x'}, 'there are: image, engine'),
+    ({'engine': 'lxc'}, "no container engine 'lxc'"),
+    ({'engine': 'docker'}, "can't use this computer's own root"),
+    ({'cpus': 'two'}, 'takes a number above 0'),
+    ({'cpus': 0}, 'takes a number above 0'),
+    ({'memory': True}, 'takes a string'),
+    ({'ports': '80:80'}, 'takes a list of strings'),
+    ({'env': ['A=b']}, 'takes names and strings'),
+    ({'env': {'A B': 'c'}}, "can't carry the variable 'A B'"),
+    ({'env': {'A': 'c\nPermitRootLogin yes'}}, "can't carry the variable"),
+    ({'user': 'Me; rm'}, "can't be a user name"),
+    ({'ip': '198.51.100.7'}, "give network='...' too"),
+    ({'mounts': ['relative']}, "it takes '/path'"),
+    ({'mounts': ['/a/../b']}, "it takes '/path'"),
+    ({'mounts': ['/no/such/folder']}, "doesn't exist"),
+    ({'image': '--privileged'}, "option 'image' can't be '--privileged'"),
+    ({'network': '-x'}, "option 'network' can't be '-x'"),
+])
+def test_options_that_make_no_sense_are_refused(given, words):
+    with pytest.raises(ConfigurationError, match=words):
+        Options.parse(given)
+
+
+def test_options_are_taken_as_they_are_meant(tmp_path):
+    options = Options.parse({
+        'image': 'ros:jazzy', 'cpus': 2, 'memory': '1g', 'ports': ['80:80'], 'gpus': 'all',
+        'mounts': [str(tmp_path)], 'env': {'A': 'b'}, 'network': 'n', 'ip': '198.51.100.7',
+        'devices': None,
+    })
+    words = list(container.common_flags(
+        MachineSpec('m', 'container', on_exit='stop'), REQUEST, options))
+    for pair in (('--cpus', '2'), ('--memory', '1g'), ('-p', '80:80'), ('--gpus', 'all'),
+                 ('--network', 'n'), ('--ip', '198.51.100.7'), ('--hostname', 'm'),
+                 ('--name', 'fogros2-m'), ('--device', '/dev/net/tun'),
+                 ('--label', 'fogros2-name=m'), ('--label', 'fogros2-token=0123-token'),
+                 ('--cap-add', 'NET_ADMIN')):
+        assert any(words[i:i + 2] == list(pair) for i in range(len(words))), pair
+    assert '--privileged' not in words
+    assert 'AAAA' not in ' '.join(words)
+
+
+def test_control_groups_decide_podman_s_flags():
+    flags = container_engine.flags_for
+    assert flags(unified=True, systemd=True, runc=True) == ()
+    assert flags(unified=True, systemd=False, runc=True) == ('--cgroup-manager', 'cgroupfs')
+    assert flags(unified=False, systemd=False, runc=True) == (
+        '--runtime', 'runc', '--cgroup-manager', 'cgroupfs')
+    assert flags(unified=False, systemd=True, runc=False) == ()
+
+
+def test_limits_never_ask_for_more_than_there_is():
+    words = container_engine.limits()
+    for word in words[1::2]:
+        soft, hard = word.partition('=')[2].split(':')
+        assert soft == hard
+        assert int(hard) <= 1 << 22
+
+
+@pytest.mark.parametrize('stderr, hint', [
+    ('Error: mounting overlay failed: invalid argument', 'image='),
+    ('Error: write /x: no space left on device', 'disk is full'),
+    ('sudo: a password is required', 'sudo -v'),
+    ('Error: stat /dev/net/tun: no such file or directory', 'modprobe tun'),
+    ('Error: IPAM error: ip address 198.51.100.7 is already allocated', 'choose another'),
+])
+def test_an_engine_s_failure_has_a_remedy(stderr, hint):
+    error = container_engine.translate(CommandError(
+        Command(('podman',), what='creating it'), Result(125, '', f'warning\n{stderr}\n'), 'here'))
+    assert hint in error.hint
+    assert stderr in str(error)
+
+
+@pytest.mark.parametrize('machine_id', [
+    '', 'x', 'podman:123:abcd-1', 'lxc:0123456789ab:abcd-1', 'podman:0123456789ab:../../etc',
+    'podman:0123456789ab:', 'podman:0123456789ab:-rf',
+])
+def test_only_our_own_ids_are_taken(machine_id):
+    with pytest.raises(MachineNotFound):
+        engine, identity, token = container.parse_id(machine_id)
+        container.directory(token)
+
+
+def test_times_of_both_engines_are_read():
+    second = 1763708340
+    assert container.timestamp('2025-11-21T06:59:00.123456789Z') == pytest.approx(second + 0.123)
+    assert container.timestamp('2025-11-21T08:59:00.1+02:00') == pytest.approx(second + 0.1)
+    assert container.timestamp('yesterday') == 0.0
+
+
+def entry_files(**changes) -> bytes:
+    archive = container_root.Archive()
+    container_entry.add(archive, **{
+        'user': 'fog', 'authorized_key': 'ssh-ed25519 AAAA me', 'environment': {'A': 'b c'},
+        'agent_config': {'machine': 'm', 'end_command': []}, **changes})
+    return archive.data()
+
+
+def test_the_first_process_is_a_shell_script(tmp_path):
+    for config in ({}, {'machine': 'm'}):
+        script = tmp_path / 'entry.sh'
+        script.write_text(text(entry_files(agent_config=config), 'opt/fogros2/entry.sh'))
+        subprocess.run(['sh', '-n', str(script)], check=True)
+
+
+def test_the_guard_gets_its_configuration_alone():
+    data = entry_files()
+    config = json.loads(text(data, 'opt/fogros2/agent.json'))
+    assert config['end_command'] == ['kill', '-TERM', '1']
+    assert config['user'] == 'fog'
+    found = content(data)
+    assert stat.S_IMODE(found['opt/fogros2/agent.json'].mode) == 0o600
+    assert 'opt/fogros2/agent.py' in found
+    assert 'agent.py' not in text(entry_files(agent_config={}), 'opt/fogros2/entry.sh')
+
+
+def test_the_ssh_server_takes_our_key_alone():
+    data = entry_files()
+    config = text(data, 'opt/fogros2/sshd_config').splitlines()
+    for line in ('PasswordAuthentication no', 'KbdInteractiveAuthentication no', 'AllowUsers fog',
+                 'PermitRootLogin no', 'PrintMotd no', 'UseDNS no'):
+        assert line in config
+    assert any(line.startswith('SetEnv') and '"A=b c"' in line for line in config)
+    assert text(data, 'opt/fogros2/authorized_keys') == 'ssh-ed25519 AAAA me\n'
