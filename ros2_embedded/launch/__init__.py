@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts, watches and stops processes as a launch description says: ROS 2 Jazzy's API."""
-from . import logging  # isort: skip
 from . import (
     actions,
     conditions,
@@ -9,51 +8,43 @@ from . import (
     events,
     frontend,
     launch_description_sources,
+    logging,
     substitutions,
 )
-from ._aliases import missing
-from .action import Action
-from .condition import Condition
-from .event import Event
-from .event_handler import EventHandler
-from .invalid_launch_file_error import InvalidLaunchFileError
+from ._aliases import alias_submodules, missing
+from ._base import (
+    Action,
+    BaseEventHandler,
+    Condition,
+    Event,
+    EventHandler,
+    InvalidLaunchFileError,
+    LaunchDescriptionEntity,
+    SomeEntitiesType,
+    SomeEntitiesType_types_tuple,
+    SomeSubstitutionsType,
+    SomeSubstitutionsType_types_tuple,
+    Substitution,
+)
 from .launch_context import LaunchContext
-from .launch_description import LaunchDescription
-from .launch_description_entity import LaunchDescriptionEntity
-from .launch_description_source import LaunchDescriptionSource
+from .launch_description import LaunchDescription, LaunchDescriptionSource
 from .launch_introspector import LaunchIntrospector
 from .launch_service import LaunchService
-from .some_entities_type import SomeEntitiesType, SomeEntitiesType_types_tuple
-from .some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
-from .substitution import Substitution
 
 __all__ = [
-    'actions',
-    'conditions',
-    'descriptions',
-    'event_handlers',
-    'events',
-    'frontend',
-    'launch_description_sources',
-    'logging',
-    'substitutions',
-    'Action',
-    'Condition',
-    'Event',
-    'EventHandler',
-    'InvalidLaunchFileError',
-    'LaunchContext',
-    'LaunchDescription',
-    'LaunchDescriptionEntity',
-    'LaunchDescriptionSource',
-    'LaunchIntrospector',
-    'LaunchService',
-    'SomeEntitiesType',
-    'SomeEntitiesType_types_tuple',
-    'SomeSubstitutionsType',
-    'SomeSubstitutionsType_types_tuple',
-    'Substitution',
-]
+    'actions', 'conditions', 'descriptions', 'event_handlers', 'events', 'frontend',
+    'launch_description_sources', 'logging', 'substitutions', 'Action', 'BaseEventHandler',
+    'Condition', 'Event', 'EventHandler', 'InvalidLaunchFileError', 'LaunchContext',
+    'LaunchDescription', 'LaunchDescriptionEntity', 'LaunchDescriptionSource',
+    'LaunchIntrospector', 'LaunchService', 'SomeEntitiesType', 'SomeEntitiesType_types_tuple',
+    'SomeSubstitutionsType', 'SomeSubstitutionsType_types_tuple', 'Substitution']
+
+alias_submodules(
+    __name__, ('Action', 'Condition', 'Event', 'InvalidLaunchFileError',
+               'LaunchDescriptionEntity', 'LaunchDescriptionSource', 'Substitution'),
+    event_handler=('BaseEventHandler', 'EventHandler'),
+    some_entities_type=('SomeEntitiesType', 'SomeEntitiesType_types_tuple'),
+    some_substitutions_type=('SomeSubstitutionsType', 'SomeSubstitutionsType_types_tuple'))
 
 
 def __getattr__(name: str) -> object:

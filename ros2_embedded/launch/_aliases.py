@@ -4,7 +4,7 @@ from importlib.machinery import ModuleSpec
 import re
 import sys
 from types import ModuleType
-from typing import Dict, Iterable, Mapping, NoReturn, Optional, Tuple
+from typing import Dict, Iterable, NoReturn, Optional, Tuple
 
 _BEFORE_WORD = re.compile('(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])')
 _modules: Dict[str, Tuple[str, ...]] = {}
@@ -15,10 +15,7 @@ class _AliasFinder:
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> Optional[ModuleSpec]:
-        return ModuleSpec(name, _AliasLoader) if name in _modules else None  # type: ignore
-
-
-class _AliasLoader:
+        return ModuleSpec(name, _AliasFinder) if name in _modules else None  # type: ignore
 
     @staticmethod
     def create_module(spec: ModuleSpec) -> None:
@@ -34,19 +31,15 @@ class _AliasLoader:
 sys.meta_path.append(_AliasFinder)
 
 
-def alias_submodules(
-    package: str, names: Iterable[str], special: Optional[Mapping[str, Tuple[str, ...]]] = None
-) -> None:
+def alias_submodules(package: str, names: Iterable[str], **special: Tuple[str, ...]) -> None:
     """
-    Make ``package.execute_process`` importable for a name ``ExecuteProcess`` of ``package``.
+    Make ``package.execute_process`` importable for a class ``ExecuteProcess`` of ``package``.
 
-    :param names: what gets a module of its own, CamelCase.
     :param special: modules whose name or content doesn't follow from a class's name.
     """
-    special = special or {}
     for name in names:
-        snake_case = _BEFORE_WORD.sub('_', name).lower()
-        _modules[f'{package}.{snake_case}'] = (name,)
+        if name[0].isupper():
+            _modules[f"{package}.{_BEFORE_WORD.sub('_', name).lower()}"] = (name,)
     for module, content in special.items():
         _modules[f'{package}.{module}'] = content
 
@@ -55,9 +48,12 @@ def missing(module: str, name: str) -> NoReturn:
     """
     Refuse a name that the embedded default lacks; for a module's ``__getattr__``.
 
-    :raises AttributeError: always.
+    :raises ImportError: for a name of ROS 2's: of an AttributeError, an import statement
+        wouldn't show the text.
+    :raises AttributeError: for any other.
     """
-    hint = '' if name.startswith('_') else (
-        ': the embedded default has no such part. If ROS 2 Jazzy has it, install ROS 2 '
-        '(https://docs.ros.org/en/jazzy/Installation.html) and use that instead')
-    raise AttributeError(f"module '{module}' has no attribute '{name}'{hint}")
+    if name in ('LifecycleTransition', 'ROSTimer', 'RosTimer', 'SetUseSimTime'):
+        raise ImportError(
+            f'{module}.{name} is not part of the embedded default: install ROS 2 '
+            '(https://docs.ros.org/en/jazzy/Installation.html) and use that instead')
+    raise AttributeError(f"module '{module}' has no attribute '{name}'")

@@ -4,29 +4,17 @@ from __future__ import annotations
 
 from typing import Any, Iterable, List, Tuple
 
-from .action import Action
+from ._base import Action, LaunchDescriptionEntity, SomeSubstitutionsType
 from .actions import EmitEvent, ExecuteProcess, LogInfo, RegisterEventHandler
 from .launch_description import LaunchDescription
-from .launch_description_entity import LaunchDescriptionEntity
-from .some_substitutions_type import SomeSubstitutionsType
 from .utilities import normalize_to_list_of_substitutions
 
 Tree = Tuple[str, List[Any]]
 
 
 def format_substitutions(substitutions: SomeSubstitutionsType) -> str:
-    """Return substitutions in words."""
     normalized = normalize_to_list_of_substitutions(substitutions)
     return ' + '.join(sub.describe() for sub in normalized)
-
-
-def _describe_process(action: ExecuteProcess) -> str:
-    cmd = ', '.join(format_substitutions(word) for word in action.cmd)
-    cwd = None if action.cwd is None else f"'{format_substitutions(action.cwd)}'"
-    env = None if action.env is None else '{' + ', '.join(
-        f'{format_substitutions(name)}: {format_substitutions(value)}'
-        for name, value in action.env) + '}'
-    return f'ExecuteProcess(cmd=[{cmd}], cwd={cwd}, env={env}, shell={action.shell})'
 
 
 def _describe(entity: LaunchDescriptionEntity) -> Tree:
@@ -35,16 +23,18 @@ def _describe(entity: LaunchDescriptionEntity) -> Tree:
     if isinstance(entity, EmitEvent):
         return f"EmitEvent(event='{entity.event.name}')", []
     if isinstance(entity, ExecuteProcess):
-        return _describe_process(entity), []
+        cmd = ', '.join(format_substitutions(word) for word in entity.cmd)
+        cwd = None if entity.cwd is None else f"'{format_substitutions(entity.cwd)}'"
+        env = None if entity.env is None else '{' + ', '.join(
+            f'{format_substitutions(name)}: {format_substitutions(value)}'
+            for name, value in entity.env) + '}'
+        return f'ExecuteProcess(cmd=[{cmd}], cwd={cwd}, env={env}, shell={entity.shell})', []
     if isinstance(entity, RegisterEventHandler):
         text, entities = entity.event_handler.describe()
-        if isinstance(entities, LaunchDescriptionEntity):
-            entities = [entities]
         return (f"RegisterEventHandler('{entity.event_handler}'):",
                 [(text, [_describe(one) for one in entities])])
-    if isinstance(entity, Action):
-        return f"Action('{entity}')", []
-    return f"Unknown entity('{entity}')", []
+    kind = 'Action' if isinstance(entity, Action) else 'Unknown entity'
+    return f"{kind}('{entity}')", []
 
 
 def _draw(trees: Iterable[Tree], indentation: str) -> Iterable[str]:
@@ -56,9 +46,8 @@ def _draw(trees: Iterable[Tree], indentation: str) -> Iterable[str]:
 
 
 class LaunchIntrospector:
-    """Describes launch descriptions without visiting them."""
 
     def format_launch_description(self, launch_description: LaunchDescription) -> str:
-        """Return the entities as a tree in text."""
+        """Return the entities, not visited, as a tree in text."""
         trees = [_describe(entity) for entity in launch_description.entities]
         return '\n'.join([str(launch_description), *_draw(trees, '')])

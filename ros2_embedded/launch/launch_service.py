@@ -14,12 +14,11 @@ import warnings
 
 import launch.logging
 
-from .event import Event
+from ._base import Event, LaunchDescriptionEntity
 from .event_handlers import OnIncludeLaunchDescription, OnShutdown
 from .events import IncludeLaunchDescription, Shutdown
 from .launch_context import LaunchContext
 from .launch_description import LaunchDescription
-from .launch_description_entity import LaunchDescriptionEntity
 from .utilities import (
     AsyncSafeSignalManager,
     is_a_subclass,

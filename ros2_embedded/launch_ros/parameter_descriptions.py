@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, cast, Optional, Tuple, Union
+from typing import Any, Optional, Tuple, Union
 
 from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.frontend.parse_substitution import parse_substitution
@@ -34,7 +34,7 @@ class ParameterValue:
         self, value: SomeValueType, *, value_type: Optional[AllowedTypesType] = None
     ) -> None:
         self.__value = normalize_typed_substitution(value, value_type)
-        self.__value_type = value_type
+        self.value_type = value_type
         self.__evaluated_parameter_value: Any = None
 
     @property
@@ -43,11 +43,6 @@ class ParameterValue:
         if self.__evaluated_parameter_value is not None:
             return self.__evaluated_parameter_value
         return self.__value
-
-    @property
-    def value_type(self) -> Optional[AllowedTypesType]:
-        """The value's type."""
-        return self.__value_type
 
     def __str__(self) -> str:
         return (f'launch_ros.description.ParameterValue(value={self.value}, '
@@ -72,25 +67,16 @@ class Parameter:
         value_type: Optional[AllowedTypesType] = None
     ) -> None:
         ensure_argument_type(name, SomeSubstitutionsType_types_tuple, 'name')
-        self.__name = normalize_to_list_of_substitutions(name)
+        self.name: Any = normalize_to_list_of_substitutions(name)
         self.__parameter_value = ParameterValue(value, value_type=value_type)
         self.__evaluated_parameter_rule: Optional[Tuple[str, Any]] = None
 
     @property
-    def name(self) -> Any:
-        """The name once evaluated, before that as substitutions."""
-        if self.__evaluated_parameter_rule is not None:
-            return self.__evaluated_parameter_rule[0]
-        return self.__name
-
-    @property
     def value(self) -> Any:
-        """The value once evaluated, before that as it was given."""
         return self.__parameter_value.value
 
     @property
     def value_type(self) -> Optional[AllowedTypesType]:
-        """The value's type."""
         return self.__parameter_value.value_type
 
     def __str__(self) -> str:
@@ -100,9 +86,8 @@ class Parameter:
     def evaluate(self, context: LaunchContext) -> Tuple[str, Any]:
         """Return name and value."""
         if self.__evaluated_parameter_rule is None:
-            self.__evaluated_parameter_rule = (
-                perform_substitutions(context, self.__name),
-                self.__parameter_value.evaluate(context))
+            self.name = perform_substitutions(context, self.name)
+            self.__evaluated_parameter_rule = (self.name, self.__parameter_value.evaluate(context))
         return self.__evaluated_parameter_rule
 
 
@@ -116,34 +101,18 @@ class ParameterFile:
 
     def __init__(
         self, param_file: Union[SomeSubstitutionsType, 'os.PathLike[str]', bytes], *,
-        allow_substs: Union[bool, SomeSubstitutionsType] = False
+        allow_substs: bool = False
     ) -> None:
-        self.__evaluated_param_file: Optional[Path] = None
         self.__created_tmp_file = False
+        self.__evaluated = False
         ensure_argument_type(
             param_file, SomeSubstitutionsType_types_tuple + (os.PathLike, bytes), 'param_file',
             'ParameterFile()')
         ensure_argument_type(allow_substs, bool, 'allow_subst', 'ParameterFile()')
         # Bytes are iterable, but no substitutions.
-        self.__param_file: Any = param_file
-        if not isinstance(param_file, (os.PathLike, bytes)):
-            self.__param_file = normalize_to_list_of_substitutions(param_file)
-        self.__allow_substs = normalize_typed_substitution(allow_substs, bool)
-        self.__evaluated_allow_substs: Optional[bool] = None
-
-    @property
-    def param_file(self) -> Any:
-        """The path once evaluated, before that as it was given."""
-        if self.__evaluated_param_file is not None:
-            return self.__evaluated_param_file
-        return self.__param_file
-
-    @property
-    def allow_substs(self) -> Any:
-        """Whether substitutions in the file are performed."""
-        if self.__evaluated_allow_substs is not None:
-            return self.__evaluated_allow_substs
-        return self.__allow_substs
+        self.param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
+            normalize_to_list_of_substitutions(param_file))
+        self.allow_substs = allow_substs
 
     def __str__(self) -> str:
         return (f'launch_ros.description.ParameterFile(param_file={self.param_file}, '
@@ -155,15 +124,13 @@ class ParameterFile:
 
         :raises SubstitutionFailure: if the file with its substitutions performed isn't YAML.
         """
-        if self.__evaluated_param_file is not None:
-            return self.__evaluated_param_file
-        path = self.__param_file
+        if self.__evaluated:
+            return Path(self.param_file)
+        path = self.param_file
         if isinstance(path, list):
             path = perform_substitutions(context, path)
         path = Path(os.fsdecode(path))
-        self.__evaluated_allow_substs = cast(
-            bool, perform_typed_substitution(context, self.__allow_substs, bool))
-        if self.__evaluated_allow_substs:
+        if self.allow_substs:
             import yaml
             text = perform_substitutions(context, parse_substitution(path.read_text()))
             try:
@@ -175,14 +142,14 @@ class ParameterFile:
                 self.__created_tmp_file = True
                 file.write(text)
             path = Path(file.name)
-        self.__evaluated_param_file = path
+        self.param_file = path
+        self.__evaluated = True
         return path
 
     def cleanup(self) -> None:
         """Remove the temporary file, if there is one."""
-        if self.__created_tmp_file and self.__evaluated_param_file is not None:
-            self.__evaluated_param_file.unlink(missing_ok=True)
-            self.__evaluated_param_file = None
+        if self.__created_tmp_file and self.__evaluated:
+            self.param_file.unlink(missing_ok=True)
 
     def __del__(self) -> None:
         # The constructor may have raised before there was anything.

@@ -3,14 +3,12 @@
 import pathlib
 from typing import Any, Dict, Mapping, Sequence, Tuple, Union
 
-from launch.some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
-from launch.substitution import Substitution
+from launch import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple, Substitution
 
 from .parameter_descriptions import Parameter as ParameterDescription
 from .parameter_descriptions import ParameterFile
 from .parameter_descriptions import ParameterValue as ParameterValueDescription
 
-_SingleValueType_types_tuple = (str, int, float, bool)
 _SingleValueType = Union[str, int, float, bool]
 _MultiValueType = Union[Sequence[str], Sequence[int], Sequence[float], Sequence[bool], bytes]
 
@@ -20,7 +18,7 @@ SomeParameterValue = Union[
     ParameterValueDescription, SomeSubstitutionsType, Sequence[SomeSubstitutionsType],
     _SingleValueType, _MultiValueType]
 SomeParameterValue_types_tuple = (
-    SomeSubstitutionsType_types_tuple + _SingleValueType_types_tuple + (bytes,))
+    SomeSubstitutionsType_types_tuple + (str, int, float, bool, bytes))
 SomeParametersDict = Mapping[Any, Any]
 SomeParameters = Sequence[Union[SomeParameterFile, ParameterDescription, SomeParametersDict]]
 
@@ -34,10 +32,3 @@ Parameters = Sequence[Union[ParameterFile, ParametersDict, ParameterDescription]
 EvaluatedParameterValue = Union[_SingleValueType, _MultiValueType]
 EvaluatedParameters = Sequence[
     Union[pathlib.Path, ParameterDescription, Dict[str, EvaluatedParameterValue]]]
-
-__all__ = [
-    'EvaluatedParameters', 'EvaluatedParameterValue', 'ParameterDescription', 'ParameterFile',
-    'ParameterName', 'Parameters', 'ParametersDict', 'ParameterValue',
-    'ParameterValueDescription', 'SomeParameterFile', 'SomeParameterName', 'SomeParameters',
-    'SomeParametersDict', 'SomeParameterValue', 'SomeParameterValue_types_tuple',
-]

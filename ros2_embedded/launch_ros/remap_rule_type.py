@@ -2,8 +2,7 @@
 """What is accepted as remappings of a node, and what becomes of that."""
 from typing import Iterable, Tuple
 
-from launch.some_substitutions_type import SomeSubstitutionsType
-from launch.substitution import Substitution
+from launch import SomeSubstitutionsType, Substitution
 
 SomeRemapRule = Tuple[SomeSubstitutionsType, SomeSubstitutionsType]
 SomeRemapRules = Iterable[SomeRemapRule]

@@ -9,19 +9,49 @@ import textwrap
 import launch
 from launch import LaunchContext, LaunchDescription, LaunchIntrospector, LaunchService
 from launch.actions import (
-    AppendEnvironmentVariable, DeclareLaunchArgument, EmitEvent, ExecuteProcess, GroupAction,
-    IncludeLaunchDescription, LogInfo, OpaqueCoroutine, OpaqueFunction, PopEnvironment,
-    PopLaunchConfigurations, PushEnvironment, PushLaunchConfigurations, RegisterEventHandler,
-    ResetLaunchConfigurations, SetEnvironmentVariable, SetLaunchConfiguration, Shutdown,
-    TimerAction, UnregisterEventHandler, UnsetEnvironmentVariable, UnsetLaunchConfiguration)
+    AppendEnvironmentVariable,
+    DeclareLaunchArgument,
+    EmitEvent,
+    ExecuteProcess,
+    GroupAction,
+    IncludeLaunchDescription,
+    LogInfo,
+    OpaqueCoroutine,
+    OpaqueFunction,
+    PopEnvironment,
+    PopLaunchConfigurations,
+    PushEnvironment,
+    PushLaunchConfigurations,
+    RegisterEventHandler,
+    ResetLaunchConfigurations,
+    SetEnvironmentVariable,
+    SetLaunchConfiguration,
+    Shutdown,
+    TimerAction,
+    UnregisterEventHandler,
+    UnsetEnvironmentVariable,
+    UnsetLaunchConfiguration,
+)
 from launch.conditions import (
-    evaluate_condition_expression, IfCondition, InvalidConditionExpressionError,
-    LaunchConfigurationEquals, LaunchConfigurationNotEquals, UnlessCondition)
+    evaluate_condition_expression,
+    IfCondition,
+    InvalidConditionExpressionError,
+    LaunchConfigurationEquals,
+    LaunchConfigurationNotEquals,
+    UnlessCondition,
+)
 from launch.event_handlers import event_named, OnExecutionComplete, OnProcessExit, OnShutdown
 from launch.launch_description_sources import (
-    AnyLaunchDescriptionSource, InvalidLaunchFileError, PythonLaunchDescriptionSource)
+    AnyLaunchDescriptionSource,
+    InvalidLaunchFileError,
+    PythonLaunchDescriptionSource,
+)
 from launch.substitutions import (
-    LaunchConfiguration, TextSubstitution, ThisLaunchFile, ThisLaunchFileDir)
+    LaunchConfiguration,
+    TextSubstitution,
+    ThisLaunchFile,
+    ThisLaunchFileDir,
+)
 import launch.utilities
 from launch.utilities import perform_substitutions
 import pytest
@@ -89,7 +119,7 @@ def test_condition_expressions(text, value):
 
 
 def test_a_condition_that_is_neither_true_nor_false_is_refused():
-    with pytest.raises(InvalidConditionExpressionError, match='expected one of .* got \'maybe\''):
+    with pytest.raises(InvalidConditionExpressionError, match="expected one of .* got 'maybe'"):
         evaluate_condition_expression(LaunchContext(), [TextSubstitution(text='maybe')])
 
 
@@ -199,7 +229,7 @@ def test_locals_last_as_long_as_an_event():
         EmitEvent(event=Asked()), EmitEvent(event=Asked())) == 0
     assert notes == [('Asked', False), (1, 1), ('Asked', False), (1, 2)]
     with pytest.raises(AttributeError, match="does not contain attribute 'nothing'"):
-        LaunchContext().locals.nothing
+        _ = LaunchContext().locals.nothing
 
 
 def test_execution_complete_comes_when_the_future_is_done():
@@ -335,7 +365,7 @@ def test_this_launch_file(tmp_path):
 
 
 @pytest.mark.parametrize('content, expected', [
-    ('def broken(:', r"SyntaxError: .*\(broken.launch.py, line 1\)"),
+    ('def broken(:', r'SyntaxError: .*\(broken.launch.py, line 1\)'),
     ('x = 1', r"does not contain the required function 'generate_launch_description\(\)'"),
     ('import nothing_of_the_kind', "ModuleNotFoundError: No module named 'nothing_of_the_kind'"),
 ])

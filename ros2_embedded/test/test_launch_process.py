@@ -10,14 +10,28 @@ import sys
 import launch
 from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import (
-    EmitEvent, ExecuteLocal, ExecuteProcess, LogInfo, OpaqueFunction, RegisterEventHandler,
-    SetEnvironmentVariable, SetLaunchConfiguration, Shutdown)
+    EmitEvent,
+    ExecuteLocal,
+    ExecuteProcess,
+    LogInfo,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
+    SetLaunchConfiguration,
+    Shutdown,
+)
 from launch.descriptions import Executable
 from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import matches_action
 from launch.events.process import (
-    matches_executable, matches_name, matches_pid, ProcessExited, ProcessStarted,
-    ShutdownProcess, SignalProcess)
+    matches_executable,
+    matches_name,
+    matches_pid,
+    ProcessExited,
+    ProcessStarted,
+    ShutdownProcess,
+    SignalProcess,
+)
 from launch.substitutions import LaunchConfiguration
 import pytest
 
@@ -129,8 +143,9 @@ def test_command_directory_environment_and_shell(capsys, monkeypatch, tmp_path):
         SetLaunchConfiguration('more', 'm'), SetEnvironmentVariable('FOG_SET', 's'),
         python(show, output='screen', cwd=str(tmp_path), additional_env=additional),
         python(show, output='screen', cwd='/', env={'PATH': path}, additional_env=additional),
-        ExecuteProcess(cmd=['echo', ['sh', 'ell'], '$FOG_SET', '&&', 'true'], shell=True,
-                       output='screen'),
+        ExecuteProcess(  # noqa: S604
+            cmd=['echo', ['sh', 'ell'], '$FOG_SET', '&&', 'true'], shell=True,
+            output='screen'),
         ExecuteLocal(process_description=Executable(
             cmd=['echo'], arguments=['local', 'hero']), output='screen')) == 0
     lines = [line.partition('] ')[2] for line in capsys.readouterr().out.splitlines()]

@@ -9,20 +9,37 @@ from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import GroupAction, IncludeLaunchDescription, OpaqueFunction
 import launch.logging
 from launch.substitutions import (
-    LaunchConfiguration, PathJoinSubstitution, SubstitutionFailure, TextSubstitution)
+    LaunchConfiguration,
+    PathJoinSubstitution,
+    SubstitutionFailure,
+    TextSubstitution,
+)
 from launch.utilities import perform_substitutions
 from launch_ros.actions import (
-    ComposableNodeContainer, LifecycleNode, LoadComposableNodes, Node, PushRosNamespace,
-    PushROSNamespace, SetParameter, SetParametersFromFile, SetRemap, SetROSLogDir)
+    ComposableNodeContainer,
+    LifecycleNode,
+    LoadComposableNodes,
+    Node,
+    PushROSNamespace,
+    PushRosNamespace,
+    SetParameter,
+    SetParametersFromFile,
+    SetRemap,
+    SetROSLogDir,
+)
 from launch_ros.descriptions import ComposableNode, Parameter, ParameterFile, ParameterValue
 from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
 from launch_ros.events.matchers import matches_node_name
-from launch_ros.substitutions import (
-    ExecutableInPackage, FindPackagePrefix, FindPackageShare, Parameter as ParameterSubstitution)
+from launch_ros.substitutions import ExecutableInPackage, FindPackagePrefix, FindPackageShare
+from launch_ros.substitutions import Parameter as ParameterSubstitution
 from launch_ros.utilities import (
-    evaluate_parameters, make_namespace_absolute, normalize_parameters, normalize_remap_rule,
-    prefix_namespace)
+    evaluate_parameters,
+    make_namespace_absolute,
+    normalize_parameters,
+    normalize_remap_rule,
+    prefix_namespace,
+)
 import pytest
 import yaml
 
@@ -111,7 +128,7 @@ def test_names_and_remappings(kwargs, expected, name):
 def test_before_it_executes_a_node_has_no_name():
     action = Node(executable='exe')
     with pytest.raises(RuntimeError, match="cannot access 'node_name' before executing action"):
-        action.node_name
+        _ = action.node_name
     assert (action._Node__package, action._Node__node_executable) == (None, 'exe')
 
 
@@ -131,7 +148,8 @@ def test_namespaces_are_pushed_in_their_scope():
     outer = Node(executable='exe', name='n')
     visit(context, PushROSNamespace('a'), GroupAction([
         PushRosNamespace([LaunchConfiguration('b', default='b'), '/c']), *nodes]), outer)
-    assert [node.node_name for node in (*nodes, outer)] == ['/a/b/c/n', '/a/b/c/x/n', '/y/n', '/a/n']
+    assert [node.node_name for node in (*nodes, outer)] == [
+        '/a/b/c/n', '/a/b/c/x/n', '/y/n', '/a/n']
     visit(context, PushROSNamespace('/d'))
     assert context.launch_configurations['ros_namespace'] == '/d'
     with pytest.raises(SubstitutionFailure, match='The resulting namespace is invalid'):
@@ -165,7 +183,7 @@ def test_a_global_parameter_is_a_substitution_too():
 
 def load(path):
     # Real launch_ros writes arrays with a tag of Python's, which rcl ignores.
-    return yaml.load(Path(path).read_text(), yaml.FullLoader)
+    return yaml.load(Path(path).read_text(), yaml.FullLoader)  # noqa: S506
 
 
 def plain(value):

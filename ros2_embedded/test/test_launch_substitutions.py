@@ -11,14 +11,36 @@ from launch.frontend import expose_action, Parser
 from launch.frontend.parse_substitution import parse_substitution
 import launch.logging
 from launch.substitutions import (
-    AllSubstitution, AndSubstitution, AnonName, AnySubstitution, Command, EnvironmentVariable,
-    EqualsSubstitution, FileContent, FindExecutable, IfElseSubstitution, LaunchConfiguration,
-    LaunchLogDir, LocalSubstitution, NotEqualsSubstitution, NotSubstitution, OrSubstitution,
-    PathJoinSubstitution, PythonExpression, SubstitutionFailure, TextSubstitution)
+    AllSubstitution,
+    AndSubstitution,
+    AnonName,
+    AnySubstitution,
+    Command,
+    EnvironmentVariable,
+    EqualsSubstitution,
+    FileContent,
+    FindExecutable,
+    IfElseSubstitution,
+    LaunchConfiguration,
+    LaunchLogDir,
+    LocalSubstitution,
+    NotEqualsSubstitution,
+    NotSubstitution,
+    OrSubstitution,
+    PathJoinSubstitution,
+    PythonExpression,
+    SubstitutionFailure,
+    TextSubstitution,
+)
 from launch.utilities import perform_substitutions
 from launch.utilities.type_utils import (
-    coerce_to_type, get_typed_value, is_instance_of, is_substitution,
-    normalize_typed_substitution, perform_typed_substitution)
+    coerce_to_type,
+    get_typed_value,
+    is_instance_of,
+    is_substitution,
+    normalize_typed_substitution,
+    perform_typed_substitution,
+)
 import pytest
 
 
@@ -77,8 +99,8 @@ def test_values(context, substitution, text):
     (Command('no-such-thing'), 'file not found'),
     (Command('sh -c "echo e >&2"'), 'executed command showed stderr output'),
     (Command('true', on_stderr='what'), "expected 'on_stderr' to be one of"),
-    (NotSubstitution('maybe'), "Failed to convert|Cannot convert"),
-    (IfElseSubstitution('maybe', 'a'), "Failed to convert|Cannot convert"),
+    (NotSubstitution('maybe'), 'Failed to convert|Cannot convert'),
+    (IfElseSubstitution('maybe', 'a'), 'Failed to convert|Cannot convert'),
 ])
 def test_failures(context, substitution, error):
     with pytest.raises(SubstitutionFailure, match=error):
@@ -124,11 +146,11 @@ def test_wrong_arguments():
     ('$(var no x$(var a)y)', 'x1y'), ('$(env FOG_ENV)', 'from env'),
     ("$(eval '1 + $(var a)')", '2'), ('$(eval "\'$(var word)\' == \'hello\'")', 'True'),
     ('$(not $(var a))', 'false'), ('$(and 1 $(var a))', 'true'), ('$(or 0 0)', 'false'),
-    ("$(equals $(var word) hello)", 'true'), ('$(not-equals 1 2)', 'true'),
+    ('$(equals $(var word) hello)', 'true'), ('$(not-equals 1 2)', 'true'),
     ('$(if $(var a) yes no)', 'yes'), ("$(command 'echo x')", 'x\n'),
-    ("$(var quote)", "it's"), ("it's $(var a) o'clock", "it's 1 o'clock"),
+    ('$(var quote)', "it's"), ("it's $(var a) o'clock", "it's 1 o'clock"),
     (r'back\\slash', 'back\\slash'), ('two\nlines $(var a)', 'two\nlines 1'),
-    ('$(var a)$(var a)', '11'), ("$(var a ignored)", '1'), ("$(eval 'os.sep' 'os, sys')", '/'),
+    ('$(var a)$(var a)', '11'), ('$(var a ignored)', '1'), ("$(eval 'os.sep' 'os, sys')", '/'),
 ])
 def test_texts_with_substitutions(context, text, expected):
     assert perform_substitutions(context, parse_substitution(text)) == expected

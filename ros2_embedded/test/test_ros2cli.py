@@ -134,7 +134,7 @@ def test_launch_arguments_are_shown(package):
 def test_launch_description_is_printed(package):
     status, out, _ = ros2('launch', '-p', 'pkg', 'a.launch.py')
     assert status == 0 and "── LogInfo('says ' + LaunchConfig('word'))" in out
-    assert "── ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
+    assert "ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
 
 
 def test_a_launch_file_is_launched(package):

@@ -29,33 +29,15 @@ from .execute_local import ExecuteLocal
 from .execute_process import ExecuteProcess
 
 __all__ = [
-    'AppendEnvironmentVariable',
-    'DeclareLaunchArgument',
-    'EmitEvent',
-    'ExecuteLocal',
-    'ExecuteProcess',
-    'GroupAction',
-    'IncludeLaunchDescription',
-    'LogInfo',
-    'OpaqueCoroutine',
-    'OpaqueFunction',
-    'PopEnvironment',
-    'PopLaunchConfigurations',
-    'PushEnvironment',
-    'PushLaunchConfigurations',
-    'ResetEnvironment',
-    'ResetLaunchConfigurations',
-    'RegisterEventHandler',
-    'SetEnvironmentVariable',
-    'SetLaunchConfiguration',
-    'Shutdown',
-    'TimerAction',
-    'UnregisterEventHandler',
-    'UnsetEnvironmentVariable',
-    'UnsetLaunchConfiguration',
-]
+    'AppendEnvironmentVariable', 'DeclareLaunchArgument', 'EmitEvent', 'ExecuteLocal',
+    'ExecuteProcess', 'GroupAction', 'IncludeLaunchDescription', 'LogInfo', 'OpaqueCoroutine',
+    'OpaqueFunction', 'PopEnvironment', 'PopLaunchConfigurations', 'PushEnvironment',
+    'PushLaunchConfigurations', 'RegisterEventHandler', 'ResetEnvironment',
+    'ResetLaunchConfigurations', 'SetEnvironmentVariable', 'SetLaunchConfiguration', 'Shutdown',
+    'TimerAction', 'UnregisterEventHandler', 'UnsetEnvironmentVariable',
+    'UnsetLaunchConfiguration']
 
-alias_submodules(__name__, __all__, {'shutdown_action': ('Shutdown',)})
+alias_submodules(__name__, __all__, shutdown_action=('Shutdown',))
 
 
 def __getattr__(name: str) -> object:

@@ -7,12 +7,10 @@ from typing import Any, Dict, List, Optional, TYPE_CHECKING, Union
 
 import launch.logging
 
-from ..action import Action, ParsedAction
-from ..frontend.entity import Entity
+from .._base import Action, ParsedAction, SomeSubstitutionsType
 from ..frontend.expose import expose_action
+from ..frontend.type_utils import Entity
 from ..launch_context import LaunchContext
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 
@@ -22,62 +20,42 @@ if TYPE_CHECKING:
 SomeConfigurations = Dict[SomeSubstitutionsType, SomeSubstitutionsType]
 
 
-def parse_keeps(entity: Entity, parser: Parser) -> Dict[str, Any]:
-    """Return the argument ``launch_configurations`` from ``<keep name= value=/>`` elements."""
-    keeps = entity.get_attr('keep', data_type=List[Entity], optional=True)
-    if keeps is None:
-        return {}
-    configurations = {
-        tuple(parser.parse_substitution(keep.get_attr('name'))):
-        parser.parse_substitution(keep.get_attr('value')) for keep in keeps}
-    for keep in keeps:
-        keep.assert_entity_completely_parsed()
-    return {'launch_configurations': configurations}
+def parse_pairs(
+    entity: Entity, parser: Parser, element: str, key: str = 'name', value: str = 'value'
+) -> Optional[Dict[Any, Any]]:
+    """Return what nested elements give by name, None if there are none of that kind."""
+    nested = entity.get_attr(element, data_type=List[Entity], optional=True)
+    if nested is None:
+        return None
+    pairs = {tuple(parser.parse_substitution(one.get_attr(key))):
+             parser.parse_substitution(one.get_attr(value)) for one in nested}
+    for one in nested:
+        one.assert_entity_completely_parsed()
+    return pairs
 
 
 class _Named(Action):
-    """Base of actions on something that has a name."""
+
+    _texts = {'name': 'name'}
 
     def __init__(self, name: SomeSubstitutionsType, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__name = normalize_to_list_of_substitutions(name)
-
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser)
-        kwargs['name'] = parser.parse_substitution(entity.get_attr('name'))
-        return cls, kwargs
-
-    @property
-    def name(self) -> List[Substitution]:
-        """The name."""
-        return self.__name
+        self.name = normalize_to_list_of_substitutions(name)
 
 
 class _NamedValue(_Named):
-    """Base of actions that give something that has a name a value."""
+
+    _texts = {'name': 'name', 'value': 'value'}
 
     def __init__(
         self, name: SomeSubstitutionsType, value: SomeSubstitutionsType, **kwargs: Any
     ) -> None:
         super().__init__(name, **kwargs)
-        self.__value = normalize_to_list_of_substitutions(value)
-
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser)
-        kwargs['value'] = parser.parse_substitution(entity.get_attr('value'))
-        return cls, kwargs
-
-    @property
-    def value(self) -> List[Substitution]:
-        """The value."""
-        return self.__value
+        self.value = normalize_to_list_of_substitutions(value)
 
 
 @expose_action('set_env')
 class SetEnvironmentVariable(_NamedValue):
-    """Sets an environment variable, for this process and those started from now on."""
 
     def execute(self, context: LaunchContext) -> None:
         name = perform_substitutions(context, self.name)
@@ -86,7 +64,6 @@ class SetEnvironmentVariable(_NamedValue):
 
 @expose_action('unset_env')
 class UnsetEnvironmentVariable(_Named):
-    """Removes an environment variable, if it is there."""
 
     def execute(self, context: LaunchContext) -> None:
         context.environment.pop(perform_substitutions(context, self.name), None)
@@ -94,11 +71,8 @@ class UnsetEnvironmentVariable(_Named):
 
 @expose_action('append_env')
 class AppendEnvironmentVariable(_NamedValue):
-    """
-    Adds to an environment variable, behind what is there or before it.
 
-    :param separator: what to put between, by default what separates paths.
-    """
+    _texts = {**_NamedValue._texts, 'separator': 'separator?'}
 
     def __init__(
         self, name: SomeSubstitutionsType, value: SomeSubstitutionsType,
@@ -106,8 +80,8 @@ class AppendEnvironmentVariable(_NamedValue):
         separator: SomeSubstitutionsType = os.pathsep, **kwargs: Any
     ) -> None:
         super().__init__(name, value, **kwargs)
-        self.__prepend = normalize_typed_substitution(prepend, bool)
-        self.__separator = normalize_to_list_of_substitutions(separator)
+        self.prepend = normalize_typed_substitution(prepend, bool)
+        self.separator = normalize_to_list_of_substitutions(separator)
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
@@ -115,20 +89,7 @@ class AppendEnvironmentVariable(_NamedValue):
         prepend = entity.get_attr('prepend', optional=True, data_type=bool, can_be_str=True)
         if prepend is not None:
             kwargs['prepend'] = parser.parse_if_substitutions(prepend)
-        separator = entity.get_attr('separator', optional=True)
-        if separator is not None:
-            kwargs['separator'] = parser.parse_substitution(separator)
         return cls, kwargs
-
-    @property
-    def prepend(self) -> Any:
-        """Whether the value goes before what is there."""
-        return self.__prepend
-
-    @property
-    def separator(self) -> List[Substitution]:
-        """What goes between."""
-        return self.__separator
 
     def execute(self, context: LaunchContext) -> None:
         name = perform_substitutions(context, self.name)
@@ -140,14 +101,12 @@ class AppendEnvironmentVariable(_NamedValue):
 
 
 class PushEnvironment(Action):
-    """Saves the environment."""
 
     def execute(self, context: LaunchContext) -> None:
         context._push_environment()
 
 
 class PopEnvironment(Action):
-    """Restores the environment that was saved last."""
 
     def execute(self, context: LaunchContext) -> None:
         context._pop_environment()
@@ -155,11 +114,6 @@ class PopEnvironment(Action):
 
 @expose_action('reset_env')
 class ResetEnvironment(Action):
-    """Restores the environment that the launch began with."""
-
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        return cls, super().parse(entity, parser)[1]
 
     def execute(self, context: LaunchContext) -> None:
         context._reset_environment()
@@ -167,7 +121,6 @@ class ResetEnvironment(Action):
 
 @expose_action('let')
 class SetLaunchConfiguration(_NamedValue):
-    """Sets a launch configuration."""
 
     def execute(self, context: LaunchContext) -> None:
         name = perform_substitutions(context, self.name)
@@ -175,21 +128,18 @@ class SetLaunchConfiguration(_NamedValue):
 
 
 class UnsetLaunchConfiguration(_Named):
-    """Removes a launch configuration, if it is there."""
 
     def execute(self, context: LaunchContext) -> None:
         context.launch_configurations.pop(perform_substitutions(context, self.name), None)
 
 
 class PushLaunchConfigurations(Action):
-    """Saves the launch configurations."""
 
     def execute(self, context: LaunchContext) -> None:
         context._push_launch_configurations()
 
 
 class PopLaunchConfigurations(Action):
-    """Restores the launch configurations that were saved last."""
 
     def execute(self, context: LaunchContext) -> None:
         context._pop_launch_configurations()
@@ -208,7 +158,7 @@ class ResetLaunchConfigurations(Action):
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs.update(parse_keeps(entity, parser))
+        kwargs['launch_configurations'] = parse_pairs(entity, parser, 'keep')
         return cls, kwargs
 
     def execute(self, context: LaunchContext) -> None:
@@ -231,14 +181,16 @@ class DeclareLaunchArgument(Action):
     :raises RuntimeError: for no choices, or a default that isn't one of them.
     """
 
+    _texts = {'default_value': 'default?'}
+
     def __init__(
         self, name: str, *, default_value: Optional[SomeSubstitutionsType] = None,
         description: Optional[str] = None, choices: Optional[List[str]] = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
-        self.__name = name
+        self.name = name
         self.__logger = launch.logging.get_logger(__name__)
-        self.__default_value = None if default_value is None else (
+        self.default_value = None if default_value is None else (
             normalize_to_list_of_substitutions(default_value))
         if choices is not None:
             if not choices:
@@ -251,17 +203,14 @@ class DeclareLaunchArgument(Action):
         elif choices is not None:
             dot = '' if description.endswith('.') else '.'
             description += f'{dot} Valid choices are: {choices}'
-        self.__description = description
-        self.__choices = choices
+        self.description = description
+        self.choices = choices
         self._conditionally_included = False
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['name'] = parser.escape_characters(entity.get_attr('name'))
-        default = entity.get_attr('default', optional=True)
-        if default is not None:
-            kwargs['default_value'] = parser.parse_substitution(default)
         description = entity.get_attr('description', optional=True)
         if description is not None:
             kwargs['description'] = parser.escape_characters(description)
@@ -270,26 +219,6 @@ class DeclareLaunchArgument(Action):
             kwargs['choices'] = [
                 parser.escape_characters(choice.get_attr('value')) for choice in choices]
         return cls, kwargs
-
-    @property
-    def name(self) -> str:
-        """The argument's name."""
-        return self.__name
-
-    @property
-    def default_value(self) -> Optional[List[Substitution]]:
-        """The default, if any."""
-        return self.__default_value
-
-    @property
-    def description(self) -> str:
-        """What it is for, in words."""
-        return self.__description
-
-    @property
-    def choices(self) -> Optional[List[str]]:
-        """The values that are allowed, if not all are."""
-        return self.__choices
 
     def __refuse(self, text: str) -> None:
         self.__logger.error(text)

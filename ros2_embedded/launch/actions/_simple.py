@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions that set something, say something, or call something."""
+"""Actions that say something, call something, or handle events."""
 from __future__ import annotations
 
 import asyncio
 import collections.abc
 import logging
-from typing import Any, Awaitable, Callable, Dict, Iterable, List, Optional, Tuple, TYPE_CHECKING
+from typing import Any, Awaitable, Callable, Dict, Iterable, List, Optional, Tuple
 
 import launch.logging
 
-from ..action import Action, ParsedAction
-from ..event import Event
-from ..event_handler import BaseEventHandler
+from .._base import (
+    Action,
+    BaseEventHandler,
+    Entities,
+    Event,
+    LaunchDescriptionEntity,
+    SomeSubstitutionsType,
+)
 from ..event_handlers import OnShutdown
 from ..events import Shutdown as ShutdownEvent
 from ..events.process import ProcessExited
 from ..frontend.expose import expose_action
 from ..launch_context import LaunchContext
-from ..launch_description_entity import LaunchDescriptionEntity
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
 from ..utilities import (
     ensure_argument_type,
     is_a_subclass,
@@ -28,47 +30,31 @@ from ..utilities import (
     perform_substitutions,
 )
 
-if TYPE_CHECKING:
-    from ..frontend import Entity, Parser
-
 _logger = logging.getLogger('launch')
 
 
 class EmitEvent(Action):
-    """Emits an event."""
 
     def __init__(self, *, event: Event, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         if not is_a_subclass(event, Event):
             raise RuntimeError(f"EmitEvent() expected an event instance, got '{event}'.")
-        self.__event = event
+        self.event = event
 
-    @property
-    def event(self) -> Event:
-        """The event."""
-        return self.__event
-
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
-        context.emit_event_sync(self.__event)
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
+        context.emit_event_sync(self.event)
         return None
 
 
 @expose_action('shutdown')
 class Shutdown(EmitEvent):
-    """Shuts the launch down."""
+
+    _texts = {'reason': 'reason?'}
 
     def __init__(self, *, reason: Any = 'reason not given', **kwargs: Any) -> None:
         super().__init__(event=ShutdownEvent(reason=reason), **kwargs)
 
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser)
-        reason = entity.get_attr('reason', optional=True)
-        if reason:
-            kwargs['reason'] = parser.parse_substitution(reason)
-        return cls, kwargs
-
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
         event = context.get_locals_as_dict().get('event')
         if isinstance(event, ProcessExited):
             _logger.info(
@@ -78,64 +64,42 @@ class Shutdown(EmitEvent):
 
 @expose_action('log')
 class LogInfo(Action):
-    """Logs a text."""
+
+    _texts = {'msg': 'message'}
 
     def __init__(self, *, msg: SomeSubstitutionsType, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__msg = normalize_to_list_of_substitutions(msg)
+        self.msg = normalize_to_list_of_substitutions(msg)
         self.__logger = launch.logging.get_logger('launch.user')
-
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser)
-        kwargs['msg'] = parser.parse_substitution(entity.get_attr('message'))
-        return cls, kwargs
-
-    @property
-    def msg(self) -> List[Substitution]:
-        """The text."""
-        return self.__msg
 
     def execute(self, context: LaunchContext) -> None:
         self.__logger.info(perform_substitutions(context, self.msg))
 
 
 class RegisterEventHandler(Action):
-    """Adds an event handler."""
 
     def __init__(self, event_handler: BaseEventHandler, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__event_handler = event_handler
-
-    @property
-    def event_handler(self) -> BaseEventHandler:
-        """The handler."""
-        return self.__event_handler
+        self.event_handler = event_handler
 
     def execute(self, context: LaunchContext) -> None:
-        context.register_event_handler(self.__event_handler)
+        context.register_event_handler(self.event_handler)
 
     def describe_conditional_sub_entities(
         self
     ) -> List[Tuple[str, Iterable[LaunchDescriptionEntity]]]:
-        text, entities = self.__event_handler.describe()
+        text, entities = self.event_handler.describe()
         return [(text, normalize_to_list_of_entities(entities))] if entities else []
 
 
 class UnregisterEventHandler(Action):
-    """Removes an event handler."""
 
     def __init__(self, event_handler: BaseEventHandler, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__event_handler = event_handler
-
-    @property
-    def event_handler(self) -> BaseEventHandler:
-        """The handler."""
-        return self.__event_handler
+        self.event_handler = event_handler
 
     def execute(self, context: LaunchContext) -> None:
-        context.unregister_event_handler(self.__event_handler)
+        context.unregister_event_handler(self.event_handler)
 
 
 class OpaqueFunction(Action):
@@ -160,9 +124,8 @@ class OpaqueFunction(Action):
         self.__args = args or ()
         self.__kwargs = kwargs or {}
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
-        entities: Optional[List[LaunchDescriptionEntity]] = self.__function(
-            context, *self.__args, **self.__kwargs)
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
+        entities: Optional[Entities] = self.__function(context, *self.__args, **self.__kwargs)
         return entities
 
 
@@ -201,8 +164,7 @@ class OpaqueCoroutine(Action):
 
     def execute(self, context: LaunchContext) -> None:
         args = self.__args if self.__ignore_context else (context, *self.__args)
-        self.__future = context.asyncio_loop.create_task(
-            self.__coroutine(*args, **self.__kwargs))
+        self.__future = context.asyncio_loop.create_task(self.__coroutine(*args, **self.__kwargs))
         context.register_event_handler(OnShutdown(on_shutdown=self.__on_shutdown))
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:

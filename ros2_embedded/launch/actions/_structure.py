@@ -5,21 +5,25 @@ from __future__ import annotations
 import asyncio
 import collections.abc
 import os
-from typing import Any, cast, Dict, Iterable, List, Optional, Sequence, Tuple, TYPE_CHECKING, Union
+from typing import Any, cast, Dict, Iterable, List, Optional, Tuple, TYPE_CHECKING, Union
 import warnings
 
 import launch.logging
 
-from ..action import Action, ParsedAction
-from ..event_handler import EventHandler
+from .._base import (
+    Action,
+    Entities,
+    EventHandler,
+    LaunchDescriptionEntity,
+    ParsedAction,
+    SomeEntitiesType,
+    SomeSubstitutionsType,
+    SomeSubstitutionsType_types_tuple,
+)
 from ..events import Shutdown, TimerEvent
-from ..frontend.entity import Entity
 from ..frontend.expose import expose_action
 from ..launch_context import LaunchContext
-from ..launch_description_entity import LaunchDescriptionEntity
-from ..launch_description_source import LaunchDescriptionSource
-from ..some_entities_type import SomeEntitiesType
-from ..some_substitutions_type import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
+from ..launch_description import LaunchDescriptionSource
 from ..utilities import (
     ensure_argument_type,
     is_a_subclass,
@@ -28,7 +32,7 @@ from ..utilities import (
 )
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 from ._environment import (
-    parse_keeps,
+    parse_pairs,
     PopEnvironment,
     PopLaunchConfigurations,
     PushEnvironment,
@@ -41,10 +45,9 @@ from ._environment import (
 from ._simple import OpaqueFunction
 
 if TYPE_CHECKING:
-    from ..frontend import Parser
+    from ..frontend import Entity, Parser
 
-Entities = List[LaunchDescriptionEntity]
-Arguments = Sequence[Tuple[SomeSubstitutionsType, SomeSubstitutionsType]]
+SomeArguments = Iterable[Tuple[SomeSubstitutionsType, SomeSubstitutionsType]]
 
 
 @expose_action('group')
@@ -76,7 +79,7 @@ class GroupAction(Action):
             value = entity.get_attr(name, data_type=bool, optional=True)
             if value is not None:
                 kwargs[name] = value
-        kwargs.update(parse_keeps(entity, parser))
+        kwargs['launch_configurations'] = parse_pairs(entity, parser, 'keep')
         kwargs['actions'] = [
             parser.parse_action(child) for child in entity.children
             if child.type_name != 'keep']
@@ -88,15 +91,14 @@ class GroupAction(Action):
             sets: Entities = [
                 SetLaunchConfiguration(name, value)
                 for name, value in self.__launch_configurations.items()]
+            if self.__scoped and not self.__forwarding:
+                sets = [ResetEnvironment(),
+                        ResetLaunchConfigurations(self.__launch_configurations)]
+            entities = [*sets, *entities]
             if self.__scoped:
-                if not self.__forwarding:
-                    sets = [ResetEnvironment(),
-                            ResetLaunchConfigurations(self.__launch_configurations)]
-                self.__actions_to_return = [
-                    PushLaunchConfigurations(), PushEnvironment(), *sets, *entities,
-                    PopEnvironment(), PopLaunchConfigurations()]
-            else:
-                self.__actions_to_return = [*sets, *entities]
+                entities = [PushLaunchConfigurations(), PushEnvironment(), *entities,
+                            PopEnvironment(), PopLaunchConfigurations()]
+            self.__actions_to_return = entities
         return self.__actions_to_return
 
     def execute(self, context: LaunchContext) -> Optional[Entities]:
@@ -105,68 +107,45 @@ class GroupAction(Action):
 
 @expose_action('include')
 class IncludeLaunchDescription(Action):
-    """
-    Visits a launch description from elsewhere.
+    """Sets launch configurations, then visits a launch description from elsewhere."""
 
-    :param launch_description_source: a source, or the path of a launch file.
-    :param launch_arguments: launch configurations to set before.
-    """
+    _texts = {'launch_description_source': 'file'}
 
     def __init__(
         self,
         launch_description_source: Union[LaunchDescriptionSource, SomeSubstitutionsType], *,
-        launch_arguments: Optional[
-            Iterable[Tuple[SomeSubstitutionsType, SomeSubstitutionsType]]] = None,
-        **kwargs: Any
+        launch_arguments: Optional[SomeArguments] = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(launch_description_source, LaunchDescriptionSource):
             from ..launch_description_sources import AnyLaunchDescriptionSource
             launch_description_source = AnyLaunchDescriptionSource(launch_description_source)
-        self.__launch_description_source = launch_description_source
-        self.__launch_arguments: Arguments = tuple(launch_arguments or ())
+        self.launch_description_source = launch_description_source
+        self.launch_arguments = tuple(launch_arguments or ())
         self.__logger = launch.logging.get_logger(__name__)
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs['launch_description_source'] = parser.parse_substitution(entity.get_attr('file'))
-        args = entity.get_attr('arg', data_type=List[Entity], optional=True)
-        if args is not None:
-            kwargs['launch_arguments'] = [
-                (parser.parse_substitution(arg.get_attr('name')),
-                 parser.parse_substitution(arg.get_attr('value'))) for arg in args]
-            for arg in args:
-                arg.assert_entity_completely_parsed()
+        kwargs['launch_arguments'] = (parse_pairs(entity, parser, 'arg') or {}).items()
         return cls, kwargs
 
-    @property
-    def launch_description_source(self) -> LaunchDescriptionSource:
-        """Where the launch description comes from."""
-        return self.__launch_description_source
-
-    @property
-    def launch_arguments(self) -> Arguments:
-        """The launch configurations to set before."""
-        return self.__launch_arguments
-
     def _get_launch_file(self) -> str:
-        return os.path.abspath(self.__launch_description_source.location)
+        return os.path.abspath(self.launch_description_source.location)
 
     def _get_launch_file_directory(self) -> str:
         path = self._get_launch_file()
         if os.path.exists(path):
             return os.path.dirname(path)
-        return self.__launch_description_source.location
+        return self.launch_description_source.location
 
     def get_sub_entities(self) -> Entities:
-        source = self.__launch_description_source
-        description = source.try_get_launch_description_without_context()
+        description = self.launch_description_source.try_get_launch_description_without_context()
         return [] if description is None else [description]
 
     def __argument_names(self, context: LaunchContext) -> List[str]:
         return [perform_substitutions(context, normalize_to_list_of_substitutions(name))
-                for name, _ in self.__launch_arguments]
+                for name, _ in self.launch_arguments]
 
     def _try_get_arguments_names_without_context(self) -> Optional[List[str]]:
         try:
@@ -174,11 +153,11 @@ class IncludeLaunchDescription(Action):
         except Exception as exc:  # noqa: BLE001 - A substitution may raise anything.
             self.__logger.debug(
                 'Failed to get launch arguments names for launch description '
-                f"'{self.__launch_description_source.location}', with exception: {exc}")
+                f"'{self.launch_description_source.location}', with exception: {exc}")
         return None
 
     def execute(self, context: LaunchContext) -> Optional[Entities]:
-        description = self.__launch_description_source.get_launch_description(context)
+        description = self.launch_description_source.get_launch_description(context)
         context.extend_locals({
             'current_launch_file_path': self._get_launch_file(),
             'current_launch_file_directory': self._get_launch_file_directory()})
@@ -201,12 +180,7 @@ class IncludeLaunchDescription(Action):
 
 @expose_action('timer')
 class TimerAction(Action):
-    """
-    Visits actions when a period has passed.
-
-    :param period: in seconds.
-    :param cancel_on_shutdown: whether a shutdown of the launch cancels the timer.
-    """
+    """Visits actions when a period, in seconds, has passed."""
 
     def __init__(
         self, *, period: Union[float, SomeSubstitutionsType],
@@ -222,8 +196,8 @@ class TimerAction(Action):
             warnings.warn(
                 "The parameter 'period' must be a float or substitution,"
                 'passing a string literal was deprecated', stacklevel=2)
-        self.__period = normalize_typed_substitution(period, float)
-        self.__actions = actions
+        self.period = normalize_typed_substitution(period, float)
+        self.actions = actions
         self.__context_locals: Dict[str, Any] = {}
         self._completed_future: Optional[asyncio.Future[Any]] = None
         self.__canceled = False
@@ -243,29 +217,19 @@ class TimerAction(Action):
             kwargs['cancel_on_shutdown'] = parser.parse_if_substitutions(cancel)
         return cls, kwargs
 
-    @property
-    def period(self) -> Any:
-        """The period, in seconds."""
-        return self.__period
-
-    @property
-    def actions(self) -> Iterable[LaunchDescriptionEntity]:
-        """What is visited then."""
-        return self.__actions
-
     def describe(self) -> str:
-        return f'TimerAction(period={self.__period}, actions=<actions>)'
+        return f'{type(self).__name__}(period={self.period}, actions=<actions>)'
 
     def describe_conditional_sub_entities(
         self
     ) -> List[Tuple[str, Iterable[LaunchDescriptionEntity]]]:
-        return [(f'{self.__period} seconds pass without being canceled', self.__actions)]
+        return [(f'{self.period} seconds pass without being canceled', self.actions)]
 
     async def _wait_to_fire_event(self, context: LaunchContext) -> None:
         assert self._canceled_future is not None and self._completed_future is not None
         await asyncio.wait(
             [self._canceled_future],
-            timeout=perform_typed_substitution(context, self.__period, float))
+            timeout=perform_typed_substitution(context, self.period, float))
         if not self._canceled_future.done():
             await context.emit_event(TimerEvent(timer_action=self))
         self._completed_future.set_result(None)
@@ -273,7 +237,7 @@ class TimerAction(Action):
     def handle(self, context: LaunchContext) -> Optional[SomeEntitiesType]:
         """Return what is to be visited, in the locals of when the timer was started."""
         context.extend_locals(self.__context_locals)
-        return self.__actions
+        return self.actions
 
     def cancel(self) -> None:
         """Cancel the timer, started or not."""

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import codecs
+import functools
 import logging
 import os
 import signal
 import traceback
-from typing import Any, Callable, cast, Dict, Iterator, List, Optional, Union
+from typing import Any, Callable, cast, Dict, Iterator, List, Optional, Tuple, Union
 
 import launch.logging
 
-from ..action import Action
+from .._base import (
+    Action,
+    BaseEventHandler,
+    Entities,
+    Event,
+    EventHandler,
+    SomeEntitiesType,
+    SomeSubstitutionsType,
+    Substitution,
+)
 from ..conditions import evaluate_condition_expression
 from ..descriptions import Executable
-from ..event import Event
-from ..event_handler import BaseEventHandler, EventHandler
 from ..event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown
 from ..events import matches_action, Shutdown
 from ..events.process import (
@@ -29,17 +37,13 @@ from ..events.process import (
     SignalProcess,
 )
 from ..launch_context import LaunchContext
-from ..launch_description_entity import LaunchDescriptionEntity
-from ..some_entities_type import SomeEntitiesType
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
 from ..substitutions import LaunchConfiguration, PythonExpression
 from ..utilities import is_a_subclass, normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 from ._simple import EmitEvent, OpaqueFunction
 from ._structure import TimerAction
-from ._subprocess import Protocol, start_process
 
+OnData = Callable[[bytes], None]
 OnExit = Union[
     SomeEntitiesType, Callable[[ProcessExited, LaunchContext], Optional[SomeEntitiesType]], None]
 
@@ -86,6 +90,70 @@ class _Output:
             self.__seen = 0
 
 
+class Protocol(asyncio.SubprocessProtocol):
+    """Hands on what a process writes, by file descriptor, and its id as soon as there is one."""
+
+    def __init__(self, on_start: Callable[[int], None], on_data: Dict[int, OnData]) -> None:
+        self.complete: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self.__on_start = on_start
+        self.on_data = on_data
+        self.__transport: Any = None
+
+    def connection_made(self, transport: Any) -> None:
+        self.__transport = transport
+        self.__on_start(transport.get_pid())
+
+    def pipe_data_received(self, fd: int, data: bytes) -> None:
+        self.on_data[fd](data)
+
+    def process_exited(self) -> None:
+        if not self.complete.done():
+            self.complete.set_result(self.__transport.get_returncode())
+
+
+class _TerminalReader(asyncio.Protocol):
+
+    def __init__(self, on_data: OnData) -> None:
+        self.__on_data = on_data
+
+    def data_received(self, data: bytes) -> None:
+        self.__on_data(data)
+
+
+async def _start_process(
+    make_protocol: Callable[[], Protocol], *, cmd: List[str], shell: bool, emulate_tty: bool,
+    **kwargs: Any
+) -> Tuple[asyncio.SubprocessTransport, Protocol]:
+    """
+    Start a process, in this process group, with a pipe as standard input.
+
+    :raises OSError: if it can't be started.
+    """
+    loop = asyncio.get_running_loop()
+    # What isn't meant to be inherited is marked so; closing one by one would only take time.
+    kwargs['close_fds'] = False
+    terminals = [os.openpty(), os.openpty()] if emulate_tty else []
+    try:
+        for name, (_, slave) in zip(('stdout', 'stderr'), terminals):
+            kwargs[name] = slave
+        if shell:
+            transport, protocol = await loop.subprocess_shell(
+                make_protocol, ' '.join(cmd), **kwargs)
+        else:
+            transport, protocol = await loop.subprocess_exec(make_protocol, *cmd, **kwargs)
+    except BaseException:
+        for master, _ in terminals:
+            os.close(master)
+        raise
+    finally:
+        for _, slave in terminals:
+            os.close(slave)
+    for fd, (master, _) in enumerate(terminals, 1):
+        await loop.connect_read_pipe(
+            functools.partial(_TerminalReader, protocol.on_data[fd]), os.fdopen(master, 'rb', 0))
+    return transport, protocol
+
+
 class ExecuteLocal(Action):
     """
     Executes something, and emits events for its start, output and end.
@@ -114,13 +182,13 @@ class ExecuteLocal(Action):
         respawn_delay: Optional[float] = None, respawn_max_retries: int = -1, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
-        self.__process_description = process_description
-        self.__shell = shell
-        self.__sigterm_timeout = normalize_to_list_of_substitutions(sigterm_timeout)
-        self.__sigkill_timeout = normalize_to_list_of_substitutions(sigkill_timeout)
-        self.__emulate_tty = emulate_tty
+        self.process_description = process_description
+        self.shell = shell
+        self.sigterm_timeout = normalize_to_list_of_substitutions(sigterm_timeout)
+        self.sigkill_timeout = normalize_to_list_of_substitutions(sigkill_timeout)
+        self.emulate_tty = emulate_tty
         output = os.environ.get('OVERRIDE_LAUNCH_PROCESS_OUTPUT', output)
-        self.__output: Union[Dict[str, Any], List[Substitution]] = (
+        self.output: Union[Dict[str, Any], List[Substitution]] = (
             output if isinstance(output, dict) else normalize_to_list_of_substitutions(output))
         self.__output_format = output_format
         self.__log_cmd = log_cmd
@@ -142,38 +210,7 @@ class ExecuteLocal(Action):
         self.__executed = False
 
     @property
-    def process_description(self) -> Executable:
-        """What is executed."""
-        return self.__process_description
-
-    @property
-    def shell(self) -> bool:
-        """Whether a shell executes it."""
-        return self.__shell
-
-    @property
-    def emulate_tty(self) -> bool:
-        """Whether it thinks that it writes to a terminal."""
-        return self.__emulate_tty
-
-    @property
-    def sigkill_timeout(self) -> List[Substitution]:
-        """Seconds from SIGTERM to SIGKILL when shut down."""
-        return self.__sigkill_timeout
-
-    @property
-    def sigterm_timeout(self) -> List[Substitution]:
-        """Seconds from SIGINT to SIGTERM when shut down."""
-        return self.__sigterm_timeout
-
-    @property
-    def output(self) -> Union[Dict[str, Any], List[Substitution]]:
-        """Where its output goes."""
-        return self.__output
-
-    @property
     def process_details(self) -> Optional[Dict[str, Any]]:
-        """What its events carry: action, name, cmd, cwd, env, and pid once it is there."""
         return self.__process_event_args
 
     @property
@@ -184,34 +221,24 @@ class ExecuteLocal(Action):
         return self._subprocess_transport.get_returncode()
 
     def get_stdout(self) -> str:
-        """
-        Return all of its standard output so far.
-
-        :raises RuntimeError: without ``cached_output``.
-        """
         return self.__cached('stdout', self.__stdout_buffer)
 
     def get_stderr(self) -> str:
-        """
-        Return all of its standard error so far.
-
-        :raises RuntimeError: without ``cached_output``.
-        """
         return self.__cached('stderr', self.__stderr_buffer)
 
     def __cached(self, name: str, output: _Output) -> str:
         if not self.__cached_output:
             raise RuntimeError(
                 f'cached output must be true to be able to get {name}, '
-                f"proc '{self.__process_description.name}'")
+                f"proc '{self.process_description.name}'")
         return output.text
 
-    def get_sub_entities(self) -> List[LaunchDescriptionEntity]:
+    def get_sub_entities(self) -> Entities:
         return self.__on_exit if isinstance(self.__on_exit, list) else []
 
     def _shutdown_process(
         self, context: LaunchContext, *, send_sigint: bool
-    ) -> Optional[List[LaunchDescriptionEntity]]:
+    ) -> Optional[Entities]:
         if self.__shutdown_future is None or self.__shutdown_future.done():
             return None
         if self.__completed_future is None or self.__completed_future.done():
@@ -231,7 +258,7 @@ class ExecuteLocal(Action):
                 signal_number=signal.SIGINT, process_matcher=matches_action(self))))
         return actions
 
-    def __make_shutdown_timers(self) -> List[LaunchDescriptionEntity]:
+    def __make_shutdown_timers(self) -> Entities:
         def escalate(
             period: List[Substitution], received: str, number: Union[str, signal.Signals]
         ) -> TimerAction:
@@ -248,21 +275,21 @@ class ExecuteLocal(Action):
                 actions=[OpaqueFunction(function=report), EmitEvent(event=event)])
 
         both = PythonExpression((
-            'float(', *self.__sigterm_timeout, ') + float(', *self.__sigkill_timeout, ')'))
-        self.__sigterm_timer = escalate(self.__sigterm_timeout, 'SIGINT', signal.SIGTERM)
+            'float(', *self.sigterm_timeout, ') + float(', *self.sigkill_timeout, ')'))
+        self.__sigterm_timer = escalate(self.sigterm_timeout, 'SIGINT', signal.SIGTERM)
         self.__sigkill_timer = escalate([both], 'SIGTERM', 'SIGKILL')
         return [self.__sigterm_timer, self.__sigkill_timer]
 
     def __on_shutdown(
         self, event: Event, context: LaunchContext
-    ) -> Optional[List[LaunchDescriptionEntity]]:
+    ) -> Optional[Entities]:
         # A terminal sends SIGINT to the process too.
         interrupted = cast(Shutdown, event).due_to_sigint and not context.noninteractive
         return self._shutdown_process(context, send_sigint=not interrupted)
 
     def __on_shutdown_process_event(
         self, context: LaunchContext
-    ) -> Optional[List[LaunchDescriptionEntity]]:
+    ) -> Optional[Entities]:
         if not cast(ShutdownProcess, context.locals.event).process_matcher(self):
             return None
         return self._shutdown_process(context, send_sigint=True)
@@ -311,7 +338,7 @@ class ExecuteLocal(Action):
         if self.__log_cmd:
             self.__logger.info(
                 f"process details: cmd='{words}', cwd='{cwd}', custom_env?={env is not None}")
-        emulate_tty = self.__emulate_tty
+        emulate_tty = self.emulate_tty
         if 'emulate_tty' in context.launch_configurations:
             emulate_tty = evaluate_condition_expression(
                 context, normalize_to_list_of_substitutions(
@@ -321,16 +348,12 @@ class ExecuteLocal(Action):
             self.__logger.info(f'process started with pid [{pid}]')
             details['pid'] = pid
 
-        def make_protocol() -> Protocol:
-            return Protocol(
-                on_start,
-                lambda data: context.emit_event_sync(ProcessStdout(text=data, **details)),
-                lambda data: context.emit_event_sync(ProcessStderr(text=data, **details)))
-
         try:
-            transport, protocol = await start_process(
-                make_protocol, cmd=cmd, cwd=cwd, env=env, shell=self.__shell,
-                emulate_tty=emulate_tty)
+            transport, protocol = await _start_process(
+                lambda: Protocol(on_start, {
+                    1: lambda data: context.emit_event_sync(ProcessStdout(text=data, **details)),
+                    2: lambda data: context.emit_event_sync(ProcessStderr(text=data, **details)),
+                }), cmd=cmd, cwd=cwd, env=env, shell=self.shell, emulate_tty=emulate_tty)
         except Exception:  # noqa: BLE001 - The launch goes on without this process.
             self.__logger.error(
                 f'exception occurred while executing process:\n{traceback.format_exc()}')
@@ -373,8 +396,7 @@ class ExecuteLocal(Action):
             self.__completed_future.set_result(None)
 
     def prepare(self, context: LaunchContext) -> None:
-        """Work out what exactly will be executed."""
-        description = self.__process_description
+        description = self.process_description
         description.prepare(context, self)
         self.__process_event_args = {
             'action': self,
@@ -385,14 +407,14 @@ class ExecuteLocal(Action):
         }
         self.__respawn = perform_typed_substitution(context, self.__respawn, bool)
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> Optional[Entities]:
         """
         Start the process, in the background.
 
         :raises RuntimeError: if the action was executed before.
         """
         self.prepare(context)
-        name = self.__process_description.final_name
+        name = self.process_description.final_name
         assert name is not None
         if self.__executed:
             raise RuntimeError(
@@ -427,8 +449,8 @@ class ExecuteLocal(Action):
             self.__completed_future = context.asyncio_loop.create_future()
             self.__shutdown_future = context.asyncio_loop.create_future()
             self.__logger = launch.logging.get_logger(name)
-            output = self.__output if isinstance(self.__output, dict) else (
-                perform_substitutions(context, self.__output))
+            output = self.output if isinstance(self.output, dict) else (
+                perform_substitutions(context, self.output))
             self.__stdout_logger, self.__stderr_logger = (
                 launch.logging.get_output_loggers(name, output))
             context.asyncio_loop.create_task(self.__execute_process(context))

@@ -5,13 +5,12 @@ from __future__ import annotations
 import shlex
 from typing import Any, Dict, Iterable, List, Optional, TYPE_CHECKING
 
-from ..action import ParsedAction
+from .._base import ParsedAction, SomeSubstitutionsType, Substitution
 from ..descriptions import Executable
-from ..frontend.entity import Entity
 from ..frontend.expose import expose_action
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
+from ..frontend.type_utils import Entity
 from ..substitutions import TextSubstitution
+from ._environment import parse_pairs
 from ._simple import Shutdown
 from .execute_local import ExecuteLocal
 
@@ -72,81 +71,62 @@ class ExecuteProcess(ExecuteLocal):
         cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
     ) -> ParsedAction:
         """
-        Return this class and the keyword arguments that a frontend's entity gives.
+        Return the class and the keyword arguments that a frontend's entity gives.
 
         :param ignore: arguments that a derived class reads itself.
         """
         _, kwargs = super().parse(entity, parser)
         ignored = ignore or ()
-
-        def read(name: str, attribute: str, data_type: Any = str) -> Any:
-            if name in ignored:
-                return None
-            return entity.get_attr(attribute, data_type=data_type, optional=True)
-
         if 'cmd' not in ignored:
             kwargs['cmd'] = cls._parse_cmdline(entity.get_attr('cmd'), parser)
-        for name, attribute in (
-            ('cwd', 'cwd'), ('name', 'name'), ('prefix', 'launch-prefix'),
-            ('output', 'output'), ('respawn', 'respawn')
+        for name, kind in (
+            ('cwd', None), ('name', None), ('prefix', None), ('output', None), ('respawn', None),
+            ('on_exit', str), ('respawn_delay', float), ('sigkill_timeout', float),
+            ('sigterm_timeout', float), ('respawn_max_retries', int), ('shell', bool),
+            ('emulate_tty', bool)
         ):
-            text = read(name, attribute)
-            if text is not None:
-                kwargs[name] = parser.parse_substitution(text)
-        on_exit = read('on_exit', 'on_exit')
-        if on_exit is not None:
-            if on_exit != 'shutdown':
-                raise ValueError(
-                    'Attribute on_exit of Entity node expected to be shutdown but got '
-                    f'`{on_exit}`Other on_exit actions not yet supported')
-            kwargs['on_exit'] = [Shutdown()]
-        for name in ('respawn_delay', 'sigkill_timeout', 'sigterm_timeout'):
-            seconds = read(name, name, float)
-            if seconds is not None:
-                if seconds < 0.0:
+            value = None if name in ignored else entity.get_attr(
+                'launch-prefix' if name == 'prefix' else name, data_type=kind or str,
+                optional=True)
+            if value is None:
+                continue
+            if kind is None:
+                value = parser.parse_substitution(value)
+            elif name == 'on_exit':
+                if value != 'shutdown':
+                    raise ValueError(
+                        'Attribute on_exit of Entity node expected to be shutdown but got '
+                        f'`{value}`Other on_exit actions not yet supported')
+                value = [Shutdown()]
+            elif kind is float:
+                if value < 0.0:
                     raise ValueError(
                         f'Attribute {name} of Entity node expected to be a non-negative value '
-                        f'but got `{seconds}`')
-                kwargs[name] = seconds if name == 'respawn_delay' else str(seconds)
-        for name, kind in (
-            ('respawn_max_retries', int), ('shell', bool), ('emulate_tty', bool)
-        ):
-            value = read(name, name, kind)
-            if value is not None:
-                kwargs[name] = value
-        variables = read('additional_env', 'env', List[Entity])
-        if variables is not None:
-            kwargs['additional_env'] = {
-                tuple(parser.parse_substitution(variable.get_attr('name'))):
-                parser.parse_substitution(variable.get_attr('value'))
-                for variable in variables}
-            for variable in variables:
-                variable.assert_entity_completely_parsed()
+                        f'but got `{value}`')
+                value = value if name == 'respawn_delay' else str(value)
+            kwargs[name] = value
+        if 'additional_env' not in ignored:
+            kwargs['additional_env'] = parse_pairs(entity, parser, 'env')
         return cls, kwargs
 
     @property
     def name(self) -> Any:
-        """The unique name once prepared, before that as it was given."""
         return self.__final('name')
 
     @property
     def cmd(self) -> Any:
-        """The command once prepared, before that as substitutions."""
         return self.__final('cmd')
 
     @property
     def cwd(self) -> Any:
-        """The working directory once prepared, before that as it was given."""
         return self.__final('cwd')
 
     @property
     def env(self) -> Any:
-        """The environment once prepared, before that as it was given."""
         return self.__final('env')
 
     @property
     def additional_env(self) -> Any:
-        """The additional environment as it was given."""
         return self.process_description.additional_env
 
     def __final(self, name: str) -> Any:

@@ -6,27 +6,19 @@ from typing import Iterable, List, Optional
 import warnings
 
 from .._aliases import alias_submodules
-from ..condition import Condition
+from .._base import Condition, SomeSubstitutionsType, Substitution
 from ..launch_context import LaunchContext
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
 
 __all__ = [
-    'evaluate_condition_expression',
-    'IfCondition',
-    'InvalidConditionExpressionError',
-    'LaunchConfigurationEquals',
-    'LaunchConfigurationNotEquals',
-    'UnlessCondition',
-]
+    'evaluate_condition_expression', 'IfCondition', 'InvalidConditionExpressionError',
+    'LaunchConfigurationEquals', 'LaunchConfigurationNotEquals', 'UnlessCondition']
 
 VALID_TRUE_EXPRESSIONS = ['true', '1']
 VALID_FALSE_EXPRESSIONS = ['false', '0']
 
 
 class InvalidConditionExpressionError(ValueError):
-    """An expression that is neither true nor false."""
 
     def __init__(
         self, expression: str, unexpanded_expression: Iterable[Substitution],
@@ -38,9 +30,7 @@ class InvalidConditionExpressionError(ValueError):
             f"but got '{expression}', expanded from '{origin}'")
 
 
-def evaluate_condition_expression(
-    context: LaunchContext, expression: List[Substitution]
-) -> bool:
+def evaluate_condition_expression(context: LaunchContext, expression: List[Substitution]) -> bool:
     """
     Return what the expression says: 'true' or '1', 'false' or '0', in upper or lower case.
 
@@ -56,7 +46,6 @@ def evaluate_condition_expression(
 
 
 class IfCondition(Condition):
-    """Holds if the expression is true."""
 
     def __init__(self, predicate_expression: SomeSubstitutionsType) -> None:
         self.__predicate_expression = normalize_to_list_of_substitutions(predicate_expression)
@@ -67,7 +56,6 @@ class IfCondition(Condition):
 
 
 class UnlessCondition(IfCondition):
-    """Holds if the expression is false."""
 
     def _predicate_func(self, context: LaunchContext) -> bool:
         return not super()._predicate_func(context)
@@ -82,9 +70,7 @@ class LaunchConfigurationEquals(Condition):
         warnings.warn(
             "The 'LaunchConfigurationEquals' and 'LaunchConfigurationNotEquals' Conditions are "
             " deprecated. Use the 'EqualsSubstitution' and 'NotEqualsSubstitution' substitutions "
-            'instead! E.g.:\n  IfCondition(\n  '
-            "\tEqualsSubstitution(LaunchConfiguration('some_launch_arg'), "
-            '"some_equality_check")\n  )', UserWarning, stacklevel=2)
+            'instead!', UserWarning, stacklevel=2)
         self.__name = launch_configuration_name
         self.__expected = None if expected_value is None else (
             normalize_to_list_of_substitutions(expected_value))
@@ -97,12 +83,10 @@ class LaunchConfigurationEquals(Condition):
 
 
 class LaunchConfigurationNotEquals(LaunchConfigurationEquals):
-    """Holds unless the launch configuration has that value."""
 
     def _predicate_func(self, context: LaunchContext) -> bool:
         return not super()._predicate_func(context)
 
 
-alias_submodules(__name__, __all__[1:], {
-    'evaluate_condition_expression_impl': (
-        'evaluate_condition_expression', 'VALID_TRUE_EXPRESSIONS', 'VALID_FALSE_EXPRESSIONS')})
+alias_submodules(
+    __name__, __all__, evaluate_condition_expression_impl=('evaluate_condition_expression',))

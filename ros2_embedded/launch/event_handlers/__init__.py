@@ -6,34 +6,31 @@ import collections.abc
 from typing import Any, Callable, cast, List, Optional, Tuple, Type, TYPE_CHECKING, Union
 
 from .._aliases import alias_submodules
-from ..event import Event
-from ..event_handler import BaseEventHandler, EventHandler
+from .._base import (
+    Action,
+    BaseEventHandler,
+    Entities,
+    Event,
+    EventHandler,
+    LaunchDescriptionEntity,
+    SomeEntitiesType,
+)
 from ..events import ExecutionComplete, IncludeLaunchDescription, Shutdown
 from ..events.process import ProcessExited, ProcessIO, ProcessStarted
-from ..launch_description_entity import LaunchDescriptionEntity
-from ..some_entities_type import SomeEntitiesType
 from ..utilities import is_a_subclass
 
 if TYPE_CHECKING:
-    from ..action import Action
     from ..actions import ExecuteLocal
     from ..launch_context import LaunchContext
 
 __all__ = [
-    'event_named',
-    'OnExecutionComplete',
-    'OnIncludeLaunchDescription',
-    'OnProcessExit',
-    'OnProcessIO',
-    'OnProcessStart',
-    'OnShutdown',
-]
+    'event_named', 'OnExecutionComplete', 'OnIncludeLaunchDescription', 'OnProcessExit',
+    'OnProcessIO', 'OnProcessStart', 'OnShutdown']
 
-SomeTarget = Optional[Union[Callable[[Any], bool], 'Action']]
+SomeTarget = Optional[Union[Callable[[Any], bool], Action]]
 
 
 def event_named(name: str) -> Callable[[Event], bool]:
-    """Return a matcher for events of that name."""
     return lambda event: event.name == name
 
 
@@ -58,9 +55,9 @@ class OnActionEventBase(BaseEventHandler):
             raise TypeError(
                 f"action_matcher must be an '{target_action_cls.__name__}' instance "
                 'or a callable')
-        self.__action_matcher = action_matcher
-        self.__event_name = target_event_cls.__name__
-        self.__action_name = target_action_cls.__name__
+        self.__matcher_description = f'event == {target_event_cls.__name__}'
+        if action_matcher is not None:
+            self.__matcher_description += f' and {target_action_cls.__name__}(event.action)'
 
         def matches(event: Event) -> bool:
             if not isinstance(event, target_event_cls):
@@ -71,7 +68,7 @@ class OnActionEventBase(BaseEventHandler):
             return action_matcher is None or action is action_matcher
 
         super().__init__(matcher=matches, **kwargs)
-        self.__entities: List[LaunchDescriptionEntity] = []
+        self.__entities: Entities = []
         self.__on_event: Optional[Callable[[Event, LaunchContext], Any]] = None
         if callable(on_event):
             self.__on_event = on_event
@@ -101,14 +98,10 @@ class OnActionEventBase(BaseEventHandler):
 
     @property
     def matcher_description(self) -> str:
-        text = f'event == {self.__event_name}'
-        if self.__action_matcher is not None:
-            text += f' and {self.__action_name}(event.action)'
-        return text
+        return self.__matcher_description
 
 
 class OnExecutionComplete(OnActionEventBase):
-    """Answers the completion of actions."""
 
     def __init__(
         self, *, target_action: SomeTarget = None,
@@ -117,14 +110,12 @@ class OnExecutionComplete(OnActionEventBase):
             Callable[[ExecutionComplete, LaunchContext], Optional[SomeEntitiesType]]],
         **kwargs: Any
     ) -> None:
-        from ..action import Action
         super().__init__(
             action_matcher=target_action, on_event=on_completion,
             target_event_cls=ExecutionComplete, target_action_cls=Action, **kwargs)
 
 
 class OnProcessExit(OnActionEventBase):
-    """Answers the end of processes."""
 
     def __init__(
         self, *,
@@ -144,7 +135,6 @@ OnOutput = Optional[Callable[[ProcessIO], Optional[SomeEntitiesType]]]
 
 
 class OnProcessIO(OnActionEventBase):
-    """Answers input and output of processes."""
 
     def __init__(
         self, *, target_action: SomeTarget = None, on_stdin: OnOutput = None,
@@ -153,13 +143,9 @@ class OnProcessIO(OnActionEventBase):
         from ..actions import ExecuteLocal
 
         def handle(event: ProcessIO, _: LaunchContext) -> Optional[SomeEntitiesType]:
-            for wanted, handler in (
-                (event.from_stdout, on_stdout), (event.from_stderr, on_stderr),
-                (event.from_stdin, on_stdin)
-            ):
-                if wanted and handler is not None:
-                    return handler(event)
-            return None
+            handler = (
+                on_stdout if event.from_stdout else on_stderr if event.from_stderr else on_stdin)
+            return None if handler is None else handler(event)
 
         super().__init__(
             action_matcher=target_action, on_event=handle,
@@ -167,7 +153,6 @@ class OnProcessIO(OnActionEventBase):
 
 
 class OnProcessStart(OnActionEventBase):
-    """Answers the start of processes."""
 
     def __init__(
         self, *, target_action: SomeTarget = None,
@@ -193,17 +178,8 @@ class OnIncludeLaunchDescription(EventHandler):
                 function=lambda context: [context.locals.event.launch_description]),
             **kwargs)
 
-    @property
-    def handler_description(self) -> str:
-        return 'returns the launch_description in the event'
-
-    @property
-    def matcher_description(self) -> str:
-        return 'event issubclass of launch.events.IncludeLaunchDescription'
-
 
 class OnShutdown(BaseEventHandler):
-    """Answers the launch's shutdown."""
 
     def __init__(
         self, *,
@@ -224,10 +200,5 @@ class OnShutdown(BaseEventHandler):
     def handler_description(self) -> str:
         return str(self.__on_shutdown)
 
-    @property
-    def matcher_description(self) -> str:
-        return 'event issubclass of launch.events.Shutdown'
 
-
-alias_submodules(__name__, __all__[1:], {
-    'on_action_event_base': ('OnActionEventBase',)})
+alias_submodules(__name__, __all__, on_action_event_base=('OnActionEventBase',))

@@ -2,25 +2,15 @@
 """Events of launch itself."""
 from __future__ import annotations
 
-from typing import Callable, TYPE_CHECKING
+from typing import Any, Callable
 
 from .._aliases import alias_submodules
-from ..event import Event
+from .._base import Action, Event
 from . import process
 
-if TYPE_CHECKING:
-    from ..action import Action
-    from ..actions import TimerAction
-    from ..launch_description import LaunchDescription
-
 __all__ = [
-    'matches_action',
-    'process',
-    'ExecutionComplete',
-    'IncludeLaunchDescription',
-    'Shutdown',
-    'TimerEvent',
-]
+    'matches_action', 'process', 'ExecutionComplete', 'IncludeLaunchDescription', 'Shutdown',
+    'TimerEvent']
 
 
 class ExecutionComplete(Event):
@@ -29,12 +19,7 @@ class ExecutionComplete(Event):
     name = 'launch.events.ExecutionComplete'
 
     def __init__(self, *, action: Action) -> None:
-        self.__action = action
-
-    @property
-    def action(self) -> Action:
-        """The action."""
-        return self.__action
+        self.action = action
 
 
 class IncludeLaunchDescription(Event):
@@ -42,35 +27,18 @@ class IncludeLaunchDescription(Event):
 
     name = 'launch.events.IncludeLaunchDescription'
 
-    def __init__(self, launch_description: LaunchDescription) -> None:
-        self.__launch_description = launch_description
-
-    @property
-    def launch_description(self) -> LaunchDescription:
-        """The launch description."""
-        return self.__launch_description
+    def __init__(self, launch_description: Any) -> None:
+        self.launch_description = launch_description
 
 
 class Shutdown(Event):
-    """The launch is to end."""
+    """The launch is to end; a SIGINT, as a terminal sends it, reaches the processes too."""
 
     name = 'launch.events.Shutdown'
 
-    def __init__(
-        self, *, reason: str = 'reason not given', due_to_sigint: bool = False
-    ) -> None:
-        self.__reason = reason
-        self.__due_to_sigint = due_to_sigint
-
-    @property
-    def reason(self) -> str:
-        """Why, in words."""
-        return self.__reason
-
-    @property
-    def due_to_sigint(self) -> bool:
-        """Whether SIGINT was received, which a terminal sends to the processes too."""
-        return self.__due_to_sigint
+    def __init__(self, *, reason: str = 'reason not given', due_to_sigint: bool = False) -> None:
+        self.reason = reason
+        self.due_to_sigint = due_to_sigint
 
 
 class TimerEvent(Event):
@@ -78,19 +46,12 @@ class TimerEvent(Event):
 
     name = 'launch.events.TimerEvent'
 
-    def __init__(self, *, timer_action: TimerAction) -> None:
-        self.__timer_action = timer_action
-
-    @property
-    def timer_action(self) -> TimerAction:
-        """The timer."""
-        return self.__timer_action
+    def __init__(self, *, timer_action: Any) -> None:
+        self.timer_action = timer_action
 
 
 def matches_action(target_action: Action) -> Callable[[Action], bool]:
-    """Return a matcher for that very action."""
     return lambda action: action == target_action
 
 
-alias_submodules(
-    __name__, __all__[2:], {'matchers': ('matches_action',)})
+alias_submodules(__name__, __all__, matchers=('matches_action',))

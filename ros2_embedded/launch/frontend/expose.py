@@ -7,11 +7,9 @@ import inspect
 from typing import Any, Callable, Dict, Iterable, Optional, TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from ..action import Action
-    from ..some_substitutions_type import SomeSubstitutionsType
-    from ..substitution import Substitution
-    from .entity import Entity
+    from .._base import Action, SomeSubstitutionsType, Substitution
     from .parser import Parser
+    from .type_utils import Entity
 
 T = TypeVar('T')
 
@@ -20,11 +18,6 @@ substitution_parse_methods: Dict[str, Callable[..., Any]] = {}
 
 
 def instantiate_action(entity: Entity, parser: Parser) -> Action:
-    """
-    Return the action that the entity describes.
-
-    :raises RuntimeError: if none has its name.
-    """
     if entity.type_name not in action_parse_methods:
         raise RuntimeError(f'Unrecognized entity of the type: {entity.type_name}')
     action_type, kwargs = action_parse_methods[entity.type_name](entity, parser)
@@ -35,11 +28,6 @@ def instantiate_action(entity: Entity, parser: Parser) -> Action:
 def instantiate_substitution(
     type_name: str, args: Optional[Iterable[SomeSubstitutionsType]] = None
 ) -> Substitution:
-    """
-    Return the substitution of that name with these arguments.
-
-    :raises RuntimeError: if none has the name.
-    """
     if type_name not in substitution_parse_methods:
         raise RuntimeError(f'Unknown substitution: {type_name}')
     substitution_type, kwargs = substitution_parse_methods[type_name](args or [])
@@ -63,15 +51,14 @@ def _expose(name: str, methods: Dict[str, Any], kind: str) -> Callable[[T], T]:
                 'parse method')
         if name in methods and getattr(methods[name], '__wrapped__', methods[name]) != parse:
             raise RuntimeError(f'Two {kind} parsing methods exposed with the same name: [{name}].')
-        if kind == 'action':
-            @functools.wraps(parse)
-            def parse_completely(entity: Entity, parser: Parser) -> Any:
-                parsed = parse(entity, parser)
-                entity.assert_entity_completely_parsed()
-                return parsed
-            methods[name] = parse_completely
-        else:
-            methods[name] = parse
+
+        @functools.wraps(parse)
+        def parse_completely(entity: Entity, parser: Parser) -> Any:
+            parsed = parse(entity, parser)
+            entity.assert_entity_completely_parsed()
+            return parsed
+
+        methods[name] = parse_completely if kind == 'action' else parse
         return exposed
     return decorate
 

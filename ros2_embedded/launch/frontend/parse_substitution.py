@@ -8,9 +8,9 @@ space; one in single or double quotes may contain spaces and parentheses.
 from __future__ import annotations
 
 import re
-from typing import Any, List, Optional
+from typing import Any, List, NoReturn, Optional
 
-from ..substitution import Substitution
+from .._base import Substitution
 from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
 from .expose import instantiate_substitution
 
@@ -29,18 +29,16 @@ class _Reader:
         self.__at = 0
 
     def read_all(self) -> List[Substitution]:
-        parts = self.__template('')
+        parts = self.__parts(_TEXT, '')
         if self.__at < len(self.__text):
             self.__refuse()
         return parts
 
-    def __template(self, quote: str) -> List[Substitution]:
+    def __parts(self, pattern: str, quote: str) -> List[Substitution]:
         parts: List[Substitution] = []
-        while True:
-            part = self.__substitution(quote) or self.__plain(_TEXT, quote)
-            if part is None:
-                return parts
+        while (part := self.__substitution(quote) or self.__plain(pattern, quote)) is not None:
             parts.append(part)
+        return parts
 
     def __substitution(self, quote: str) -> Optional[Substitution]:
         if not self.__text.startswith('$(', self.__at):
@@ -49,7 +47,6 @@ class _Reader:
         name = _NAME.match(self.__text, self.__at)
         if name is None:
             self.__refuse()
-        assert name is not None
         self.__at = name.end()
         arguments: List[List[Substitution]] = []
         while self.__skip(' '):
@@ -61,19 +58,11 @@ class _Reader:
     def __argument(self, quote: str) -> List[Substitution]:
         for mark in '\'"' if not quote else '':
             if self.__skip(mark):
-                parts = self.__template(mark)
+                parts = self.__parts(_TEXT, mark)
                 if not self.__skip(mark):
                     self.__refuse()
                 return parts
-        parts = []
-        while True:
-            part = self.__substitution(quote) or self.__plain(_WORD, quote)
-            if part is None:
-                break
-            parts.append(part)
-        if not parts:
-            self.__refuse()
-        return parts
+        return self.__parts(_WORD, quote) or self.__refuse()
 
     def __plain(self, pattern: str, quote: str) -> Optional[Substitution]:
         from ..substitutions import TextSubstitution
@@ -91,7 +80,7 @@ class _Reader:
         self.__at += found
         return found
 
-    def __refuse(self) -> None:
+    def __refuse(self) -> NoReturn:
         rest = self.__text[self.__at:self.__at + 20]
         raise ValueError(
             f"can't read '{self.__text}' as text with substitutions, from column "
@@ -99,7 +88,6 @@ class _Reader:
 
 
 def replace_escaped_characters(data: str) -> str:
-    """Return the text without the backslashes that escape."""
     return re.sub(r'\\(.)', r'\1', data)
 
 
@@ -126,17 +114,15 @@ def parse_if_substitutions(value: StrSomeValueType) -> NormalizedValueType:
     kinds = set()
 
     def parse(item: Any) -> Any:
-        if not isinstance(item, str):
-            kinds.add(type(item))
-            return item
-        parts = parse_substitution(item)
-        if len(parts) == 1 and isinstance(parts[0], TextSubstitution):
-            kinds.add(str)
-            return parts[0].text
-        return parts
+        if isinstance(item, str):
+            parts = parse_substitution(item)
+            if len(parts) != 1 or not isinstance(parts[0], TextSubstitution):
+                return parts
+            item = parts[0].text
+        kinds.add(type(item))
+        return item
 
     parsed = [parse(item) for item in value] if isinstance(value, list) else parse(value)
     if len(kinds) > 1:
         raise ValueError('The result is a non-uniform list')
-    result: NormalizedValueType = parsed
-    return result
+    return parsed

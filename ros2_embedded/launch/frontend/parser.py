@@ -2,42 +2,38 @@
 """Finds the parser for a launch file, and builds what its entities describe."""
 from __future__ import annotations
 
-import io
 import os
 import traceback
 from typing import Any, Dict, Iterable, List, Optional, Set, Tuple, Type, TYPE_CHECKING
 import warnings
 
-from ..invalid_launch_file_error import InvalidLaunchFileError
-from ..substitution import Substitution
-from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
-from .entity import Entity
+from .._base import Action, InvalidLaunchFileError, Substitution
 from .expose import instantiate_action
 from .parse_substitution import (
     parse_if_substitutions,
     parse_substitution,
     replace_escaped_characters,
 )
+from .type_utils import Entity
 
 if TYPE_CHECKING:
-    from ..action import Action
     from ..launch_description import LaunchDescription
 
 
 class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
-    """No frontend could read the file."""
+    pass
 
 
 def _load_entry_points(group: str, kind: str) -> Dict[str, Any]:
     from ros2cli.entry_points import get_entry_points
     loaded = {}
-    for entry_point in get_entry_points(group).values():
+    for name, entry_point in get_entry_points(group).items():
         try:
-            loaded[entry_point.name] = entry_point.load()
+            loaded[name] = entry_point.load()
         except Exception:  # noqa: BLE001 - Another's module must not end this launch.
             warnings.warn(
-                f'Failed to load the {kind} extension: {entry_point.name}\n'
-                f'{traceback.format_exc()}', stacklevel=2)
+                f'Failed to load the {kind} extension: {name}\n{traceback.format_exc()}',
+                stacklevel=2)
     return loaded
 
 
@@ -76,62 +72,46 @@ class Parser:
         return Parser.frontend_parsers
 
     def parse_action(self, entity: Entity) -> Action:
-        """Return the action that the entity describes."""
         self.load_launch_extensions()
         return instantiate_action(entity, self)
 
     def parse_substitution(self, value: str) -> List[Substitution]:
-        """Return the substitutions that the text consists of."""
         return parse_substitution(value)
 
-    def parse_if_substitutions(self, value: StrSomeValueType) -> NormalizedValueType:
-        """Return texts in the value as substitutions, unless they are plain."""
+    def parse_if_substitutions(self, value: Any) -> Any:
         return parse_if_substitutions(value)
 
     def escape_characters(self, value: str) -> str:
-        """Return the text without the backslashes that escape."""
         return replace_escaped_characters(value)
 
     def parse_description(self, entity: Entity) -> LaunchDescription:
-        """
-        Return the launch description of a root entity.
-
-        :raises RuntimeError: if it isn't called 'launch'.
-        """
         from ..launch_description import LaunchDescription
         if entity.type_name != 'launch':
             raise RuntimeError("Expected 'launch' as root tag")
         self.load_launch_extensions()
         deprecated = entity.get_attr('deprecated', optional=True)
         return LaunchDescription(
-            [self.parse_action(child) for child in entity.children],
-            deprecated_reason=deprecated)
+            [self.parse_action(child) for child in entity.children], deprecated_reason=deprecated)
 
     @classmethod
     def get_available_extensions(cls) -> Iterable[str]:
-        """Return the parsers' names."""
         return cls._parsers().keys()
 
     @classmethod
     def may_parse(cls, filename: str) -> bool:
-        """Say whether the file's name ends as this parser's do."""
         return any(filename.endswith('.' + end) for end in cls.get_file_extensions())
 
     @classmethod
     def is_filename_valid(cls, filename: str) -> bool:
-        """Say whether any parser claims files of such a name."""
         return bool(cls.get_parsers_from_filename(filename))
 
     @classmethod
     def get_parsers_from_filename(cls, filename: str) -> List[Type[Parser]]:
-        """Return the parsers that claim files of such a name."""
         return [parser for parser in cls._parsers().values() if parser.may_parse(filename)]
 
     @classmethod
     def get_file_extensions_from_parsers(cls) -> Set[str]:
-        """Return how the names of all parsers' files end."""
-        return {end for parser in cls._parsers().values()
-                for end in parser.get_file_extensions()}
+        return {end for parser in cls._parsers().values() for end in parser.get_file_extensions()}
 
     @classmethod
     def load(cls, file: Any) -> Tuple[Entity, Parser]:
@@ -144,16 +124,15 @@ class Parser:
         if isinstance(file, (str, bytes, os.PathLike)):
             with open(file) as opened:
                 return cls.load(opened)
-        stream: io.TextIOBase = file
-        name = getattr(stream, 'name', '')
+        name = getattr(file, 'name', '')
         claiming = cls.get_parsers_from_filename(name)
         errors: List[Exception] = []
         for parser in [*claiming, *(p for p in cls._parsers().values() if p not in claiming)]:
             try:
-                return parser.load(stream)
+                return parser.load(file)
             except Exception as exc:  # noqa: BLE001 - Each format has its own errors.
                 errors.append(exc)
-                stream.seek(0)
+                file.seek(0)
         extension = os.path.splitext(name)[1][1:] if claiming else ''
         raise InvalidFrontendLaunchFileError(extension, likely_errors=errors)
 

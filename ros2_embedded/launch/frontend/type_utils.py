@@ -1,37 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types as launch files name them."""
-from typing import Any, List
+"""The elements of launch files, whatever the format, and types as they name them."""
+from __future__ import annotations
+
+from typing import Any, List, Optional
 
 from ..utilities.type_utils import is_typing_list
-from .entity import Entity
+
+
+class Entity:
+    """An element with a type's name, attributes and children; it notes what was read."""
+
+    @property
+    def type_name(self) -> str:
+        raise NotImplementedError()
+
+    @property
+    def parent(self) -> Optional[Entity]:
+        raise NotImplementedError()
+
+    @property
+    def children(self) -> List[Entity]:
+        raise NotImplementedError()
+
+    def get_attr(
+        self, name: str, *, data_type: Any = str, optional: bool = False,
+        can_be_str: bool = True
+    ) -> Any:
+        """
+        Return an attribute.
+
+        :param data_type: a scalar type, a list of it, ``List[Entity]``, or None for any.
+        :param can_be_str: whether a text will do where the type is another.
+        :raises AttributeError: if it isn't there and not optional.
+        :raises TypeError: if it isn't of the type.
+        """
+        raise NotImplementedError()
+
+    def assert_entity_completely_parsed(self) -> None:
+        """
+        Refuse what nobody read.
+
+        :raises ValueError: naming the attributes or elements.
+        """
+        raise NotImplementedError()
+
 
 _TYPES = {
-    'str': str,
-    'bool': bool,
-    'float': float,
-    'int': int,
-    'list_of_str': List[str],
-    'list_of_bool': List[bool],
-    'list_of_float': List[float],
-    'list_of_int': List[int],
+    'str': str, 'bool': bool, 'float': float, 'int': int, 'list_of_str': List[str],
+    'list_of_bool': List[bool], 'list_of_float': List[float], 'list_of_int': List[int],
     'yaml': None,
 }
 
 
 def check_is_list_entity(data_type: Any) -> bool:
     """Say whether it is ``List[Entity]``, or of a class derived from that."""
-    if not is_typing_list(data_type):
-        return False
-    kind = data_type.__args__[0]
+    kind = data_type.__args__[0] if is_typing_list(data_type) else None
     return isinstance(kind, type) and issubclass(kind, Entity)
 
 
 def get_data_type_from_identifier(type_identifier: str) -> Any:
-    """
-    Return the type of that name; None for 'yaml'.
-
-    :raises ValueError: if there is none.
-    """
     if type_identifier not in _TYPES:
         raise ValueError(f"Got invalid type identifier '{type_identifier}'")
     return _TYPES[type_identifier]

@@ -8,28 +8,21 @@ from types import ModuleType
 from typing import Callable, cast, List, Type
 
 from .._aliases import alias_submodules
+from .._base import InvalidLaunchFileError, SomeSubstitutionsType
 from ..frontend import InvalidFrontendLaunchFileError, Parser
-from ..invalid_launch_file_error import InvalidLaunchFileError
-from ..launch_description import LaunchDescription
-from ..launch_description_source import LaunchDescriptionSource
-from ..some_substitutions_type import SomeSubstitutionsType
+from ..launch_description import LaunchDescription, LaunchDescriptionSource
 
 __all__ = [
     'get_launch_description_from_any_launch_file',
     'get_launch_description_from_python_launch_file',
-    'get_launch_description_from_frontend_launch_file',
-    'InvalidFrontendLaunchFileError',
-    'InvalidLaunchFileError',
-    'InvalidPythonLaunchFileError',
-    'load_python_launch_file_as_module',
-    'AnyLaunchDescriptionSource',
-    'FrontendLaunchDescriptionSource',
-    'PythonLaunchDescriptionSource',
-]
+    'get_launch_description_from_frontend_launch_file', 'InvalidFrontendLaunchFileError',
+    'InvalidLaunchFileError', 'InvalidPythonLaunchFileError',
+    'load_python_launch_file_as_module', 'AnyLaunchDescriptionSource',
+    'FrontendLaunchDescriptionSource', 'PythonLaunchDescriptionSource']
 
 
 class InvalidPythonLaunchFileError(Exception):
-    """A Python launch file without ``generate_launch_description``."""
+    pass
 
 
 def load_python_launch_file_as_module(python_launch_file_path: str) -> ModuleType:
@@ -45,11 +38,6 @@ def load_python_launch_file_as_module(python_launch_file_path: str) -> ModuleTyp
 def get_launch_description_from_python_launch_file(
     python_launch_file_path: str
 ) -> LaunchDescription:
-    """
-    Return what the file's ``generate_launch_description()`` returns.
-
-    :raises InvalidPythonLaunchFileError: if there is none.
-    """
     module = load_python_launch_file_as_module(python_launch_file_path)
     if not hasattr(module, 'generate_launch_description'):
         raise InvalidPythonLaunchFileError(
@@ -61,11 +49,6 @@ def get_launch_description_from_python_launch_file(
 def get_launch_description_from_frontend_launch_file(
     frontend_launch_file_path: str, *, parser: Type[Parser] = Parser
 ) -> LaunchDescription:
-    """
-    Return what a file for a frontend (XML, YAML, ...) describes.
-
-    :raises InvalidFrontendLaunchFileError: if no frontend can read it.
-    """
     entity, reader = parser.load(frontend_launch_file_path)
     return reader.parse_description(entity)
 
@@ -97,7 +80,6 @@ def get_launch_description_from_any_launch_file(
 
 
 class AnyLaunchDescriptionSource(LaunchDescriptionSource):
-    """A launch file in any format."""
 
     def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
         super().__init__(None, launch_file_path, 'interpreted launch file')
@@ -107,7 +89,6 @@ class AnyLaunchDescriptionSource(LaunchDescriptionSource):
 
 
 class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
-    """A launch file for a frontend."""
 
     def __init__(
         self, launch_file_path: SomeSubstitutionsType, *,
@@ -121,7 +102,6 @@ class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
 
 
 class PythonLaunchDescriptionSource(LaunchDescriptionSource):
-    """A launch file in Python."""
 
     def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
         super().__init__(None, launch_file_path, 'interpreted python launch file')
@@ -130,10 +110,4 @@ class PythonLaunchDescriptionSource(LaunchDescriptionSource):
         return get_launch_description_from_python_launch_file(location)
 
 
-alias_submodules(__name__, __all__[-3:], {
-    'any_launch_file_utilities': ('get_launch_description_from_any_launch_file',),
-    'frontend_launch_file_utilities': (
-        'get_launch_description_from_frontend_launch_file', 'InvalidFrontendLaunchFileError'),
-    'python_launch_file_utilities': (
-        'get_launch_description_from_python_launch_file', 'InvalidPythonLaunchFileError',
-        'load_python_launch_file_as_module')})
+alias_submodules(__name__, __all__[-3:])

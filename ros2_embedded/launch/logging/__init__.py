@@ -10,7 +10,7 @@ import datetime
 import logging
 import os
 import sys
-from typing import Any, Dict, List, Mapping, Optional, Set, Tuple, Union
+from typing import Any, Dict, List, Mapping, Optional, Set, Tuple
 import warnings
 
 from . import handlers
@@ -27,12 +27,11 @@ _OUTPUTS: Dict[str, Dict[str, Set[str]]] = {
     'log': {'both': {'log'}, 'stderr': {'screen'}},
     'both': {'both': {'log', 'screen'}},
     'own_log': {'both': {'own_log'}, 'stdout': {'own_log'}, 'stderr': {'own_log'}},
-    'full': {
-        'both': {'screen', 'log', 'own_log'}, 'stdout': {'own_log'}, 'stderr': {'own_log'}},
+    'full': {'both': {'screen', 'log', 'own_log'}, 'stdout': {'own_log'}, 'stderr': {'own_log'}},
 }
 
 
-def _base_directory() -> str:
+def _get_logging_directory() -> str:
     home = os.environ.get('ROS_HOME') or os.path.join('~', '.ros')
     directory = os.environ.get('ROS_LOG_DIR') or os.path.join(home, 'log')
     return os.path.normpath(os.path.expanduser(directory))
@@ -46,37 +45,31 @@ def _make_log_dir(base: str) -> str:
             os.makedirs(directory)
         except FileExistsError:
             continue
+        latest = os.path.join(base, 'latest')
+        try:
+            if os.path.islink(latest):
+                os.unlink(latest)
+            os.symlink(directory, latest, target_is_directory=True)
+        except OSError as exc:
+            warnings.warn(
+                f'Cannot create a symlink to latest log directory: {exc}', stacklevel=2)
         return directory
 
 
-def _point_latest_to(directory: str) -> None:
-    latest = os.path.join(os.path.dirname(directory), 'latest')
-    try:
-        if os.path.islink(latest):
-            os.unlink(latest)
-        os.symlink(directory, latest, target_is_directory=True)
-    except OSError as exc:
-        warnings.warn(f'Cannot create a symlink to latest log directory: {exc}', stacklevel=2)
-
-
-class _Formats:
-    """A formatter from a format's name or text, which an environment variable overrides."""
-
-    @staticmethod
-    def make(
-        text: Optional[str], style: Optional[str], named: Mapping[str, str], kind: str
-    ) -> Optional[logging.Formatter]:
-        override = os.environ.get(f'OVERRIDE_LAUNCH_{kind.upper()}_FORMAT')
-        if override:
-            text, style = override.encode('latin1').decode('unicode_escape'), '{'
-        elif text in named and text is not None:
-            if style is not None:
-                raise ValueError(
-                    f'Cannot set a custom format style for the "{text}" {kind} format.')
-            text = named[text]
-        if text is None:
-            return None
-        return logging.Formatter(text, style=style or '{')  # type: ignore[arg-type]
+def _make_formatter(
+    text: Optional[str], style: Optional[str], named: Mapping[str, str], kind: str
+) -> Optional[logging.Formatter]:
+    override = os.environ.get(f'OVERRIDE_LAUNCH_{kind.upper()}_FORMAT')
+    if override:
+        text, style = override.encode('latin1').decode('unicode_escape'), '{'
+    elif text in named and text is not None:
+        if style is not None:
+            raise ValueError(
+                f'Cannot set a custom format style for the "{text}" {kind} format.')
+        text = named[text]
+    if text is None:
+        return None
+    return logging.Formatter(text, style=style or '{')  # type: ignore[arg-type]
 
 
 class LaunchConfig:
@@ -90,28 +83,24 @@ class LaunchConfig:
         self._log_dir: Optional[str] = None
         self.file_handlers: Dict[str, Any] = {}
         self.screen_handler: Any = None
-        self.screen_formatter: Optional[logging.Formatter] = None
-        self.file_formatter: Optional[logging.Formatter] = None
-        self._log_handler_factory: Any = None
+        self.log_handler_factory: Any = handlers.WatchedFileHandler
         logging.root.setLevel(logging.INFO)
         self.set_screen_format('default')
         self.set_log_format('default')
 
     @property
     def level(self) -> int:
-        """The root logger's level."""
         return logging.root.getEffectiveLevel()
 
     @level.setter
-    def level(self, new_level: Union[int, str]) -> None:
+    def level(self, new_level: Any) -> None:
         logging.root.setLevel(new_level)
 
     @property
     def log_dir(self) -> str:
         """The directory of this launch's log files, made when first asked for."""
         if self._log_dir is None:
-            self._log_dir = _make_log_dir(_base_directory())
-            _point_latest_to(self._log_dir)
+            self._log_dir = _make_log_dir(_get_logging_directory())
         return self._log_dir
 
     @log_dir.setter
@@ -125,26 +114,16 @@ class LaunchConfig:
                 raise ValueError(f'{new_log_dir} is not a directory')
         self._log_dir = new_log_dir
 
-    @property
-    def log_handler_factory(self) -> Any:
-        """What makes a handler from a path and ``encoding=``."""
-        return self._log_handler_factory or handlers.WatchedFileHandler
-
-    @log_handler_factory.setter
-    def log_handler_factory(self, new_log_handler_factory: Any) -> None:
-        self._log_handler_factory = new_log_handler_factory
-
     def set_screen_format(
         self, screen_format: Optional[str], *, screen_style: Optional[str] = None
     ) -> None:
         """Set the screen's format: 'default', 'default_with_timestamp' or a text."""
-        self.screen_formatter = _Formats.make(
+        self.screen_formatter = _make_formatter(
             screen_format, screen_style, _SCREEN_FORMATS, 'screen')
         if self.screen_handler is not None and self.screen_formatter is not None:
             self.screen_handler.setFormatter(self.screen_formatter)
 
     def get_screen_handler(self) -> Any:
-        """Return the one handler that writes to standard output."""
         if self.screen_handler is None:
             self.screen_handler = handlers.StreamHandler(_Screen())
             self.screen_handler.setFormatter(self.screen_formatter)
@@ -154,17 +133,15 @@ class LaunchConfig:
         self, log_format: Optional[str], *, log_style: Optional[str] = None
     ) -> None:
         """Set the log files' format: 'default' or a text."""
-        self.file_formatter = _Formats.make(log_format, log_style, _LOG_FORMATS, 'log')
+        self.file_formatter = _make_formatter(log_format, log_style, _LOG_FORMATS, 'log')
         if self.file_formatter is not None:
             for handler in self.file_handlers.values():
                 handler.setFormatter(self.file_formatter)
 
     def get_log_file_path(self, file_name: str = 'launch.log') -> str:
-        """Return the path of a file in the log directory."""
         return os.path.join(self.log_dir, file_name)
 
     def get_log_file_handler(self, file_name: str = 'launch.log') -> Any:
-        """Return the one handler that writes to that file in the log directory."""
         if file_name not in self.file_handlers:
             handler = self.log_handler_factory(
                 self.get_log_file_path(file_name), encoding='utf-8')
@@ -191,7 +168,6 @@ launch_config = LaunchConfig()
 
 
 def log_launch_config(*, logger: logging.Logger = logging.root) -> None:
-    """Log where the log files are, and the level."""
     if launch_config.file_handlers:
         logger.info(f'All log files can be found below {launch_config.log_dir}')
     level = logging.getLevelName(logging.root.getEffectiveLevel())
@@ -206,11 +182,11 @@ def get_logger(name: Optional[str] = None) -> logging.Logger:
     return logger
 
 
-def _add(logger: logging.Logger, handler: Any) -> bool:
-    if handler in logger.handlers:
-        return False
-    logger.addHandler(handler)
-    return True
+def _add(logger: logging.Logger, handler: Any, own_format: Optional[str] = None) -> None:
+    if handler not in logger.handlers:
+        logger.addHandler(handler)
+        if own_format is not None:
+            handler.setFormatterFor(logger, logging.Formatter(own_format, style='{'))
 
 
 def _normalize_output_configuration(config: Any) -> Dict[str, Set[str]]:
@@ -218,22 +194,19 @@ def _normalize_output_configuration(config: Any) -> Dict[str, Set[str]]:
     if isinstance(config, str):
         if config not in _OUTPUTS:
             raise ValueError(
-                f'{config} is not a valid standard output config '
-                'i.e. "screen", "log" or "both"')
-        normalized.update(_OUTPUTS[config])
-    elif isinstance(config, dict):
-        for source, destinations in config.items():
-            if source not in normalized:
-                raise ValueError(
-                    f'{source} is not a valid output source i.e. "stdout", "stderr" or "both"')
-            wanted = {destinations} if isinstance(destinations, str) else set(destinations)
-            for destination in wanted - {'screen', 'log', 'own_log'}:
-                raise ValueError(
-                    f'{destination} is not a valid output destination '
-                    'i.e. "screen", "log" or "own_log"')
-            normalized[source] = wanted
-    else:
+                f'{config} is not a valid standard output config i.e. "screen", "log" or "both"')
+        return {**normalized, **_OUTPUTS[config]}
+    if not isinstance(config, dict):
         raise ValueError(f'{config} is not a valid output configuration')
+    for source, destinations in config.items():
+        if source not in normalized:
+            raise ValueError(
+                f'{source} is not a valid output source i.e. "stdout", "stderr" or "both"')
+        normalized[source] = {destinations} if isinstance(destinations, str) else set(destinations)
+        for destination in normalized[source] - {'screen', 'log', 'own_log'}:
+            raise ValueError(
+                f'{destination} is not a valid output destination '
+                'i.e. "screen", "log" or "own_log"')
     return normalized
 
 
@@ -253,18 +226,14 @@ def get_output_loggers(
         logger = logging.getLogger(f'{process_name}-{source}')
         loggers.append(logger)
         wanted = config['both'] | config[source]
-        if 'screen' in wanted and _add(logger, launch_config.get_screen_handler()):
-            launch_config.get_screen_handler().setFormatterFor(
-                logger, logging.Formatter('{msg}', style='{'))
-        if 'log' in wanted and _add(logger, launch_config.get_log_file_handler()):
-            launch_config.get_log_file_handler().setFormatterFor(
-                logger, logging.Formatter('{created:.7f} {msg}', style='{'))
+        if 'screen' in wanted:
+            _add(logger, launch_config.get_screen_handler(), '{msg}')
+        if 'log' in wanted:
+            _add(logger, launch_config.get_log_file_handler(), '{created:.7f} {msg}')
         for kind, name in ((source, f'{process_name}-{source}.log'),
                            ('both', f'{process_name}.log')):
             if 'own_log' in config[kind]:
-                handler = launch_config.get_log_file_handler(name)
-                handler.setFormatter(logging.Formatter('{msg}', style='{'))
-                _add(logger, handler)
+                _add(logger, launch_config.get_log_file_handler(name), '{msg}')
     return loggers[0], loggers[1]
 
 

@@ -1,58 +1,497 @@
 # SPDX-License-Identifier: Apache-2.0
 """Texts that are only known when the launch runs."""
+from __future__ import annotations
+
+import collections.abc
+import importlib
+import math
+import os
+from typing import Any, Dict, Iterable, List, Optional, Sequence, Tuple, Type, Union
+
+import launch.logging
+
 from .._aliases import alias_submodules, missing
-from ._logic import (
-    AllSubstitution,
-    AndSubstitution,
-    AnySubstitution,
-    EqualsSubstitution,
-    IfElseSubstitution,
-    NotEqualsSubstitution,
-    NotSubstitution,
-    OrSubstitution,
+from .._base import SomeSubstitutionsType, Substitution
+from ..frontend.expose import expose_substitution
+from ..launch_context import LaunchContext
+from ..utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
 )
-from ._system import Command, FileContent, FindExecutable, PythonExpression
-from ._values import (
-    AnonName,
-    EnvironmentVariable,
-    LaunchConfiguration,
-    LaunchLogDir,
-    LocalSubstitution,
-    PathJoinSubstitution,
-    SubstitutionFailure,
-    TextSubstitution,
-    ThisLaunchFile,
-    ThisLaunchFileDir,
-)
+from ..utilities.type_utils import is_substitution, perform_typed_substitution
 
 __all__ = [
-    'AllSubstitution',
-    'AndSubstitution',
-    'AnySubstitution',
-    'AnonName',
-    'Command',
-    'EqualsSubstitution',
-    'EnvironmentVariable',
-    'FileContent',
-    'FindExecutable',
-    'IfElseSubstitution',
-    'LaunchConfiguration',
-    'LaunchLogDir',
-    'LocalSubstitution',
-    'NotSubstitution',
-    'NotEqualsSubstitution',
-    'OrSubstitution',
-    'PathJoinSubstitution',
-    'PythonExpression',
-    'SubstitutionFailure',
-    'TextSubstitution',
-    'ThisLaunchFile',
-    'ThisLaunchFileDir',
-]
+    'AllSubstitution', 'AndSubstitution', 'AnySubstitution', 'AnonName', 'Command',
+    'EqualsSubstitution', 'EnvironmentVariable', 'FileContent', 'FindExecutable',
+    'IfElseSubstitution', 'LaunchConfiguration', 'LaunchLogDir', 'LocalSubstitution',
+    'NotSubstitution', 'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution',
+    'PythonExpression', 'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile',
+    'ThisLaunchFileDir']
 
-alias_submodules(__name__, __all__, {'boolean_substitution': (
+Parsed = Tuple[Type[Any], Dict[str, Any]]
+Substitutions = List[Substitution]
+
+
+class SubstitutionFailure(RuntimeError):
+    """A substitution has no value in this context."""
+
+    def __init__(self, msg: Any) -> None:
+        super().__init__(msg)
+
+
+def described(substitutions: Iterable[Substitution]) -> str:
+    return ' + '.join(sub.describe() for sub in substitutions)
+
+
+def normalized_default(default: Any) -> Optional[Substitutions]:
+    """Return a default of any type as substitutions; None stays None."""
+    if default is None:
+        return None
+    if isinstance(default, str) or not isinstance(default, collections.abc.Iterable):
+        default = (default,)
+    return normalize_to_list_of_substitutions([
+        item if isinstance(item, (str, Substitution)) else str(item) for item in default])
+
+
+class ParsedSubstitution(Substitution):
+    """Base of those that launch files write as ``$(name argument ...)``."""
+
+    #: The parameters that the arguments are for; a question mark where they may be absent.
+    _parameters: Tuple[str, ...] = ()
+
+    @classmethod
+    def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
+        """
+        Return the class and the keyword arguments.
+
+        :raises TypeError: for too few or too many.
+        """
+        least = sum(not name.endswith('?') for name in cls._parameters)
+        if not least <= len(data) <= len(cls._parameters):
+            raise TypeError(
+                f'{cls.__name__} substitution expects {least} to {len(cls._parameters)} '
+                f'arguments, got {len(data)}')
+        return cls, {name.rstrip('?'): value for name, value in zip(cls._parameters, data)}
+
+
+class TextSubstitution(Substitution):
+
+    def __init__(self, *, text: str) -> None:
+        super().__init__()
+        if not isinstance(text, str):
+            raise TypeError(f"TextSubstitution expected Text object got '{type(text)}' instead.")
+        self.text = text
+
+    def describe(self) -> str:
+        return f"'{self.text}'"
+
+    def perform(self, context: LaunchContext) -> str:
+        return self.text
+
+
+@expose_substitution('var')
+class LaunchConfiguration(ParsedSubstitution):
+    """The value of a launch configuration, or the default."""
+
+    _parameters = ('variable_name', 'default?')
+
+    def __init__(self, variable_name: SomeSubstitutionsType, *, default: Any = None) -> None:
+        super().__init__()
+        self.variable_name = normalize_to_list_of_substitutions(variable_name)
+        self.__default = normalized_default(default)
+
+    def describe(self) -> str:
+        return f'LaunchConfig({described(self.variable_name)})'
+
+    def perform(self, context: LaunchContext) -> str:
+        name = perform_substitutions(context, self.variable_name)
+        if name in context.launch_configurations:
+            value: str = context.launch_configurations[name]
+            return value
+        if self.__default is None:
+            raise SubstitutionFailure(f"launch configuration '{name}' does not exist")
+        return perform_substitutions(context, self.__default)
+
+
+@expose_substitution('env')
+class EnvironmentVariable(ParsedSubstitution):
+    """The value of an environment variable, or the default."""
+
+    _parameters = ('name', 'default_value?')
+
+    def __init__(
+        self, name: SomeSubstitutionsType, *,
+        default_value: Optional[SomeSubstitutionsType] = None
+    ) -> None:
+        super().__init__()
+        self.name = normalize_to_list_of_substitutions(name)
+        self.default_value = normalized_default(default_value)
+
+    def describe(self) -> str:
+        return f'EnvVar({described(self.name)})'
+
+    def perform(self, context: LaunchContext) -> str:
+        name = perform_substitutions(context, self.name)
+        if name in context.environment:
+            return context.environment[name]
+        if self.default_value is None:
+            raise SubstitutionFailure(f"environment variable '{name}' does not exist")
+        return perform_substitutions(context, self.default_value)
+
+
+class LocalSubstitution(Substitution):
+    """The value of an expression over the context's local variables."""
+
+    def __init__(self, expression: str, description: Optional[str] = None) -> None:
+        super().__init__()
+        ensure_argument_type(expression, str, 'expression', 'LocalSubstitution')
+        self.expression = expression
+        self.description = description
+
+    def describe(self) -> str:
+        return f"LocalVar('{self.description or self.expression}')"
+
+    def perform(self, context: LaunchContext) -> str:
+        value: str = eval('context.locals.' + self.expression)  # noqa: S307
+        return value
+
+
+class PathJoinSubstitution(Substitution):
+
+    def __init__(self, substitutions: Iterable[Union[str, Substitution]]) -> None:
+        self.substitutions = normalize_to_list_of_substitutions(substitutions)
+
+    def describe(self) -> str:
+        return f"PathJoin('{described(self.substitutions)}')"
+
+    def perform(self, context: LaunchContext) -> str:
+        return os.path.join(*(sub.perform(context) for sub in self.substitutions))
+
+
+@expose_substitution('anon')
+class AnonName(ParsedSubstitution):
+    """The name with something unique behind it, the same throughout a launch."""
+
+    _parameters = ('name',)
+
+    def __init__(self, name: SomeSubstitutionsType) -> None:
+        super().__init__()
+        self.name = normalize_to_list_of_substitutions(name)
+
+    def describe(self) -> str:
+        return f'AnonName({described(self.name)})'
+
+    def perform(self, context: LaunchContext) -> str:
+        name = perform_substitutions(context, self.name)
+        value: str = context.launch_configurations.setdefault(
+            'anon' + name, self.compute_name(name))
+        return value
+
+    def compute_name(self, id_value: str) -> str:
+        import random
+        unique = f'{id_value}_{os.uname().nodename}_{os.getpid()}_{random.getrandbits(63)}'
+        return unique.translate(str.maketrans('.-:', '___'))
+
+
+@expose_substitution('launch_log_dir')
+@expose_substitution('log_dir')
+class LaunchLogDir(ParsedSubstitution):
+
+    def describe(self) -> str:
+        return 'LaunchLogDir()'
+
+    def perform(self, context: LaunchContext) -> str:
+        return launch.logging.launch_config.log_dir
+
+
+@expose_substitution('filename')
+class ThisLaunchFile(ParsedSubstitution):
+
+    _local = 'current_launch_file_path'
+
+    def describe(self) -> str:
+        return f'{type(self).__name__}()'
+
+    def perform(self, context: LaunchContext) -> str:
+        value: Optional[str] = context.get_locals_as_dict().get(self._local)
+        if value is None:
+            raise SubstitutionFailure(
+                f'{type(self).__name__} used outside of a launch file (in a script)')
+        return value
+
+
+@expose_substitution('dirname')
+class ThisLaunchFileDir(ThisLaunchFile):
+
+    _local = 'current_launch_file_directory'
+
+
+@expose_substitution('command')
+class Command(ParsedSubstitution):
+    """
+    The standard output of a command.
+
+    :param on_stderr: what standard error's output means: 'fail', 'ignore', 'warn', or
+        'capture' to have it in the text.
+    """
+
+    _parameters = ('command', 'on_stderr?')
+
+    def __init__(
+        self, command: SomeSubstitutionsType, *, on_stderr: SomeSubstitutionsType = 'fail'
+    ) -> None:
+        super().__init__()
+        self.command = normalize_to_list_of_substitutions(command)
+        self.on_stderr = normalize_to_list_of_substitutions(on_stderr)
+
+    def describe(self) -> str:
+        return f'Command({described(self.command)})'
+
+    def perform(self, context: LaunchContext) -> str:
+        import shlex
+        import subprocess
+        command = perform_substitutions(context, self.command)
+        on_stderr = perform_substitutions(context, self.on_stderr)
+        if on_stderr not in ('fail', 'ignore', 'warn', 'capture'):
+            raise SubstitutionFailure(
+                "expected 'on_stderr' to be one of: 'fail', 'ignore', 'warn' or 'capture'")
+        try:
+            result = subprocess.run(
+                shlex.split(command), stdout=subprocess.PIPE, text=True,
+                stderr=subprocess.STDOUT if on_stderr == 'capture' else subprocess.PIPE)
+        except FileNotFoundError as exc:
+            raise SubstitutionFailure(f'file not found: {exc}') from exc
+        stderr = f'\nCaptured stderr output:\n{result.stderr}' if result.stderr else ''
+        if result.returncode != 0:
+            raise SubstitutionFailure(f'executed command failed. Command: {command}{stderr}')
+        if stderr and on_stderr in ('fail', 'warn'):
+            text = f'executed command showed stderr output. Command: {command}{stderr}'
+            if on_stderr == 'fail':
+                raise SubstitutionFailure(text)
+            launch.logging.get_logger().warning(text)
+        return result.stdout
+
+
+@expose_substitution('file-content')
+class FileContent(ParsedSubstitution):
+
+    _parameters = ('path',)
+
+    def __init__(self, path: SomeSubstitutionsType) -> None:
+        super().__init__()
+        self.path = normalize_to_list_of_substitutions(path)
+
+    def describe(self) -> str:
+        return f"FileContent({', '.join(sub.describe() for sub in self.path)})"
+
+    def perform(self, context: LaunchContext) -> str:
+        path = perform_substitutions(context, self.path)
+        try:
+            with open(path) as file:
+                return file.read()
+        except FileNotFoundError as exc:
+            raise SubstitutionFailure(f'File not found: {path}') from exc
+
+
+@expose_substitution('find-exec')
+class FindExecutable(ParsedSubstitution):
+
+    _parameters = ('name',)
+
+    def __init__(self, *, name: SomeSubstitutionsType) -> None:
+        super().__init__()
+        self.name = normalize_to_list_of_substitutions(name)
+
+    def describe(self) -> str:
+        return f'FindExec({described(self.name)})'
+
+    def perform(self, context: LaunchContext) -> str:
+        import shutil
+        path = shutil.which(perform_substitutions(context, self.name))
+        if path is None:
+            raise SubstitutionFailure(f"executable '{self.name}' not found on the PATH")
+        return path
+
+
+@expose_substitution('eval')
+class PythonExpression(ParsedSubstitution):
+    """The value of a Python expression over modules; over ``math``, its content too."""
+
+    _parameters = ('expression', 'python_modules?')
+
+    def __init__(
+        self, expression: SomeSubstitutionsType, python_modules: SomeSubstitutionsType = ('math',)
+    ) -> None:
+        super().__init__()
+        types = (str, Substitution, collections.abc.Iterable)
+        ensure_argument_type(expression, types, 'expression', 'PythonExpression')
+        ensure_argument_type(python_modules, types, 'python_modules', 'PythonExpression')
+        self.expression = normalize_to_list_of_substitutions(expression)
+        self.python_modules = normalize_to_list_of_substitutions(python_modules)
+
+    @classmethod
+    def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
+        _, kwargs = super().parse(data)
+        if 'python_modules' in kwargs:
+            names = ''.join(getattr(sub, 'text', '') for sub in kwargs['python_modules'])
+            kwargs['python_modules'] = [name.strip() for name in names.split(',')]
+        return cls, kwargs
+
+    def describe(self) -> str:
+        modules = ', '.join(sub.describe() for sub in self.python_modules)
+        return f'PythonExpr({described(self.expression)}, [{modules}])'
+
+    def perform(self, context: LaunchContext) -> str:
+        names: Dict[str, Any] = {}
+        for sub in self.python_modules:
+            module = importlib.import_module(context.perform_substitution(sub))
+            if module is math:
+                names.update(vars(math))
+            names[module.__name__] = module
+        return str(eval(perform_substitutions(context, self.expression), {}, names))  # noqa: S307
+
+
+def _truth(context: LaunchContext, value: Substitutions) -> bool:
+    try:
+        return bool(perform_typed_substitution(context, value, bool))
+    except (TypeError, ValueError) as exc:
+        raise SubstitutionFailure(exc) from exc
+
+
+def _text(truth: bool) -> str:
+    return 'true' if truth else 'false'
+
+
+@expose_substitution('not')
+class NotSubstitution(ParsedSubstitution):
+
+    _parameters = ('value',)
+
+    def __init__(self, value: SomeSubstitutionsType) -> None:
+        super().__init__()
+        self.value = normalize_to_list_of_substitutions(value)
+
+    def describe(self) -> str:
+        return f'NotSubstitution({self.value})'
+
+    def perform(self, context: LaunchContext) -> str:
+        return _text(not _truth(context, self.value))
+
+
+@expose_substitution('and')
+class AndSubstitution(ParsedSubstitution):
+    """Whether both sides are true; both are evaluated."""
+
+    _parameters = ('left', 'right')
+
+    def __init__(self, left: Any, right: Any) -> None:
+        super().__init__()
+        self.left = normalize_to_list_of_substitutions(left)
+        self.right = normalize_to_list_of_substitutions(right)
+
+    def describe(self) -> str:
+        return f'{type(self).__name__}({self.left} {self.right})'
+
+    def perform(self, context: LaunchContext) -> str:
+        return _text(_truth(context, self.left) & _truth(context, self.right))
+
+
+@expose_substitution('or')
+class OrSubstitution(AndSubstitution):
+    """Whether a side is true; both are evaluated."""
+
+    def perform(self, context: LaunchContext) -> str:
+        return _text(_truth(context, self.left) | _truth(context, self.right))
+
+
+@expose_substitution('any')
+class AnySubstitution(Substitution):
+
+    def __init__(self, *args: SomeSubstitutionsType) -> None:
+        super().__init__()
+        self.args = [normalize_to_list_of_substitutions(arg) for arg in args]
+
+    @classmethod
+    def parse(cls, data: Iterable[SomeSubstitutionsType]) -> Parsed:
+        return cls, {'args': data}
+
+    def describe(self) -> str:
+        return f"{type(self).__name__}({' '.join(str(arg) for arg in self.args)})"
+
+    def perform(self, context: LaunchContext) -> str:
+        truths = [_truth(context, arg) for arg in self.args]
+        return _text(any(truths))
+
+
+@expose_substitution('all')
+class AllSubstitution(AnySubstitution):
+
+    def perform(self, context: LaunchContext) -> str:
+        truths = [_truth(context, arg) for arg in self.args]
+        return _text(all(truths))
+
+
+def _comparable(side: Any) -> Any:
+    if is_substitution(side):
+        return side
+    return '' if side is None else _text(side) if isinstance(side, bool) else str(side)
+
+
+@expose_substitution('equals')
+class EqualsSubstitution(AndSubstitution):
+    """Whether both sides are equal: as booleans, as numbers, or else as texts."""
+
+    def __init__(self, left: Any, right: Any) -> None:
+        super().__init__(_comparable(left), _comparable(right))
+
+    def perform(self, context: LaunchContext) -> str:
+        left = perform_substitutions(context, self.left)
+        right = perform_substitutions(context, self.right)
+        truths = {'true': True, '1': True, 'false': False, '0': False}
+        if left.lower() in truths and right.lower() in truths:
+            return _text(truths[left.lower()] == truths[right.lower()])
+        try:
+            return _text(math.isclose(float(left), float(right)))
+        except ValueError:
+            return _text(left == right)
+
+
+@expose_substitution('not-equals')
+class NotEqualsSubstitution(EqualsSubstitution):
+
+    def perform(self, context: LaunchContext) -> str:
+        return _text(super().perform(context) != 'true')
+
+
+@expose_substitution('if')
+class IfElseSubstitution(ParsedSubstitution):
+    """One value if the condition is true, else the other."""
+
+    _parameters = ('condition', 'if_value', 'else_value?')
+
+    def __init__(
+        self, condition: SomeSubstitutionsType, if_value: SomeSubstitutionsType = '',
+        else_value: SomeSubstitutionsType = ''
+    ) -> None:
+        super().__init__()
+        if if_value == '' and else_value == '':
+            raise RuntimeError('One of if_value and else_value must be specified')
+        self.condition = normalize_to_list_of_substitutions(condition)
+        self.if_value = normalize_to_list_of_substitutions(if_value)
+        self.else_value = normalize_to_list_of_substitutions(else_value)
+
+    def describe(self) -> str:
+        return f'IfElseSubstitution({self.condition}, {self.if_value}, {self.else_value})'
+
+    def perform(self, context: LaunchContext) -> str:
+        chosen = self.if_value if _truth(context, self.condition) else self.else_value
+        return perform_substitutions(context, chosen)
+
+
+alias_submodules(__name__, __all__, boolean_substitution=(
     'AllSubstitution', 'AndSubstitution', 'AnySubstitution', 'NotSubstitution',
-    'OrSubstitution')})
+    'OrSubstitution'))
 
 
 def __getattr__(name: str) -> object:

@@ -8,39 +8,29 @@ import inspect
 from typing import Any, cast, Iterable, List, Optional, Tuple, TYPE_CHECKING, Union
 
 from .._aliases import alias_submodules
-from ..launch_description_entity import LaunchDescriptionEntity
-from ..some_entities_type import SomeEntitiesType
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
+from .._base import (
+    Entities,
+    LaunchDescriptionEntity,
+    SomeEntitiesType,
+    SomeSubstitutionsType,
+    Substitution,
+)
 from .signal_management import AsyncSafeSignalManager
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
 
 __all__ = [
-    'is_a',
-    'is_a_subclass',
-    'isclassinstance',
-    'ensure_argument_type',
-    'perform_substitutions',
-    'AsyncSafeSignalManager',
-    'normalize_to_list_of_substitutions',
-    'normalize_to_list_of_entities',
-    'visit_all_entities_and_collect_futures',
-]
+    'is_a', 'is_a_subclass', 'isclassinstance', 'ensure_argument_type', 'perform_substitutions',
+    'AsyncSafeSignalManager', 'normalize_to_list_of_substitutions',
+    'normalize_to_list_of_entities', 'visit_all_entities_and_collect_futures']
 
 
 def isclassinstance(obj: object) -> bool:
-    """Say whether it is an object of some class."""
     return hasattr(obj, '__class__')
 
 
 def is_a(obj: object, entity_type: type) -> bool:
-    """
-    Say whether the object is an instance of the class.
-
-    :raises RuntimeError: if ``entity_type`` isn't a class.
-    """
     if not inspect.isclass(entity_type):
         raise RuntimeError(f"entity_type '{obj}' is not a class")
     return isinstance(obj, entity_type)
@@ -60,34 +50,26 @@ def ensure_argument_type(
 
     :raises TypeError: naming the caller, the argument and what was expected.
     """
-    def refuse(who: str, name: str, expected: str, value: object) -> None:
-        raise TypeError(
-            f"{who}xpected '{name}' to be one of [{expected}], but got '{value}' of type "
-            f"'{type(value)}'")
+    def check(value: object, allowed: Tuple[type, ...], who: str, name: str) -> None:
+        if not isinstance(value, allowed):
+            expected = ', '.join(str(one) for one in allowed)
+            raise TypeError(
+                f"{who}xpected '{name}' to be one of [{expected}], but got '{value}' of type "
+                f"'{type(value)}'")
 
     myself = "'ensure_argument_type()' e"
-    if not isinstance(types, (type, collections.abc.Iterable)):
-        refuse(myself, 'types', 'type, collections.abc.Iterable of type', types)
-    if not isinstance(argument_name, str):
-        refuse(myself, 'argument_name', 'str', argument_name)
-    if caller is not None and not isinstance(caller, str):
-        refuse(myself, 'caller', 'str, None', caller)
-    allowed = (types,) if isinstance(types, type) else tuple(types)
-    if not isinstance(argument, allowed):
-        refuse(f"'{caller}' e" if caller else 'E', argument_name,
-               ', '.join(str(one) for one in allowed), argument)
+    check(types, (type, collections.abc.Iterable), myself, 'types')
+    check(argument_name, (str,), myself, 'argument_name')
+    check(caller, (str, type(None)), myself, 'caller')
+    check(argument, (types,) if isinstance(types, type) else tuple(types),
+          f"'{caller}' e" if caller else 'E', argument_name)
 
 
-def normalize_to_list_of_entities(
-    entities: Iterable[SomeEntitiesType]
-) -> List[LaunchDescriptionEntity]:
+def normalize_to_list_of_entities(entities: Iterable[SomeEntitiesType]) -> Entities:
     """Return the entities with iterables among them laid out flat, one level deep."""
-    flat: List[LaunchDescriptionEntity] = []
+    flat: Entities = []
     for entity in entities:
-        if isinstance(entity, LaunchDescriptionEntity):
-            flat.append(entity)
-        else:
-            flat.extend(entity)
+        flat.extend([entity] if isinstance(entity, LaunchDescriptionEntity) else entity)
     return flat
 
 
@@ -115,7 +97,6 @@ def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> List[Subs
 
 
 def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) -> str:
-    """Return the substitutions' texts, joined."""
     return ''.join([context.perform_substitution(sub) for sub in subs])
 
 
@@ -131,11 +112,6 @@ def visit_all_entities_and_collect_futures(
     return futures
 
 
-alias_submodules(__name__, (), {
-    'class_tools_impl': ('is_a', 'is_a_subclass', 'isclassinstance'),
-    'ensure_argument_type_impl': ('ensure_argument_type',),
-    'normalize_to_list_of_entities_impl': ('normalize_to_list_of_entities',),
-    'normalize_to_list_of_substitutions_impl': ('normalize_to_list_of_substitutions',),
-    'perform_substitutions_impl': ('perform_substitutions',),
-    'visit_all_entities_and_collect_futures_impl': ('visit_all_entities_and_collect_futures',),
-})
+alias_submodules(
+    __name__, (), class_tools_impl=('is_a', 'is_a_subclass', 'isclassinstance'),
+    **{f'{name}_impl': (name,) for name in __all__[3:] if name.islower()})

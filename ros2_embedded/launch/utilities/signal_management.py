@@ -6,8 +6,7 @@ import asyncio
 import os
 import signal
 import socket
-from types import TracebackType
-from typing import Callable, Dict, Optional, Type, Union
+from typing import Any, Callable, Dict, Optional, Union
 
 
 class AsyncSafeSignalManager:
@@ -48,10 +47,7 @@ class AsyncSafeSignalManager:
             signal.set_wakeup_fd = self.__replace_next_fd
         return self
 
-    def __exit__(
-        self, exc_type: Optional[Type[BaseException]], exc: Optional[BaseException],
-        traceback: Optional[TracebackType]
-    ) -> None:
+    def __exit__(self, *exc_info: Any) -> None:
         self.__loop.remove_reader(self.__reader.fileno())
         self.__real_set_wakeup_fd(self.__next_fd)
         if self.__outer is None:
@@ -80,11 +76,7 @@ class AsyncSafeSignalManager:
     def handle(
         self, signum: Union[signal.Signals, int], handler: Optional[Callable[[int], None]]
     ) -> Optional[Callable[[int], None]]:
-        """
-        Set what is called for a signal; None removes it.
-
-        :return: the handler there was.
-        """
+        """Set what is called for a signal, None for nothing; return what it was."""
         signum = signal.Signals(signum)
         if handler is None:
             return self.__handlers.pop(signum, None)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import collections.abc
-from typing import Any, cast, List, Optional, Sequence, Set, Tuple, Type, TYPE_CHECKING, Union
+from typing import Any, List, Optional, Sequence, Tuple, Type, TYPE_CHECKING, Union
 
-from ..some_substitutions_type import SomeSubstitutionsType
-from ..substitution import Substitution
+from .._base import SomeSubstitutionsType, Substitution
 from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
 
 if TYPE_CHECKING:
@@ -20,40 +19,31 @@ ScalarTypesType = Type[Union[int, float, bool, str]]
 ListTypesType = Type[Union[List[int], List[float], List[bool], List[str]]]
 AllowedTypesType = Union[ScalarTypesType, ListTypesType]
 ScalarValueType = Union[int, float, bool, str]
-ListValueType = Union[List[int], List[float], List[bool], List[str]]
 SequenceValueType = Union[Sequence[int], Sequence[float], Sequence[bool], Sequence[str]]
 AllowedValueType = Union[ScalarValueType, SequenceValueType]
-SomeScalarType = Union[SomeSubstitutionsType, ScalarValueType]
-SomeSequenceType = Sequence[Union[int, float, bool, str, SomeSubstitutionsType]]
-SomeValueType = Union[SomeScalarType, SomeSequenceType]
-NormalizedScalarType = Union[List[Substitution], ScalarValueType]
-NormalizedSequenceType = Sequence[Union[int, float, bool, str, List[Substitution]]]
-NormalizedValueType = Union[NormalizedScalarType, NormalizedSequenceType]
-StrSomeScalarType = SomeScalarType
-StrSomeSequenceType = Sequence[Union[int, float, bool, str]]
-StrSomeValueType = Union[StrSomeScalarType, StrSomeSequenceType]
+SomeValueType = Union[
+    SomeSubstitutionsType, ScalarValueType,
+    Sequence[Union[int, float, bool, str, SomeSubstitutionsType]]]
+NormalizedValueType = Any
+StrSomeValueType = Any
 
 
 def is_typing_list(data_type: Any) -> bool:
-    """Say whether it is ``List``, bare or of something."""
     return data_type is List or getattr(data_type, '__origin__', None) is list
 
 
 def is_valid_scalar_type(data_type: Any) -> bool:
-    """Say whether it is int, float, bool or str."""
     return data_type in ScalarTypesTuple
 
 
-def extract_type(data_type: AllowedTypesType) -> Tuple[ScalarTypesType, bool]:
+def extract_type(data_type: Any) -> Tuple[Any, bool]:
     """
     Return the scalar type, and whether a list of it is meant.
 
     :raises ValueError: for a type that isn't allowed.
     """
-    scalar: Any = data_type
     arguments = getattr(data_type, '__args__', None) if is_typing_list(data_type) else None
-    if arguments:
-        scalar = arguments[0]
+    scalar = arguments[0] if arguments else data_type
     if not is_valid_scalar_type(scalar):
         raise ValueError(f'Unrecognized data type: {data_type}')
     return scalar, bool(arguments)
@@ -81,21 +71,6 @@ def is_instance_of(
     return isinstance(value, kinds)
 
 
-def _from_yaml(value: str, error: str, can_be_str: bool) -> Any:
-    import yaml
-    if not value:
-        return value
-    try:
-        output = yaml.safe_load(value)
-    except yaml.YAMLError as exc:
-        if can_be_str:
-            return value
-        raise ValueError(f'{error}: yaml.safe_load() failed\n{exc}') from exc
-    if not is_instance_of_valid_type(output, can_be_str=can_be_str):
-        raise ValueError(f'{error}: output type is not allowed, got {type(output)}')
-    return output
-
-
 def coerce_to_type(
     value: str, data_type: Optional[AllowedTypesType] = None, *, can_be_str: bool = False
 ) -> Any:
@@ -106,43 +81,39 @@ def coerce_to_type(
     :raises ValueError: if it can't be read so.
     """
     ensure_argument_type(value, str, 'value', 'coerce_to_type')
-    if data_type is None:
-        return _from_yaml(value, f"Failed to convert '{value}' using yaml rules", can_be_str)
-    kind, is_list = extract_type(data_type)
-    kinds: Any = (str, kind) if can_be_str else kind
-    if is_list:
-        error = f"Cannot convert value '{value}' to a list of '{kinds}'"
-        output = _from_yaml(value, error, can_be_str)
-        if not isinstance(output, list):
-            raise ValueError(error)
-        if not all(isinstance(item, kinds) for item in output):
-            raise ValueError(f'{error}, got {output}')
-        return output
-    if kind is str:
+    kind, is_list = (None, False) if data_type is None else extract_type(data_type)
+    if kind is str and not is_list:
         return value
-    if kind in (int, float):
+    if kind in (int, float) and not is_list:
         try:
             return kind(value)
         except ValueError:
             if can_be_str:
                 return value
             raise
-    output = _from_yaml(
-        {'1': 'true', '0': 'false'}.get(value, value),
-        f"Failed to convert '{value}' to '{kind}'", can_be_str)
-    if isinstance(output, kinds):
-        return output
-    raise ValueError(f"Cannot convert value '{value}' to '{kind}'")
+    if kind is bool and not is_list:
+        value = {'1': 'true', '0': 'false'}.get(value, value)
+    error = (f"Failed to convert '{value}' using yaml rules" if kind is None else
+             f"Cannot convert value '{value}' to " + (f"a list of '{kind}'" if is_list else
+                                                      f"'{kind}'"))
+    if kind is None and not value:
+        return value
+    import yaml
+    try:
+        output = yaml.safe_load(value)
+    except yaml.YAMLError as exc:
+        if can_be_str:
+            return value
+        raise ValueError(f'{error}: yaml.safe_load() failed\n{exc}') from exc
+    if not is_instance_of(output, data_type, can_be_str=can_be_str):
+        raise ValueError(f'{error}: output type is not allowed, got {type(output)}')
+    return output
 
 
 def coerce_list(
     value: List[str], data_type: Optional[ScalarTypesType] = None, *, can_be_str: bool = False
 ) -> Any:
-    """
-    Read each text as the type, see :func:`coerce_to_type`.
-
-    :raises ValueError: also if the result isn't uniform.
-    """
+    """Read each text as the type, see :func:`coerce_to_type`; the result must be uniform."""
     ensure_argument_type(value, list, 'value', 'coerce_list')
     output = [coerce_to_type(item, data_type, can_be_str=can_be_str) for item in value]
     if not is_instance_of_valid_type(output, can_be_str=can_be_str):
@@ -162,12 +133,9 @@ def get_typed_value(
     """
     if not isinstance(value, list):
         return coerce_to_type(value, data_type, can_be_str=can_be_str)
-    kind: Optional[ScalarTypesType] = None
-    if data_type is not None:
-        kind, is_list = extract_type(data_type)
-        if not is_list:
-            raise TypeError(
-                f"Cannot convert input '{value}' of type '{type(value)}' to '{kind}'")
+    kind, is_list = (None, True) if data_type is None else extract_type(data_type)
+    if not is_list:
+        raise TypeError(f"Cannot convert input '{value}' of type '{type(value)}' to '{kind}'")
     return coerce_list(value, kind, can_be_str=can_be_str)
 
 
@@ -179,9 +147,7 @@ def is_substitution(x: Any) -> bool:
         and any(isinstance(item, Substitution) for item in x))
 
 
-def normalize_typed_substitution(
-    value: SomeValueType, data_type: Optional[AllowedTypesType]
-) -> Any:
+def normalize_typed_substitution(value: Any, data_type: Optional[AllowedTypesType]) -> Any:
     """
     Return a scalar as it is, substitutions as a list, a list with its items so treated.
 
@@ -192,15 +158,13 @@ def normalize_typed_substitution(
             raise TypeError(f"value='{value}' is not an instance of {data_type}")
         return value
     if is_substitution(value):
-        return normalize_to_list_of_substitutions(cast(SomeSubstitutionsType, value))
+        return normalize_to_list_of_substitutions(value)
     if not isinstance(value, collections.abc.Iterable):
         raise TypeError(
             'value should be either a scalar, a substitutions, or a mixed list of scalars and '
             f'substitutions. Got `value={value}` of type `{type(value)}`. ')
-    kind: Optional[ScalarTypesType] = None
-    if data_type is not None:
-        kind, is_list = extract_type(data_type)
-    kinds: Set[type] = set()
+    kind, is_list = (None, True) if data_type is None else extract_type(data_type)
+    kinds = set()
     for item in value:
         if isinstance(item, ScalarTypesTuple):
             kinds.add(type(item))
@@ -208,32 +172,28 @@ def normalize_typed_substitution(
             raise TypeError(
                 'value is a list, and one of the items is not a scalar, a Substitution or a list '
                 f"of substitutions. Got value='{value}'")
-    if data_type is not None and not is_list:
+    if not is_list:
         raise TypeError(
             'The provided value resolves to a list, though the required type is a scalar. '
             f"Got value='{value}', data_type='{kind}'.")
-    found: Any = float if kinds == {int, float} else next(iter(kinds), None)
-    if len(kinds - {int, float} if found is float else kinds) > 1:
-        raise TypeError(f"Input value is not an acceptable 'SomeValueType'.Got value='{value}'")
     # Whole numbers do in a list of floats.
-    if found is int and kind is float:
-        found = float
-    if found is not None and kind is not None and found is not kind:
-        raise TypeError(
-            f"Got a list of '{found}', expected a list of '{kind}'. value='{value}'")
+    as_float = kinds == {int, float} or (kinds == {int} and kind is float)
+    found = float if as_float else next(iter(kinds), None)
+    if len(kinds) > 1 and not as_float:
+        raise TypeError(f"Input value is not an acceptable 'SomeValueType'.Got value='{value}'")
+    if None not in (found, kind) and found is not kind:
+        raise TypeError(f"Got a list of '{found}', expected a list of '{kind}'. value='{value}'")
     return [
         normalize_to_list_of_substitutions(item) if is_substitution(item)
-        else float(item) if found is float else item
-        for item in cast(Sequence[Any], value)]
+        else float(item) if as_float else item for item in value]
 
 
 def is_normalized_substitution(x: Any) -> bool:
-    """Say whether it is a non-empty list of substitutions."""
     return isinstance(x, list) and bool(x) and all(isinstance(i, Substitution) for i in x)
 
 
 def perform_typed_substitution(
-    context: LaunchContext, value: NormalizedValueType, data_type: Optional[AllowedTypesType]
+    context: LaunchContext, value: Any, data_type: Optional[AllowedTypesType]
 ) -> Any:
     """
     Return what a normalized value becomes in the context.
@@ -243,28 +203,19 @@ def perform_typed_substitution(
     """
     if isinstance(value, ScalarTypesTuple):
         if data_type is not None and not is_instance_of(value, data_type):
-            raise TypeError(
-                f'value=`{value}` is a scalar and not an instance of `{data_type}`')
+            raise TypeError(f'value=`{value}` is a scalar and not an instance of `{data_type}`')
         return value
     if is_normalized_substitution(value):
-        return coerce_to_type(
-            perform_substitutions(context, cast(List[Substitution], value)), data_type)
+        return coerce_to_type(perform_substitutions(context, value), data_type)
     if not isinstance(value, list):
         raise TypeError(
             f"Input value is not an acceptable 'NormalizedValueType'.Got value='{value}'")
-    kind: Optional[ScalarTypesType] = None
-    if data_type is not None:
-        kind, is_list = extract_type(data_type)
-        if not is_list:
-            raise ValueError(
-                'The input value is a list, cannot convert it to a scalar. '
-                f"Got value='{value}', expected type {kind}.")
+    kind, is_list = (None, True) if data_type is None else extract_type(data_type)
     output = [
-        coerce_to_type(perform_substitutions(context, cast(List[Substitution], item)), kind)
+        coerce_to_type(perform_substitutions(context, item), kind)
         if is_normalized_substitution(item) else item for item in value]
-    if not is_instance_of(output, data_type):
+    if not is_list or not is_instance_of(output, data_type):
         raise ValueError(
-            'The output list is not uniform' if kind is None else
-            'The output list does not match the expected type '
-            f"Got value='{value}', expected type {kind}.")
+            f"The output list does not match the expected type Got value='{value}', "
+            f'expected type {kind}.')
     return output

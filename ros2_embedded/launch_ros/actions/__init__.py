@@ -2,43 +2,31 @@
 """What a launch can do with nodes."""
 from launch._aliases import alias_submodules, missing
 
-from ._composition import ComposableNodeContainer, LoadComposableNodes
-from ._composition import get_composable_node_load_request as get_composable_node_load_request
-from ._lifecycle import LifecycleNode, LifecycleTransition
-from ._ros_timer import ROSTimer
+from ._composition import (
+    ComposableNodeContainer,
+    get_composable_node_load_request,
+    LoadComposableNodes,
+)
+from ._lifecycle import LifecycleNode
 from ._settings import (
     PushROSNamespace,
     SetParameter,
     SetParametersFromFile,
     SetRemap,
     SetROSLogDir,
-    SetUseSimTime,
 )
 from .node import Node
 
-# The names of ROS 2 before Jazzy.
+# Its name before Jazzy.
 PushRosNamespace = PushROSNamespace
-RosTimer = ROSTimer
 
 __all__ = [
-    'ComposableNodeContainer',
-    'LifecycleNode',
-    'LifecycleTransition',
-    'LoadComposableNodes',
-    'Node',
-    'PushROSNamespace',
-    'PushRosNamespace',
-    'ROSTimer',
-    'RosTimer',
-    'SetParameter',
-    'SetParametersFromFile',
-    'SetRemap',
-    'SetROSLogDir',
-    'SetUseSimTime',
-]
+    'ComposableNodeContainer', 'get_composable_node_load_request', 'LifecycleNode',
+    'LoadComposableNodes', 'Node', 'PushROSNamespace', 'PushRosNamespace',
+    'SetParameter', 'SetParametersFromFile', 'SetRemap', 'SetROSLogDir']
 
-alias_submodules(__name__, __all__, {
-    'load_composable_nodes': ('LoadComposableNodes', 'get_composable_node_load_request')})
+alias_submodules(__name__, __all__, load_composable_nodes=(
+    'LoadComposableNodes', 'get_composable_node_load_request'))
 
 
 def __getattr__(name: str) -> object:

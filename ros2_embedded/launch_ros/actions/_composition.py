@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, List, Optional, Union
 
-from launch import Action, LaunchContext, SomeSubstitutionsType
-from launch.action import ParsedAction
+from launch import (
+    Action,
+    LaunchContext,
+    LaunchDescriptionEntity,
+    SomeSubstitutionsType,
+    SomeSubstitutionsType_types_tuple,
+)
+from launch._base import ParsedAction
 from launch.frontend import Entity, expose_action, Parser
-from launch.launch_description_entity import LaunchDescriptionEntity
 import launch.logging
-from launch.some_substitutions_type import SomeSubstitutionsType_types_tuple
 from launch.utilities import (
     ensure_argument_type,
     normalize_to_list_of_substitutions,
@@ -19,7 +23,7 @@ from launch.utilities import (
 
 from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
-from ..ros_adapters import get_ros_node
+from ..ros_adapters import call_service, get_ros_node
 from ..utilities import (
     add_node_name,
     evaluate_parameters,
@@ -29,7 +33,6 @@ from ..utilities import (
     to_parameters_list,
 )
 from ..utilities.normalize_parameters import normalize_parameter_dict
-from ._services import call_service
 from .node import Node
 
 

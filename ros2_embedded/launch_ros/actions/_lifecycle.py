@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, Callable, cast, Dict, Iterable, List, Optional, Union
+from typing import Any, cast, List, Optional
 
-from launch import Action, Event, EventHandler, LaunchContext, SomeSubstitutionsType
-from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler
-from launch.launch_description_entity import LaunchDescriptionEntity
+from launch import EventHandler, LaunchContext, LaunchDescriptionEntity, SomeSubstitutionsType
+from launch.actions import OpaqueFunction
 import launch.logging
-from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
 from ..events.lifecycle import ChangeState, StateTransition
-from ..events.matchers import matches_node_name
-from ..ros_adapters import get_ros_node
-from ._services import call_service
+from ..ros_adapters import call_service, get_ros_node
 from .node import Node
 
 
@@ -78,92 +74,3 @@ class LifecycleNode(Node):
             matcher=lambda event: isinstance(event, ChangeState),
             entities=[OpaqueFunction(function=self._on_change_state_event)]))
         return super().execute(context)
-
-
-class LifecycleTransition(Action):
-    """
-    Takes nodes with a lifecycle through transitions, each when the one before is done.
-
-    :raises ValueError: for no nodes or no transitions; when executed, for a transition that
-        isn't a number.
-    """
-
-    transition_targets = {
-        1: {'start_state': 'configuring', 'goal_state': 'inactive'},
-        2: {'start_state': 'cleaningup', 'goal_state': 'unconfigured'},
-        3: {'start_state': 'activating', 'goal_state': 'active'},
-        4: {'start_state': 'deactivating', 'goal_state': 'inactive'},
-        5: {'start_state': 'shuttingdown', 'goal_state': 'finalized'},
-        6: {'start_state': 'shuttingdown', 'goal_state': 'finalized'},
-        7: {'start_state': 'shuttingdown', 'goal_state': 'finalized'},
-    }
-
-    def __init__(
-        self, *, lifecycle_node_names: Iterable[SomeSubstitutionsType],
-        transition_ids: Iterable[Union[int, SomeSubstitutionsType]], **kwargs: Any
-    ) -> None:
-        super().__init__(**kwargs)
-        self.__transition_ids = [
-            normalize_to_list_of_substitutions(str(one) if isinstance(one, int) else one)
-            for one in transition_ids]
-        self.__lifecycle_node_names = [
-            normalize_to_list_of_substitutions(name) for name in lifecycle_node_names]
-        if not self.__transition_ids:
-            raise ValueError('No transition_ids provided.')
-        if not self.__lifecycle_node_names:
-            raise ValueError('No lifecycle_node_names provided.')
-        self.__event_handlers: Dict[str, List[EventHandler]] = {}
-        self.__logger = launch.logging.get_logger(__name__)
-
-    def _remove_event_handlers(
-        self, context: LaunchContext, node_name: str, reason: Optional[str] = None
-    ) -> None:
-        if reason is not None:
-            self.__logger.info(f"Stopping transitions for {node_name} because '{reason}'")
-        for handler in self.__event_handlers[node_name]:
-            if handler in context._event_handlers:
-                context.unregister_event_handler(handler)
-
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
-        from ..event_handlers import OnStateTransition
-        numbers: List[int] = []
-        for substitutions in self.__transition_ids:
-            text = perform_substitutions(context, substitutions)
-            try:
-                numbers.append(int(text))
-            except ValueError as exc:
-                raise ValueError(
-                    f'expected integer for lifecycle transition, got {text}') from exc
-        entities: List[LaunchDescriptionEntity] = []
-        for substitutions in self.__lifecycle_node_names:
-            node = perform_substitutions(context, substitutions)
-            emits: List[LaunchDescriptionEntity] = [
-                EmitEvent(event=ChangeState(
-                    lifecycle_node_matcher=matches_node_name(node), transition_id=number))
-                for number in numbers]
-            remove = functools.partial(self._remove_event_handlers, node_name=node)
-            handlers: List[EventHandler] = [
-                OnStateTransition(
-                    matcher=_transition_of(node, **self.transition_targets[number]),
-                    entities=[following], handle_once=True)
-                for number, following in zip(numbers, [
-                    *emits[1:], OpaqueFunction(function=remove)])]
-            entities += [RegisterEventHandler(handler) for handler in handlers]
-            on_error = EventHandler(
-                matcher=_transition_of(node, goal_state='errorprocessing'), handle_once=True,
-                entities=[OpaqueFunction(function=functools.partial(
-                    remove, reason='error occured during transitions'))])
-            context.register_event_handler(on_error)
-            self.__event_handlers[node] = [*handlers, on_error]
-            entities.append(emits[0])
-        return entities
-
-
-def _transition_of(
-    node: str, *, goal_state: str, start_state: Optional[str] = None
-) -> Callable[[Event], bool]:
-    matches = matches_node_name(node)
-    return lambda event: (
-        isinstance(event, StateTransition) and matches(event.action)
-        and event.goal_state == goal_state
-        and start_state in (None, event.start_state))

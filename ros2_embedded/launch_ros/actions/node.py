@@ -7,14 +7,14 @@ import pathlib
 from tempfile import NamedTemporaryFile
 from typing import Any, Dict, Iterable, List, Optional, Tuple
 
-from launch.action import ParsedAction
+from launch import LaunchDescriptionEntity, SomeSubstitutionsType
+from launch._base import ParsedAction
 from launch.actions import ExecuteProcess
+from launch.actions._environment import parse_pairs
 from launch.frontend import Entity, expose_action, Parser
 from launch.frontend.type_utils import get_data_type_from_identifier
 from launch.launch_context import LaunchContext
-from launch.launch_description_entity import LaunchDescriptionEntity
 import launch.logging
-from launch.some_substitutions_type import SomeSubstitutionsType
 from launch.substitutions import LocalSubstitution
 from launch.utilities import (
     ensure_argument_type,
@@ -40,11 +40,7 @@ from ..utilities.namespace_utils import check_namespace, check_node_name
 
 
 class NodeActionExtension:
-    """
-    Changes how nodes are executed; entry point group ``launch_ros.node_action``.
-
-    :raises PluginException: if the extension is for another version.
-    """
+    """Changes how nodes are executed; entry point group ``launch_ros.node_action``."""
 
     NAME: Optional[str] = None
     EXTENSION_POINT_VERSION = '0.1'
@@ -70,7 +66,6 @@ class Node(ExecuteProcess):
     Executes a node.
 
     :param executable: a file name in the package, or without a package a path.
-    :param name: of the node; without one it is what the executable says.
     :param exec_name: the process's name in the launch.
     :param parameters: files and dictionaries; later ones win.
     :param remappings: pairs of names.
@@ -78,6 +73,8 @@ class Node(ExecuteProcess):
     :param arguments: what goes to the executable itself.
     """
 
+    _texts = {'executable': 'exec', 'package': 'pkg?', 'name': 'name?', 'exec_name': 'exec_name?',
+              'namespace': 'namespace?'}
     UNSPECIFIED_NODE_NAME = '<node_name_unspecified>'
     UNSPECIFIED_NODE_NAMESPACE = '<node_namespace_unspecified>'
 
@@ -126,12 +123,7 @@ class Node(ExecuteProcess):
 
     @staticmethod
     def parse_nested_parameters(params: List[Entity], parser: Parser) -> List[Any]:
-        """
-        Return ``parameters`` from ``<param name= value=/>`` and ``<param from=/>`` elements.
-
-        :raises RuntimeError: for attributes that exclude each other.
-        :raises ValueError: for an element with neither name nor file.
-        """
+        """Return ``parameters`` from ``<param name= value=/>`` and ``<param from=/>``."""
         def read_named(elements: List[Entity]) -> Dict[Any, Any]:
             values: Dict[Any, Any] = {}
             for element in elements:
@@ -180,23 +172,12 @@ class Node(ExecuteProcess):
     def parse(
         cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
     ) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser, ignore=['cmd', *(ignore or ())])
-        kwargs.pop('name', None)
+        _, kwargs = super().parse(entity, parser, ignore=['cmd', 'name', *(ignore or ())])
         for name, attribute in (('arguments', 'args'), ('ros_arguments', 'ros_args')):
             text = entity.get_attr(attribute, optional=True)
             if text is not None:
                 kwargs[name] = cls._parse_cmdline(text, parser)
-        for name, attribute in (
-            ('name', 'name'), ('exec_name', 'exec_name'), ('package', 'pkg'),
-            ('namespace', 'namespace')
-        ):
-            text = entity.get_attr(attribute, optional=True)
-            if text is not None:
-                kwargs[name] = parser.parse_substitution(text)
-        kwargs['executable'] = parser.parse_substitution(entity.get_attr('exec'))
-        remappings = parse_remappings(entity, parser)
-        if remappings is not None:
-            kwargs['remappings'] = remappings
+        kwargs['remappings'] = parse_remappings(entity, parser)
         parameters = entity.get_attr('param', data_type=List[Entity], optional=True)
         if parameters is not None:
             kwargs['parameters'] = cls.parse_nested_parameters(parameters, parser)
@@ -204,28 +185,20 @@ class Node(ExecuteProcess):
 
     @property
     def node_package(self) -> Optional[SomeSubstitutionsType]:
-        """The package as it was given."""
         return self.__package
 
     @property
     def node_executable(self) -> SomeSubstitutionsType:
-        """The executable as it was given."""
         return self.__node_executable
 
     @property
     def node_name(self) -> str:
-        """
-        The node's full name; what isn't specified is so named.
-
-        :raises RuntimeError: before the action executes.
-        """
         if self.__final_node_name is None:
             raise RuntimeError("cannot access 'node_name' before executing action")
         return self.__final_node_name
 
     @property
     def expanded_node_namespace(self) -> str:
-        """The namespace, once substitutions are performed."""
         return self.__expanded_node_namespace
 
     @property
@@ -234,7 +207,6 @@ class Node(ExecuteProcess):
         return self.__expanded_remappings
 
     def is_node_name_fully_specified(self) -> bool:
-        """Say whether name and namespace are known."""
         return (self.UNSPECIFIED_NODE_NAME not in self.node_name
                 and self.UNSPECIFIED_NODE_NAMESPACE not in self.node_name)
 
@@ -349,12 +321,5 @@ class Node(ExecuteProcess):
 
 def parse_remappings(entity: Entity, parser: Parser) -> Optional[List[Any]]:
     """Return ``remappings`` from ``<remap from= to=/>`` elements, if there are any."""
-    remaps = entity.get_attr('remap', data_type=List[Entity], optional=True)
-    if remaps is None:
-        return None
-    rules = [
-        (parser.parse_substitution(remap.get_attr('from')),
-         parser.parse_substitution(remap.get_attr('to'))) for remap in remaps]
-    for remap in remaps:
-        remap.assert_entity_completely_parsed()
-    return rules
+    pairs = parse_pairs(entity, parser, 'remap', 'from', 'to')
+    return None if pairs is None else list(pairs.items())

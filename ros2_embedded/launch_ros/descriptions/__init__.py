@@ -1,11 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
 """What nodes are made of."""
-from launch._aliases import missing
+from __future__ import annotations
+
+from typing import Any, Dict, List, Optional, Tuple, Type
+
+from launch import Action, Condition, SomeSubstitutionsType
+from launch._aliases import alias_submodules, missing
+from launch.frontend import Entity, Parser
+from launch.substitutions import normalized_default
+from launch.utilities import normalize_to_list_of_substitutions
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
-from .composable_node import ComposableNode
+from ..parameters_type import SomeParameters
+from ..remap_rule_type import SomeRemapRules
+from ..utilities import normalize_parameters, normalize_remap_rules
 
 __all__ = ['ComposableNode', 'Parameter', 'ParameterFile', 'ParameterValue']
+
+
+class ComposableNode:
+    """
+    A node for a container to load.
+
+    :param plugin: the node's class.
+    :param extra_arguments: for the container, such as ``use_intra_process_comms``.
+    """
+
+    def __init__(
+        self, *, package: SomeSubstitutionsType, plugin: SomeSubstitutionsType,
+        name: Optional[SomeSubstitutionsType] = None,
+        namespace: Optional[SomeSubstitutionsType] = None,
+        parameters: Optional[SomeParameters] = None,
+        remappings: Optional[SomeRemapRules] = None,
+        extra_arguments: Optional[SomeParameters] = None,
+        condition: Optional[Condition] = None
+    ) -> None:
+        self.package = normalize_to_list_of_substitutions(package)
+        self.node_plugin = normalize_to_list_of_substitutions(plugin)
+        self.node_name = normalized_default(name)
+        self.node_namespace = normalized_default(namespace)
+        self.parameters = None if parameters is None else normalize_parameters(parameters)
+        self.remappings = list(normalize_remap_rules(remappings)) if remappings else None
+        self.extra_arguments = normalize_parameters(extra_arguments) if extra_arguments else None
+        self.__condition = condition
+
+    @classmethod
+    def parse(
+        cls, parser: Parser, entity: Entity
+    ) -> Tuple[Type[ComposableNode], Dict[str, Any]]:
+        from ..actions import Node
+        from ..actions.node import parse_remappings
+        _, kwargs = Action.parse(entity, parser)
+        for name, attribute in (('package', 'pkg'), ('plugin', 'plugin'), ('name', 'name')):
+            kwargs[name] = parser.parse_substitution(entity.get_attr(attribute))
+        namespace = entity.get_attr('namespace', optional=True)
+        if namespace is not None:
+            kwargs['namespace'] = parser.parse_substitution(namespace)
+        parameters = entity.get_attr('param', data_type=List[Entity], optional=True)
+        if parameters is not None:
+            kwargs['parameters'] = Node.parse_nested_parameters(parameters, parser)
+        kwargs['remappings'] = parse_remappings(entity, parser)
+        extra = entity.get_attr('extra_arg', data_type=List[Entity], optional=True) or ()
+        kwargs['extra_arguments'] = [
+            {tuple(parser.parse_substitution(argument.get_attr('name'))):
+             parser.parse_substitution(argument.get_attr('value'))} for argument in extra]
+        for argument in extra:
+            argument.assert_entity_completely_parsed()
+        entity.assert_entity_completely_parsed()
+        return cls, kwargs
+
+    def condition(self) -> Optional[Condition]:
+        return self.__condition
+
+
+alias_submodules(__name__, ('ComposableNode',))
 
 
 def __getattr__(name: str) -> object:

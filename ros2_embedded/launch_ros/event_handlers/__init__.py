@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Callable, Optional
 
+from launch import Event, EventHandler, SomeEntitiesType
 from launch._aliases import alias_submodules
-from launch.event import Event
-from launch.event_handler import EventHandler
-from launch.some_entities_type import SomeEntitiesType
 
 from ..actions import LifecycleNode
 from ..events.lifecycle import StateTransition

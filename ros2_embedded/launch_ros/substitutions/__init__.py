@@ -4,56 +4,39 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import Any, Dict, List, Sequence, Tuple, Type
+from typing import Any, Tuple
 
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from launch import SomeSubstitutionsType
 from launch._aliases import alias_submodules, missing
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
-from launch.some_substitutions_type import SomeSubstitutionsType
-from launch.substitution import Substitution
-from launch.substitutions import SubstitutionFailure
-from launch.substitutions._values import normalized_default
+from launch.substitutions import (
+    described,
+    normalized_default,
+    ParsedSubstitution,
+    SubstitutionFailure,
+)
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
 __all__ = [
     'ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare', 'Parameter']
 
-Parsed = Tuple[Type[Any], Dict[str, Any]]
 
+class FindPackage(ParsedSubstitution):
+    """Base of those that find a package; PackageNotFoundError if there is no such."""
 
-def _described(substitutions: Sequence[Substitution]) -> str:
-    return ' + '.join(sub.describe() for sub in substitutions)
-
-
-class FindPackage(Substitution):
-    """Base of those that find a package."""
+    _parameters: Tuple[str, ...] = ('package',)
 
     def __init__(self, package: SomeSubstitutionsType) -> None:
         super().__init__()
-        self.__package = normalize_to_list_of_substitutions(package)
-
-    @classmethod
-    def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
-        """Read ``$(name package)``."""
-        if not data or len(data) != 1:
-            raise AttributeError('find package substitutions expect 1 argument')
-        return cls, {'package': data[0]}
-
-    @property
-    def package(self) -> List[Substitution]:
-        """The package's name."""
-        return self.__package
+        self.package = normalize_to_list_of_substitutions(package)
 
     def find(self, package_name: str) -> str:
-        """
-        Return the path that is looked for.
-
-        :raises ament_index_python.packages.PackageNotFoundError: if there is no such package.
-        """
         raise NotImplementedError()
 
     def describe(self) -> str:
-        return f'{type(self).__name__}(pkg={_described(self.package)})'
+        return f'{type(self).__name__}(pkg={described(self.package)})'
 
     def perform(self, context: LaunchContext) -> str:
         return self.find(perform_substitutions(context, self.package))
@@ -61,46 +44,29 @@ class FindPackage(Substitution):
 
 @expose_substitution('find-pkg-prefix')
 class FindPackagePrefix(FindPackage):
-    """The directory that a package is installed below."""
 
     def find(self, package_name: str) -> str:
-        from ament_index_python.packages import get_package_prefix
         return str(get_package_prefix(package_name))
 
 
 @expose_substitution('find-pkg-share')
 class FindPackageShare(FindPackage):
-    """A package's share directory."""
 
     def find(self, package_name: str) -> str:
-        from ament_index_python.packages import get_package_share_directory
         return str(get_package_share_directory(package_name))
 
 
 @expose_substitution('exec-in-pkg')
 class ExecutableInPackage(FindPackagePrefix):
-    """The path of a package's executable."""
 
-    def __init__(
-        self, executable: SomeSubstitutionsType, package: SomeSubstitutionsType
-    ) -> None:
+    _parameters = ('executable', 'package')
+
+    def __init__(self, executable: SomeSubstitutionsType, package: SomeSubstitutionsType) -> None:
         super().__init__(package)
-        self.__executable = normalize_to_list_of_substitutions(executable)
-
-    @classmethod
-    def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
-        """Read ``$(exec-in-pkg executable package)``."""
-        if not data or len(data) != 2:
-            raise AttributeError('exec-in-package substitution expects 2 arguments')
-        return cls, {'executable': data[0], 'package': data[1]}
-
-    @property
-    def executable(self) -> List[Substitution]:
-        """The executable's name."""
-        return self.__executable
+        self.executable = normalize_to_list_of_substitutions(executable)
 
     def describe(self) -> str:
-        return f'ExecInPkg(pkg={_described(self.package)}, exec={_described(self.executable)})'
+        return f'ExecInPkg(pkg={described(self.package)}, exec={described(self.executable)})'
 
     def perform(self, context: LaunchContext) -> str:
         executable = perform_substitutions(context, self.executable)
@@ -119,28 +85,18 @@ class ExecutableInPackage(FindPackagePrefix):
 
 
 @expose_substitution('param')
-class Parameter(Substitution):
+class Parameter(ParsedSubstitution):
     """The value that SetParameter gave a parameter for all nodes, or the default."""
+
+    _parameters = ('name', 'default?')
 
     def __init__(self, name: SomeSubstitutionsType, *, default: Any = None) -> None:
         super().__init__()
-        self.__name = normalize_to_list_of_substitutions(name)
+        self.name = normalize_to_list_of_substitutions(name)
         self.__default = normalized_default(default)
 
-    @classmethod
-    def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
-        """Read ``$(param name [default])``."""
-        if len(data) < 1 or len(data) > 2:
-            raise TypeError('param substitution expects 1 or 2 arguments')
-        return cls, dict(zip(('name', 'default'), data))
-
-    @property
-    def name(self) -> List[Substitution]:
-        """The parameter's name."""
-        return self.__name
-
     def describe(self) -> str:
-        return f'{type(self).__name__}(name={_described(self.name)})'
+        return f'Parameter(name={described(self.name)})'
 
     def perform(self, context: LaunchContext) -> str:
         name = perform_substitutions(context, self.name)
@@ -152,8 +108,8 @@ class Parameter(Substitution):
         return perform_substitutions(context, self.__default)
 
 
-alias_submodules(__name__, __all__, {
-    'find_package': ('FindPackage', 'FindPackagePrefix', 'FindPackageShare')})
+alias_submodules(__name__, __all__, find_package=(
+    'FindPackage', 'FindPackagePrefix', 'FindPackageShare'))
 
 
 def __getattr__(name: str) -> object:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Dict, List
 
+from launch import Substitution
 from launch.launch_context import LaunchContext
-from launch.substitution import Substitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 
 from ..parameter_descriptions import Parameter as ParameterDescription

@@ -9,12 +9,10 @@ _NAME = '[A-Za-z_][A-Za-z0-9_]*'
 
 
 def is_root_namespace(ns: str) -> bool:
-    """Say whether it is '/'."""
     return ns == '/'
 
 
 def is_namespace_absolute(ns: str) -> bool:
-    """Say whether it begins with '/'."""
     return ns.startswith('/')
 
 
@@ -32,18 +30,11 @@ def prefix_namespace(base_ns: Optional[str], ns: Optional[str]) -> Optional[str]
 
 
 def make_namespace_absolute(ns: OptionalText) -> OptionalText:
-    """Return the namespace with '/' in front; None stays None."""
-    if ns is None or is_namespace_absolute(ns):
-        return ns
-    return '/' + ns
+    return ns if ns is None or is_namespace_absolute(ns) else '/' + ns
 
 
 def check_node_name(name: str) -> None:
-    """
-    Refuse what can't be a node's name.
-
-    :raises rclpy.exceptions.InvalidNodeNameException: saying why.
-    """
+    """Raise rclpy's InvalidNodeNameException for what can't be a node's name."""
     if len(name) > 255 or not re.fullmatch(_NAME, name):
         # Only its error is needed: importing rclpy takes longer than all else here.
         from rclpy.validate_node_name import validate_node_name
@@ -51,11 +42,7 @@ def check_node_name(name: str) -> None:
 
 
 def check_namespace(namespace: str) -> None:
-    """
-    Refuse what can't be an absolute namespace.
-
-    :raises rclpy.exceptions.InvalidNamespaceException: saying why.
-    """
+    """Raise rclpy's InvalidNamespaceException for what can't be an absolute namespace."""
     if len(namespace) > 245 or not re.fullmatch(f'/|(/{_NAME})+', namespace):
         from rclpy.validate_namespace import validate_namespace
         validate_namespace(namespace)

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Dict, List, Optional, Tuple
 
-from launch.some_substitutions_type import SomeSubstitutionsType_types_tuple
-from launch.substitution import Substitution
+from launch import SomeSubstitutionsType_types_tuple, Substitution
 from launch.substitutions import TextSubstitution
 from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
 

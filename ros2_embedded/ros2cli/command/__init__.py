@@ -70,39 +70,6 @@ class _LateText:
         return self.value % values
 
 
-def _add_subparsers(
-    parser: Any, cli_name: str, dest: str, description: Any, required: bool
-) -> Any:
-    subparser = parser.add_subparsers(
-        title='Commands', description=description,
-        metavar=f'Call `{cli_name} <command> -h` for more detailed usage.')
-    # With a space no attribute of the namespace can be in the way.
-    subparser.dest = ' ' + dest.lstrip('_')
-    subparser.required = required
-    return subparser
-
-
-def add_subparsers(
-    parser: Any, cli_name: str, dest: str, command_extensions: Dict[str, Any],
-    hide_extensions: Optional[List[str]] = None, required: bool = True
-) -> Any:
-    """Add a parser for each extension; deprecated, see :func:`add_subparsers_on_demand`."""
-    import warnings
-    warnings.warn(
-        "'ros2cli.command.add_subparsers' is deprecated, use "
-        "'ros2cli.command.add_subparsers_on_demand' instead", stacklevel=2)
-    subparser = _add_subparsers(
-        parser, cli_name, dest, _describe(command_extensions, hide_extensions), required)
-    for name, extension in sorted(command_extensions.items()):
-        command_parser = subparser.add_parser(
-            extension.NAME, description=get_first_line_doc(extension),
-            formatter_class=argparse.RawDescriptionHelpFormatter)
-        command_parser.set_defaults(**{dest: extension})
-        if hasattr(extension, 'add_arguments'):
-            extension.add_arguments(command_parser, f'{cli_name} {name}')
-    return subparser
-
-
 class SuppressUsageOutput:
     """Keeps parsers, while entered, from printing help and from exiting with success."""
 
@@ -137,7 +104,12 @@ def add_subparsers_on_demand(
     :param argv: the arguments, by default the process's.
     """
     description = _LateText()
-    subparser = _add_subparsers(parser, cli_name, dest, description, required)
+    subparser = parser.add_subparsers(
+        title='Commands', description=description,
+        metavar=f'Call `{cli_name} <command> -h` for more detailed usage.')
+    # With a space no attribute of the namespace can be in the way.
+    subparser.dest = ' ' + dest.lstrip('_')
+    subparser.required = required
     names = get_entry_points(group_name).keys()
     parsers = {
         name: subparser.add_parser(

@@ -21,11 +21,7 @@ from ros2cli.plugin_system import satisfies_version
 
 
 class OptionExtension:
-    """
-    Further options of ``ros2 launch``; entry point group ``ros2launch.option``.
-
-    :raises PluginException: if the extension is for another version.
-    """
+    """Further options of ``ros2 launch``; entry point group ``ros2launch.option``."""
 
     NAME: Optional[str] = None
     EXTENSION_POINT_VERSION = '0.1'

@@ -29,7 +29,6 @@ class PrefixVerb(VerbExtension):
     """Output the prefix path of a package."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
-        """Add the verb's arguments."""
         argument = parser.add_argument('package_name', help='The package name')
         argument.completer = package_name_completer
         parser.add_argument(
@@ -47,7 +46,6 @@ class ExecutablesVerb(VerbExtension):
     """Output a list of package specific executables."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
-        """Add the verb's arguments."""
         argument = parser.add_argument('package_name', nargs='?', help='The package name')
         argument.completer = package_name_completer
         parser.add_argument(
@@ -69,7 +67,6 @@ class XmlVerb(VerbExtension):
     """Output the XML of the package manifest or a specific tag."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
-        """Add the verb's arguments."""
         argument = parser.add_argument('package_name', help='The package name')
         argument.completer = package_name_completer
         parser.add_argument(

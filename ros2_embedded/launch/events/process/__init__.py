@@ -6,36 +6,20 @@ import signal as signal_module
 from typing import Any, Callable, Dict, List, Optional, TYPE_CHECKING, Union
 
 from ..._aliases import alias_submodules
-from ...event import Event
+from ..._base import Event
 from ...utilities import ensure_argument_type
 
 if TYPE_CHECKING:
-    from ...actions import ExecuteLocal, ExecuteProcess
+    from ...actions import ExecuteProcess
 
 __all__ = [
-    'matches_executable',
-    'matches_name',
-    'matches_pid',
-    'ProcessExited',
-    'ProcessIO',
-    'ProcessStarted',
-    'ProcessStderr',
-    'ProcessStdin',
-    'ProcessStdout',
-    'ProcessTargetedEvent',
-    'RunningProcessEvent',
-    'ShutdownProcess',
-    'SignalProcess',
-]
+    'matches_executable', 'matches_name', 'matches_pid', 'ProcessExited', 'ProcessIO',
+    'ProcessStarted', 'ProcessStderr', 'ProcessStdin', 'ProcessStdout', 'ProcessTargetedEvent',
+    'RunningProcessEvent', 'ShutdownProcess', 'SignalProcess']
 
 
 class RunningProcessEvent(Event):
-    """
-    Something happened to a process.
-
-    :param action: the action that started it.
-    :param name: unique among the launch's processes.
-    """
+    """Something happened to a process; its name is unique in the launch."""
 
     name = 'launch.events.process.RunningProcessEvent'
 
@@ -44,52 +28,15 @@ class RunningProcessEvent(Event):
         env: Optional[Dict[str, str]], pid: int
     ) -> None:
         super().__init__()
-        self.__action = action
-        self.__name = name
-        self.__cmd = cmd
-        self.__cwd = cwd
-        self.__env = env
-        self.__pid = pid
-
-    @property
-    def action(self) -> ExecuteProcess:
-        """The action that started the process."""
-        return self.__action
-
-    @property
-    def execute_process_action(self) -> ExecuteProcess:
-        """The action that started the process."""
-        return self.__action
-
-    @property
-    def process_name(self) -> str:
-        """The process's name, unique in this launch."""
-        return self.__name
-
-    @property
-    def cmd(self) -> List[str]:
-        """The command."""
-        return self.__cmd
-
-    @property
-    def cwd(self) -> Optional[str]:
-        """The working directory, None for the launch's."""
-        return self.__cwd
-
-    @property
-    def env(self) -> Optional[Dict[str, str]]:
-        """The whole environment."""
-        return self.__env
-
-    @property
-    def pid(self) -> int:
-        """The process id."""
-        return self.__pid
+        self.action = self.execute_process_action = action
+        self.process_name = name
+        self.cmd = cmd
+        self.cwd = cwd
+        self.env = env
+        self.pid = pid
 
 
 class ProcessStarted(RunningProcessEvent):
-    """A process has been started."""
-
     name = 'launch.events.process.ProcessStarted'
 
 
@@ -100,12 +47,7 @@ class ProcessExited(RunningProcessEvent):
 
     def __init__(self, *, returncode: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__returncode = returncode
-
-    @property
-    def returncode(self) -> int:
-        """The exit status, or minus the signal."""
-        return self.__returncode
+        self.returncode = returncode
 
 
 class ProcessIO(RunningProcessEvent):
@@ -115,33 +57,11 @@ class ProcessIO(RunningProcessEvent):
 
     def __init__(self, *, text: bytes, fd: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.__text = text
-        self.__fd = fd
-
-    @property
-    def text(self) -> bytes:
-        """The bytes."""
-        return self.__text
-
-    @property
-    def from_stdin(self) -> bool:
-        """Whether it is standard input."""
-        return self.__fd == 0
-
-    @property
-    def from_stdout(self) -> bool:
-        """Whether it is standard output."""
-        return self.__fd == 1
-
-    @property
-    def from_stderr(self) -> bool:
-        """Whether it is standard error."""
-        return self.__fd == 2
+        self.text = text
+        self.from_stdin, self.from_stdout, self.from_stderr = fd == 0, fd == 1, fd == 2
 
 
 class ProcessStdin(ProcessIO):
-    """Bytes for a process's standard input."""
-
     name = 'launch.events.process.ProcessStdin'
 
     def __init__(self, *, text: bytes, **kwargs: Any) -> None:
@@ -149,8 +69,6 @@ class ProcessStdin(ProcessIO):
 
 
 class ProcessStdout(ProcessIO):
-    """Bytes from a process's standard output."""
-
     name = 'launch.events.process.ProcessStdout'
 
     def __init__(self, *, text: bytes, **kwargs: Any) -> None:
@@ -158,15 +76,13 @@ class ProcessStdout(ProcessIO):
 
 
 class ProcessStderr(ProcessIO):
-    """Bytes from a process's standard error."""
-
     name = 'launch.events.process.ProcessStderr'
 
     def __init__(self, *, text: bytes, **kwargs: Any) -> None:
         super().__init__(text=text, fd=2, **kwargs)
 
 
-Matcher = Callable[['ExecuteLocal'], bool]
+Matcher = Callable[[Any], bool]
 
 
 class ProcessTargetedEvent(Event):
@@ -176,12 +92,7 @@ class ProcessTargetedEvent(Event):
 
     def __init__(self, *, process_matcher: Matcher) -> None:
         super().__init__()
-        self.__process_matcher = process_matcher
-
-    @property
-    def process_matcher(self) -> Matcher:
-        """Says of an action whether its process is meant."""
-        return self.__process_matcher
+        self.process_matcher = process_matcher
 
 
 class ShutdownProcess(ProcessTargetedEvent):
@@ -191,8 +102,6 @@ class ShutdownProcess(ProcessTargetedEvent):
 
 
 class SignalProcess(ProcessTargetedEvent):
-    """Processes are to get a signal, given by name or number."""
-
     name = 'launch.events.process.SignalProcess'
 
     def __init__(
@@ -201,17 +110,8 @@ class SignalProcess(ProcessTargetedEvent):
         super().__init__(process_matcher=process_matcher)
         ensure_argument_type(
             signal_number, (str, signal_module.Signals), 'signal_number', 'SignalProcess')
-        self.__signal = signal_number
-
-    @property
-    def signal(self) -> Union[str, signal_module.Signals]:
-        """The signal as it was given."""
-        return self.__signal
-
-    @property
-    def signal_name(self) -> str:
-        """The signal's name, such as SIGINT."""
-        return self.__signal if isinstance(self.__signal, str) else self.__signal.name
+        self.signal = signal_number
+        self.signal_name = signal_number if isinstance(signal_number, str) else signal_number.name
 
 
 def _matches(check: Callable[[Dict[str, Any]], bool]) -> Matcher:
@@ -219,19 +119,16 @@ def _matches(check: Callable[[Dict[str, Any]], bool]) -> Matcher:
 
 
 def matches_pid(pid: int) -> Matcher:
-    """Return a matcher for the action whose process has this id."""
     return _matches(lambda details: details['pid'] == pid)
 
 
 def matches_name(name: str) -> Matcher:
-    """Return a matcher for the action whose process has this name."""
     return _matches(lambda details: details['name'] == name)
 
 
 def matches_executable(executable: str) -> Matcher:
-    """Return a matcher for actions whose command's first word ends so."""
     return _matches(lambda details: details['cmd'][0].endswith(executable))
 
 
-alias_submodules(__name__, __all__[3:], {
-    'process_matchers': ('matches_executable', 'matches_name', 'matches_pid')})
+alias_submodules(__name__, __all__, process_matchers=(
+    'matches_executable', 'matches_name', 'matches_pid'))
