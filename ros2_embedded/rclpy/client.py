@@ -15,13 +15,14 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile
 from rclpy.service import REQUEST_HEADER
+from rclpy.service_introspection import Introspected
 from rclpy.task import Future
 from rosidl_embedded import cdr
 
 _numbers = iter(range(1, 2 ** 63))
 
 
-class Client(Entity):
+class Client(Introspected, Entity):
     """Calls a service; made by :meth:`.Node.create_client`."""
 
     def __init__(self, context: Context, client_impl: tuple[Reader, Writer], srv_type: Any,
@@ -60,6 +61,7 @@ class Client(Entity):
                 future = self._pending_requests.get(number)
             if future is None:
                 return None  # nobody waits for it any more
+            self._tell(3, self._writer.guid, number, response=response)
             future._set_executor(executor)
             return future.set_result, (response,), None
         return None
@@ -98,6 +100,7 @@ class Client(Entity):
         future.add_done_callback(self.remove_pending_request)
         prefix = cdr.HEADER + REQUEST_HEADER.pack(self._identity, number)
         try:
+            self._tell(0, self._writer.guid, number, request=request)
             self._writer.write(cdr.serialize(request, prefix))
         except (AssertionError, _dds.DDSError):
             self.remove_pending_request(future)
@@ -170,5 +173,7 @@ class Client(Entity):
         """Free it; a program calls :meth:`.Node.destroy_client`."""
         if not self._destroyed:
             self._destroyed = True
+            if self._events is not None:
+                self._events.close()
             self._reader.close()
             self._writer.close()

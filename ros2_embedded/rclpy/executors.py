@@ -264,6 +264,23 @@ class Executor(AbstractContextManager['Executor']):
                 task._has_yielded = False
             waited = True
 
+    def wait_for_ready_callbacks(
+            self, timeout_sec: float | None = None, nodes: 'list[Node] | None' = None,
+            condition: Callable[[], bool] = lambda: False) -> tuple[Task, Any, 'Node | None']:
+        """
+        Wait for something to do, for executors of one's own: a task to call, its entity and node.
+
+        :raises TimeoutException: when the time is over.
+        :raises ShutdownException: when the executor is shut down.
+        :raises ExternalShutdownException: when the context is shut down.
+        :raises ConditionReachedException: when the condition holds.
+        """
+        found, work = self._next(timeout_sec, condition)
+        if work is None:
+            return found, None, None
+        owner = next((node for node in self.get_nodes() if found in node._entities()), None)
+        return Task(self._execute, (found, work), executor=self), found, owner
+
     # --- executing ---
 
     def _begin(self) -> None:

@@ -2,7 +2,7 @@
 """Nodes."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, TYPE_CHECKING
+from typing import Any
 import weakref
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
@@ -24,6 +24,7 @@ from rclpy.constants import S_TO_NS
 from rclpy.context import Context
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NodeNameNonExistentError, NotInitializedException
+from rclpy.executors import Executor
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
@@ -49,9 +50,6 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 from rclpy.waitable import Waitable
-
-if TYPE_CHECKING:
-    from rclpy.executors import Executor
 
 __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 
@@ -215,12 +213,12 @@ class Node(NodeParameters, NodeGraph):
                 *self._clients, *self._services]
 
     @property
-    def executor(self) -> 'Executor | None':
+    def executor(self) -> Executor | None:
         """The executor it was added to."""
         return self._executor_reference() if self._executor_reference is not None else None
 
     @executor.setter
-    def executor(self, new_executor: 'Executor | None') -> None:
+    def executor(self, new_executor: Executor | None) -> None:
         current = self.executor
         if current is new_executor:
             return
@@ -231,7 +229,7 @@ class Node(NodeParameters, NodeGraph):
             self._executor_reference = weakref.ref(new_executor)
             new_executor.add_node(self)
 
-    def _forget_executor(self, executor: 'Executor') -> None:
+    def _forget_executor(self, executor: Executor) -> None:
         if self.executor is executor:
             self._executor_reference = None
 
@@ -423,6 +421,13 @@ class Node(NodeParameters, NodeGraph):
         self._graph.add_endpoints(self._record, *made)
         return made[0], made[1]
 
+    def _event_writer(self, srv_type: Any, name: str) -> Callable[[QoSProfile], Writer]:
+        def make(profile: QoSProfile) -> Writer:
+            topic = self.resolve_service_name(name) + '/_service_event'
+            writer: Writer = self._topic_entity(Writer, srv_type.Event, topic, profile, None)[0]
+            return writer
+        return make
+
     def create_client(self, srv_type: Any, srv_name: str, *,
                       qos_profile: QoSProfile = qos_profile_services_default,
                       callback_group: CallbackGroup | None = None) -> Client:
@@ -431,6 +436,7 @@ class Node(NodeParameters, NodeGraph):
         client = Client(
             self._context, self._service_entity(srv_type, srv_name, qos_profile, False),
             srv_type, srv_name, qos_profile, group, self._logger_name)
+        client._make_event_writer = self._event_writer(srv_type, srv_name)
         group.add_entity(client)
         self._clients.append(client)
         self._wake_executor()
@@ -448,6 +454,7 @@ class Node(NodeParameters, NodeGraph):
         service = Service(
             self._service_entity(srv_type, srv_name, qos_profile, True), srv_type, srv_name,
             callback, group, qos_profile, self._logger_name)
+        service._make_event_writer = self._event_writer(srv_type, srv_name)
         group.add_entity(service)
         self._services.append(service)
         self._wake_executor()

@@ -13,6 +13,7 @@ from rclpy._graph import user_data_value
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle, RCLError
 from rclpy.qos import QoSProfile
+from rclpy.service_introspection import Introspected
 from rosidl_embedded import cdr
 
 REQUEST_HEADER = struct.Struct('<Qq')  # rmw_cyclonedds: the client's writer, a sequence number
@@ -26,6 +27,11 @@ class RequestId(NamedTuple):
     sequence_number: int
     publication: int
 
+    @property
+    def gid(self) -> bytes:
+        """The client's id, as others are told it."""
+        return struct.pack('<QQ', self.writer_guid, self.publication)
+
 
 class ServiceInfo(NamedTuple):
     """What is known of a request."""
@@ -35,7 +41,7 @@ class ServiceInfo(NamedTuple):
     request_id: RequestId
 
 
-class Service(Entity):
+class Service(Introspected, Entity):
     """Answers requests; made by :meth:`.Node.create_service`."""
 
     def __init__(self, service_impl: tuple[Reader, Writer], srv_type: Any, srv_name: str,
@@ -67,6 +73,7 @@ class Service(Entity):
                 continue
             info = ServiceInfo(sample.source_timestamp, time.time_ns(),
                                RequestId(client, number, sample.publication))
+            self._tell(1, info.request_id.gid, number, request=request)
             return (self.callback, (request, self.srv_type.Response()),
                     partial(self.send_response, header=info))
         return None
@@ -102,6 +109,7 @@ class Service(Entity):
             time.sleep(0.001)
         if known:
             self._writer.write(data)
+            self._tell(2, request.gid, request.sequence_number, response=response)
 
     @property
     def service_name(self) -> str:
@@ -112,5 +120,7 @@ class Service(Entity):
         """Free it; a program calls :meth:`.Node.destroy_service`."""
         if not self._destroyed:
             self._destroyed = True
+            if self._events is not None:
+                self._events.close()
             self._reader.close()
             self._writer.close()

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 topic|node|service|param`` beside a node that runs."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+NODE = '''
+import rclpy
+from example_interfaces.srv import AddTwoInts
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('worker', namespace='/cell')
+node.declare_parameter('speed', 1.5, ParameterDescriptor(description='how fast'))
+node.declare_parameter('arm.joints', 6)
+publisher = node.create_publisher(String, 'chatter', 10)
+node.create_timer(0.05, lambda: publisher.publish(String(data='hello')))
+node.create_subscription(String, 'orders', lambda message: print(message.data, flush=True), 10)
+def add(request, response):
+    response.sum = request.a + request.b
+    return response
+node.create_service(AddTwoInts, 'add', add)
+print('ready', flush=True)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+'''
+
+
+@pytest.fixture(scope='module')
+def worker():
+    with subprocess.Popen([sys.executable, '-c', NODE], stdout=subprocess.PIPE,
+                          text=True) as process:
+        assert process.stdout.readline() == 'ready\n'
+        yield process
+        process.terminate()
+
+
+def ros2(*command, status=0, timeout=40, end=None):
+    """Run a command; after ``end`` seconds send it SIGINT."""
+    if command[1] in ('list', 'info', 'get', 'set', 'type', 'echo'):
+        command = (*command[:2], '--no-daemon', *command[2:])  # which would outlive the test
+    process = subprocess.Popen(
+        ['ros2', *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    try:
+        if end is not None:
+            try:
+                process.wait(end)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+        process.wait()
+    if status is not None:
+        assert process.returncode == status, errors
+    return out + errors
+
+
+def test_topics(worker):
+    listed = ros2('topic', 'list', '-t').splitlines()
+    assert '/cell/chatter [std_msgs/msg/String]' in listed and '/rosout [' in str(listed)
+    assert ros2('topic', 'type', '/cell/chatter') == 'std_msgs/msg/String\n'
+    assert ros2('topic', 'type', '/none', status=1) == ''
+    counted = ros2('topic', 'list', '-v')
+    assert ' * /cell/chatter [std_msgs/msg/String] 1 publisher\n' in counted
+    assert ' * /cell/orders [std_msgs/msg/String] 1 subscriber\n' in counted
+    info = ros2('topic', 'info', '/cell/chatter')
+    assert info == 'Type: std_msgs/msg/String\nPublisher count: 1\nSubscription count: 0\n'
+    verbose = ros2('topic', 'info', '-v', '/cell/chatter')
+    assert 'Node name: worker\nNode namespace: /cell\n' in verbose
+    assert '  Reliability: RELIABLE\n' in verbose and 'RIHS01_df668c' in verbose
+    assert "Unknown topic '/none'" in ros2('topic', 'info', '/none', status=1)
+
+
+def test_echo(worker):
+    assert ros2('topic', 'echo', '--once', '/cell/chatter') == 'data: hello\n---\n'
+    assert ros2('topic', 'echo', '--once', '--field', 'data', '/cell/chatter') == 'hello\n---\n'
+    assert ros2('topic', 'echo', '--once', '--csv', '/cell/chatter', 'std_msgs/msg/String') == \
+        'hello\n'
+    short = ros2('topic', 'echo', '--once', '--no-str', '--qos-reliability', 'best_effort',
+                 '/cell/chatter')
+    assert short == "data: '<string length: <5>>'\n---\n"
+    assert 'Could not determine the type' in ros2('topic', 'echo', '/none', status=1)
+    assert 'message type is invalid' in ros2('topic', 'echo', '/x', 'no/such', status=1)
+
+
+def test_pub(worker):
+    done = ros2('topic', 'pub', '--once', '/cell/orders', 'std_msgs/msg/String', '{data: go}')
+    assert "publishing #1: std_msgs.msg.String(data='go')" in done
+    assert worker.stdout.readline() == 'go\n'
+    done = ros2('topic', 'pub', '-r', '50', '-t', '3', '-p', '3', '/cell/orders',
+                'std_msgs/msg/String', 'data: more')
+    assert done.count('publishing #') == 1 and 'publishing #3' in done
+    assert [worker.stdout.readline() for _ in range(3)] == ['more\n'] * 3
+    for values, text in (('{datum: 1}', 'Failed to populate field'),
+                         ('3', 'needs to be a dictionary')):
+        assert text in ros2('topic', 'pub', '--once', '-w', '0', '/x', 'std_msgs/msg/String',
+                            values, status=1)
+
+
+def test_rates(worker):
+    rate = ros2('topic', 'hz', '/cell/chatter', end=3, status=None)
+    assert 'average rate: ' in rate
+    assert 15 < float(rate.split('average rate: ')[1].split()[0]) < 25
+    width = ros2('topic', 'bw', '/cell/chatter', end=3, status=None)
+    assert 'Subscribed to [/cell/chatter]' in width and 'Message size mean: ' in width
+
+
+def test_nodes(worker):
+    assert '/cell/worker' in ros2('node', 'list').splitlines()
+    info = ros2('node', 'info', '/cell/worker').splitlines()
+    assert info[0] == '/cell/worker'
+    assert '    /cell/orders: std_msgs/msg/String' in info
+    assert info.index('    /cell/add: example_interfaces/srv/AddTwoInts') > \
+        info.index('  Service Servers:')
+    assert "Unable to find node '/none'" in ros2('node', 'info', '/none', status=1)
+
+
+def test_services(worker):
+    assert '/cell/add [example_interfaces/srv/AddTwoInts]' in \
+        ros2('service', 'list', '-t').splitlines()
+    called = ros2('service', 'call', '/cell/add', 'example_interfaces/srv/AddTwoInts',
+                  '{a: 3, b: 4}')
+    assert 'requester: making request: example_interfaces.srv.AddTwoInts_Request(a=3, b=4)' in \
+        called
+    assert 'response:\nexample_interfaces.srv.AddTwoInts_Response(sum=7)' in called
+    assert 'service type is invalid' in ros2('service', 'call', '/x', 'no/such', status=1)
+
+
+def test_parameters(worker):
+    assert ros2('param', 'list', '/cell/worker').splitlines() == [
+        '  arm.joints', '  speed', '  start_type_description_service', '  use_sim_time']
+    assert '/cell/worker:' in ros2('param', 'list').splitlines()
+    assert ros2('param', 'get', '/cell/worker', 'speed') == 'Double value is: 1.5\n'
+    assert ros2('param', 'set', '/cell/worker', 'speed', '2.5') == 'Set parameter successful\n'
+    assert ros2('param', 'get', '--hide-type', '/cell/worker', 'speed') == '2.5\n'
+    assert 'Setting parameter failed: Wrong parameter type' in \
+        ros2('param', 'set', '/cell/worker', 'speed', 'fast')
+    assert 'Node not found' in ros2('param', 'get', '/none', 'speed', status=1)
+    assert 'Parameter not set' in ros2('param', 'get', '/cell/worker', 'none', status=1)

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The embedded default and ROS 2 on one wire, where both are installed.
+
+These run on the embedded default and start ROS 2's own programs beside it. ROS2_SETUP names the
+set-up script of a ROS 2 Jazzy that isn't in its usual place.
+"""
+
+import importlib.metadata
+import os
+from pathlib import Path
+import subprocess
+import time
+
+from example_interfaces.srv import AddTwoInts
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+SETUP = Path(os.environ.get('ROS2_SETUP', '/opt/ros/jazzy/setup.sh'))
+LIMIT = 20.0  # seconds until something that should happen hasn't
+
+
+def embedded():
+    try:
+        return importlib.metadata.version('ros2-embedded')
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+pytestmark = [
+    pytest.mark.skipif(not SETUP.is_file(), reason='ROS 2 Jazzy is not installed'),
+    pytest.mark.skipif(not embedded() or 'ROS_DISTRO' in os.environ and os.path.exists(
+        '/opt/ros/jazzy') and '/opt/ros/jazzy' in os.environ.get('PYTHONPATH', ''),
+        reason='this is ROS 2 itself')]
+
+PEER = '''
+import rclpy
+from example_interfaces.srv import AddTwoInts
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('peer', namespace='/real')
+node.declare_parameter('gain', 2.0)
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+node.create_publisher(String, 'latched', latched).publish(String(data='from ROS 2'))
+back = node.create_publisher(String, 'back', 10)
+node.create_subscription(String, 'there', back.publish, 10)
+image = node.create_publisher(Image, 'image_back', 10)
+node.create_subscription(Image, 'image_there', image.publish, 10)
+def add(request, response):
+    response.sum = request.a + request.b
+    return response
+node.create_service(AddTwoInts, 'add', add)
+node.get_logger().info('ready')
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+'''
+
+
+def ros2(*command, **kwargs):
+    """Start a program in ROS 2's environment."""
+    keep = ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'HOME', 'LANG')
+    environment = {name: os.environ[name] for name in keep if name in os.environ}
+    environment.update(PATH='/usr/local/bin:/usr/bin:/bin', PYTHONUNBUFFERED='1')
+    script = f'. "{SETUP}" && export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp && exec "$@"'
+    return subprocess.Popen(['sh', '-c', script, 'sh', *command], env=environment, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **kwargs)
+
+
+def output(*command):
+    with ros2(*command) as process:
+        try:
+            return process.communicate(timeout=60)[0]
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope='module')
+def peer():
+    """A node of ROS 2; what it has written so far."""
+    with ros2('python3', '-c', PEER) as process:
+        lines = [process.stdout.readline()]
+        assert 'ready' in lines[0]
+        yield lines
+        process.terminate()
+        lines += process.communicate(timeout=20)[0].splitlines()
+    assert [line for line in lines if '[WARN]' in line or '[ERROR]' in line] == []
+
+
+class Side:
+    """The embedded side."""
+
+    def __init__(self):
+        self.context = Context()
+        self.context.init(args=[])
+        self.node = rclpy.create_node('ours', namespace='/embedded', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def until(self, condition):
+        end = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < end, 'it did not happen'
+            self.executor.spin_once(timeout_sec=0.05)
+
+
+@pytest.fixture
+def side(peer):
+    made = Side()
+    yield made
+    made.node.destroy_node()
+    made.executor.shutdown()
+    made.context.try_shutdown()
+
+
+def test_messages_go_there_and_back(side):
+    got = []
+    publisher = side.node.create_publisher(String, '/real/there', 10)
+    side.node.create_subscription(String, '/real/back', got.append, 10)
+    side.until(lambda: publisher.get_subscription_count() == 1
+               and side.node.count_publishers('/real/back') == 1)
+    side.until(lambda: got or publisher.publish(String(data='grüße')))
+    assert got[0].data == 'grüße'
+
+
+def test_large_messages_go_there_and_back(side):
+    got, image = [], Image(height=720, width=1280, encoding='bgr8', step=3840)
+    image.data = bytes(range(256)) * 10800
+    publisher = side.node.create_publisher(Image, '/real/image_there', 10)
+    side.node.create_subscription(Image, '/real/image_back', got.append, 10)
+    side.until(lambda: publisher.get_subscription_count() == 1
+               and side.node.count_publishers('/real/image_back') == 1)
+    publisher.publish(image)
+    side.until(lambda: got)
+    assert got[0] == image
+
+
+def test_latched_messages_come_late(side):
+    got = []
+    side.node.create_subscription(String, '/real/latched', got.append, QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    side.until(lambda: got)
+    assert got[0].data == 'from ROS 2'
+
+
+def test_its_services_answer(side):
+    client = side.node.create_client(AddTwoInts, '/real/add')
+    assert client.wait_for_service(timeout_sec=LIMIT)
+    futures = [client.call_async(AddTwoInts.Request(a=number, b=2)) for number in range(8)]
+    side.until(lambda: all(future.done() for future in futures))
+    assert [future.result().sum for future in futures] == list(range(2, 10))
+
+
+def test_its_parameters_can_be_set(side):
+    client = AsyncParameterClient(side.node, '/real/peer')
+    assert client.wait_for_services(timeout_sec=LIMIT)
+    from rclpy.parameter import Parameter
+    future = client.set_parameters([Parameter('gain', value=4.5)])
+    side.until(future.done)
+    assert future.result().results[0].successful
+
+
+def test_it_shows_in_our_graph(side):
+    side.until(lambda: ('peer', '/real') in side.node.get_node_names_and_namespaces())
+    side.until(lambda: ('/real/add', ['example_interfaces/srv/AddTwoInts'])
+               in side.node.get_service_names_and_types_by_node('peer', '/real'))
+    info = side.node.get_publishers_info_by_topic('/real/back')[0]
+    ours = side.node.get_publishers_info_by_topic('/rosout')
+    assert (info.node_name, info.topic_type) == ('peer', 'std_msgs/msg/String')
+    assert {one.node_name for one in ours} >= {'peer', 'ours'}
+    assert len({str(one.topic_type_hash) for one in ours}) == 1
+
+
+def test_we_show_in_its_graph_and_answer_its_commands(side):
+    side.node.declare_parameter('speed', 1.5)
+    side.node.create_publisher(String, 'chatter', 3)
+
+    def add(request, response):
+        response.sum = request.a + request.b
+        return response
+
+    side.node.create_service(AddTwoInts, 'add', add)
+    import threading
+    thread = threading.Thread(target=side.executor.spin, daemon=True)
+    thread.start()
+    try:
+        assert '/embedded/ours' in output('ros2', 'node', 'list', '--no-daemon')
+        info = output('ros2', 'node', 'info', '--no-daemon', '/embedded/ours')
+        assert '/embedded/chatter: std_msgs/msg/String' in info
+        assert '/embedded/add: example_interfaces/srv/AddTwoInts' in info
+        topic = output('ros2', 'topic', 'info', '-v', '--no-daemon', '/embedded/chatter')
+        assert 'Node name: ours' in topic and 'RIHS01_df668c74' in topic
+        assert 'History (Depth): KEEP_LAST (3)' in topic
+        values = output('ros2', 'param', 'get', '--no-daemon', '/embedded/ours', 'speed')
+        assert 'Double value is: 1.5' in values
+        called = output('ros2', 'service', 'call', '/embedded/add',
+                        'example_interfaces/srv/AddTwoInts', '{a: 3, b: 4}')
+        assert 'sum=7' in called
+        for text in (info, topic, values, called):
+            assert 'WARN' not in text and 'Failed' not in text
+    finally:
+        side.executor.shutdown()
+        thread.join(LIMIT)
