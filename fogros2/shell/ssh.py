@@ -19,13 +19,10 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, ssh_connection, ssh_terminal, Stream, sync
-from fogros2.shell.ssh_connection import warm
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
     import paramiko
-
-__all__ = ['SSHShell', 'warm']
 
 #: Seconds after a command's end in which something it left behind may hold its output open.
 _DRAIN = 2.0
@@ -44,7 +41,7 @@ class SSHShell:
     @staticmethod
     def warm() -> None:
         """Begin to import paramiko; see :func:`fogros2.shell.warm`."""
-        warm()
+        ssh_connection.warm()
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint

@@ -10,6 +10,7 @@ import logging
 import os
 from pathlib import Path
 import socket
+import sys
 import threading
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ OWN_KEYS = ('id_ed25519', 'id_ecdsa', 'id_rsa')
 #: a cut of half a minute is survived, a robot with another address connects anew.
 KEEPALIVE = 15
 USER_TIMEOUT = 60
+_IMPORT = threading.Lock()
 
 
 class PromptSocket(socket.socket):
@@ -62,6 +64,15 @@ def warm() -> threading.Thread:
 
 
 def _import() -> None:
+    with _IMPORT:
+        if 'paramiko' not in sys.modules and 'invoke' not in sys.modules:
+            # paramiko can do without, and imports it, a third of the time it takes, for a
+            # keyword of ssh_config files that nobody reads here
+            sys.modules['invoke'] = None  # type: ignore[assignment]
+            try:
+                import paramiko
+            finally:
+                del sys.modules['invoke']
     import paramiko
     # its threads log what we raise; a handler-less logger would print it
     logger = logging.getLogger(paramiko.__name__)

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of the provider for computers that exist already."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.model import MachineSpec, MachineState
+from fogros2.provider.ssh import Options, SSHProvider
+from fogros2.testing import ProviderContract, request_for
+
+
+@pytest.fixture
+def listener():
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        yield server
+
+
+class TestSSHProvider(ProviderContract):
+
+    owned = False
+
+    @pytest.fixture(autouse=True)
+    def server(self, listener):
+        self.port = listener.getsockname()[1]
+
+    def make(self):
+        return SSHProvider(), {'host': '127.0.0.1', 'port': self.port}
+
+
+def test_everything_is_in_the_id(listener, tmp_path):
+    (tmp_path / 'a key').write_text('')
+    port = listener.getsockname()[1]
+    spec = MachineSpec('planner', 'ssh', {
+        'host': '127.0.0.1', 'port': port, 'user': 'me', 'key': str(tmp_path / 'a key'),
+        'host_key': 'ssh-ed25519 AA+/A= comment'})
+    machine = SSHProvider().describe(SSHProvider().create(spec, request_for(spec)))
+    assert machine.name == 'planner'
+    assert machine.state is MachineState.RUNNING
+    assert machine.vpn_host == '127.0.0.1'
+    assert not machine.owned
+    assert machine.end_command == ()
+    shell = machine.shell
+    assert (shell.kind, shell.host, shell.port, shell.user) == ('ssh', '127.0.0.1', port, 'me')
+    assert shell.host_key == 'ssh-ed25519 AA+/A= comment'
+    assert shell.key_file == str(tmp_path / 'a key')
+
+
+def test_without_a_key_and_a_host_key_the_user_s_own_decide(listener):
+    spec = MachineSpec('planner', 'ssh', {
+        'host': '127.0.0.1', 'port': listener.getsockname()[1], 'key': None, 'host_key': None})
+    shell = SSHProvider().describe(SSHProvider().create(spec, request_for(spec))).shell
+    assert shell.host_key is None
+    assert shell.key_file is None
+    assert shell.user
+
+
+def test_a_computer_that_is_off_is_stopped(listener):
+    spec = MachineSpec('planner', 'ssh', {'host': '127.0.0.1',
+                                          'port': listener.getsockname()[1]})
+    machine_id = SSHProvider().create(spec, request_for(spec))
+    listener.close()
+    machine = SSHProvider().describe(machine_id)
+    assert machine.state is MachineState.STOPPED
+    assert machine.shell is None
+
+
+@pytest.mark.parametrize('host, words', [
+    ('127.0.0.1', 'refuses connections'), ('no-such-host.invalid', 'no host called'),
+])
+def test_a_computer_that_can_t_be_reached_is_refused_at_once(listener, host, words):
+    port = listener.getsockname()[1]
+    listener.close()
+    spec = MachineSpec('planner', 'ssh', {'host': host, 'port': port})
+    with pytest.raises(ProviderError, match=words):
+        SSHProvider().create(spec, request_for(spec))
+
+
+@pytest.mark.parametrize('given, words', [
+    ({}, "'' can't be the host"),
+    ({'host': 'a b'}, "'a b' can't be the host"),
+    ({'host': '-oProxyCommand=x'}, "can't be the host"),
+    ({'host': 'me@there'}, "can't be the host"),
+    ({'host': 'h', 'port': 0}, 'from 1 to 65535'),
+    ({'host': 'h', 'port': 'ssh'}, 'from 1 to 65535'),
+    ({'host': 'h', 'hostkey': 'x'}, "did you mean 'host_key'"),
+    ({'host': 'h', 'host_key': 'AAAA'}, "takes 'ssh-ed25519 AAAA...'"),
+    ({'host': 'h', 'key': '/no/such/key'}, "can't be read"),
+])
+def test_options_that_make_no_sense_are_refused(given, words):
+    with pytest.raises(ConfigurationError, match=words):
+        Options.parse(given)
+
+
+@pytest.mark.parametrize('machine_id', ['podman:1', 'ssh:', 'ssh:host=x', 'ssh:host=x&port=y'])
+def test_ids_that_aren_t_ours_are_unknown(machine_id):
+    with pytest.raises(MachineNotFound):
+        SSHProvider().describe(machine_id)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of what rsync is asked and of what it says; by value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fogros2.errors import CommandError, ConnectError, ShellError
+from fogros2.model import Endpoint, Result
+from fogros2.shell import sync
+
+PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
+
+
+def test_includes_come_before_excludes():
+    words = sync.rsync(Path('/ws'), 'machine:/ws/', excludes=['build/*'], includes=['build/a'],
+                       rsh='ssh').argv
+    assert words.index('--include=build/a') < words.index('--exclude=build/*')
+    assert words[-2:] == ('/ws/', 'machine:/ws/')
+    assert '--delete' in words
+    assert words[-3] == '--'
+
+
+def test_openssh_is_pinned_as_we_are():
+    with sync.open_ssh(PINNED) as rsh:
+        words = rsh.split()
+        for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
+                       'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine',
+                       'HostName=198.51.100.7'):
+            assert option in words
+        assert "'/keys/my key'" in rsh
+        known, = (Path(w.partition('=')[2]) for w in words if w.startswith('UserKnownHostsFile='))
+        assert known.read_text() == 'machine ssh-ed25519 AAAA\n'
+        assert known.stat().st_mode & 0o077 == 0
+    assert not known.exists()
+
+
+def test_openssh_without_a_pinned_key_asks_known_hosts():
+    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as rsh:
+        assert 'HostKeyAlias=[host.example]:2222' in rsh
+        assert 'UserKnownHostsFile' not in rsh
+        assert 'StrictHostKeyChecking=yes' in rsh
+
+
+def test_progress_narrows_the_total_down():
+    seen = []
+    progress = sync.Progress(lambda done, total: seen.append((done, total)), interval=0.0)
+    for line in ('sending incremental file list', '', '      1,024   0%    1.00MB/s    0:00:00',
+                 '   2000000  20%  110.00MB/s    0:00:08', '   5100000  50%  110.00MB/s',
+                 '  10000000 100%  110.00MB/s    0:00:00 (xfr#9, to-chk=0/10)'):
+        progress(line)
+    assert seen == [(2_000_000, 10_000_000), (5_100_000, 10_000_000), (10_000_000, 10_000_000)]
+
+
+def test_progress_is_told_now_and_then():
+    seen = []
+    progress = sync.Progress(lambda done, total: seen.append(done), interval=60.0)
+    for percent in range(1, 101):
+        progress(f'   {percent}000  {percent}%  1MB/s')
+    assert seen == [1000, 100000]
+
+
+def test_statistics_are_read():
+    report = sync.report(
+        'Number of files: 12 (reg: 10, dir: 2)\nNumber of regular files transferred: 3\n'
+        'Total bytes sent: 1234567\nTotal bytes received: 88\n', 1.5)
+    assert (report.files, report.bytes, report.seconds) == (3, 1_234_567, 1.5)
+
+
+@pytest.mark.parametrize('code, stderr, kind, words', [
+    (11, 'rsync: write failed: No space left on device (28)', ShellError, 'is full'),
+    (127, 'rsync error: remote command not found (code 127)', ShellError, 'has no rsync'),
+    (12, 'rsync: connection unexpectedly closed', ConnectError, 'was lost'),
+    (255, 'ssh: Connection reset by peer', ConnectError, 'was lost'),
+    (23, 'noise\nrsync: mkdir failed: Permission denied (13)', CommandError, 'right to write'),
+    (23, 'rsync: opendir "/x" failed: odd (99)', CommandError, 'odd'),
+])
+def test_failures_are_explained(code, stderr, kind, words):
+    error = sync.explained(Result(code, '', stderr), Path('/ws'), "'planner'")
+    assert isinstance(error, kind)
+    assert words in str(error)
+
+
+def test_large_folders_are_told_from_small_ones(tmp_path):
+    (tmp_path / 'a/.git').mkdir(parents=True)
+    (tmp_path / 'a/.git/pack').write_bytes(b'x' * 5000)
+    (tmp_path / 'a/file').write_bytes(b'x' * 1000)
+    (tmp_path / 'loop').symlink_to('.')
+    assert sync.is_large(tmp_path, 999)
+    assert not sync.is_large(tmp_path, 1000)
+
+
+@pytest.mark.parametrize('target, folder', [
+    ('/ws', '/ws/'), ('~/ws/src', 'ws/src/'), ('~/', './'),
+])
+def test_folders_begin_in_the_home(target, folder):
+    assert sync.remote_folder(target) == folder
