@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Callable
 import dataclasses
 import json
 import random
+import socket
 import sys
 import time
 from typing import Any, Optional
@@ -26,6 +28,8 @@ Address = tuple[str, int]
 OVERHEAD = 42
 #: Packets under way at once; more are lost, so that a mistake can't fill the memory.
 MOST = 20_000
+#: Packets taken from a socket at a time, and bytes that it holds meanwhile.
+BATCH, BUFFER = 64, 4 << 20
 
 
 @dataclasses.dataclass
@@ -71,31 +75,30 @@ class Relay:
         self.up, self.down = Link(**settings), Link(**settings)
         self.passed = self.lost = self.bytes = 0
         self._chance = random.Random(seed)
-        self._inside: Optional[asyncio.DatagramTransport] = None
-        self._outside: dict[Address, asyncio.DatagramTransport] = {}
+        self._inside: Optional[socket.socket] = None
+        self._outside: dict[Address, socket.socket] = {}
         self._pending: set[asyncio.TimerHandle] = set()
-        self._opening: set[asyncio.Task[None]] = set()
 
     async def start(self, listen: Address) -> Address:
         """Listen, and return the address (port 0 takes any)."""
-        self._inside, _ = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Receiver(self._from_client), local_addr=listen)
-        address: Address = self._inside.get_extra_info('sockname')
+        self._inside = self._open(self._from_client)
+        self._inside.bind(listen)
+        address: Address = self._inside.getsockname()
         return address
 
     def close(self) -> None:
         """Drop everything."""
         self.rebind()
         if self._inside is not None:
-            self._inside.close()
+            self._close(self._inside)
         for handle in self._pending:
             handle.cancel()
         self._pending.clear()
 
     def rebind(self) -> None:
         """Let the target see the clients at new addresses, as a NAT does that has forgotten."""
-        for transport in self._outside.values():
-            transport.close()
+        for outside in self._outside.values():
+            self._close(outside)
         self._outside.clear()
 
     def change(self, settings: dict[str, Any]) -> dict[str, Any]:
@@ -118,30 +121,48 @@ class Relay:
         self._send(self.up, data, lambda: self._to_target(data, client))
 
     def _to_target(self, data: bytes, client: Address) -> None:
-        transport = self._outside.get(client)
-        if transport is not None:
-            transport.sendto(data)
-            return
-        task = asyncio.get_running_loop().create_task(self._open(data, client))
-        self._opening.add(task)
-        task.add_done_callback(self._opening.discard)
-
-    async def _open(self, data: bytes, client: Address) -> None:
-        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Receiver(lambda back, _: self._from_target(back, client)),
-            remote_addr=self.target)
-        # another packet may have opened one meanwhile
-        kept = self._outside.setdefault(client, transport)
-        if kept is not transport:
-            transport.close()
-        kept.sendto(data)
+        outside = self._outside.get(client)
+        if outside is None:
+            outside = self._open(lambda back, _: self._from_target(back, client))
+            self._outside[client] = outside
+        self._put(outside, data, self.target)
 
     def _from_target(self, data: bytes, client: Address) -> None:
         inside = self._inside
         if inside is not None:
-            self._send(self.down, data, lambda: inside.sendto(data, client))
+            self._send(self.down, data, lambda: self._put(inside, data, client))
 
-    def _send(self, link: Link, data: bytes, deliver: Any) -> None:
+    def _put(self, one: socket.socket, data: bytes, address: Address) -> None:
+        try:
+            one.sendto(data, address)
+        except OSError:
+            # nobody there at the moment, or a full buffer: networks lose packets without a word
+            self.lost += 1
+
+    def _open(self, take: Callable[[bytes, Address], None]) -> socket.socket:
+        one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        one.setblocking(False)
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+            one.setsockopt(socket.SOL_SOCKET, option, BUFFER)
+
+        def read() -> None:
+            for _ in range(BATCH):
+                try:
+                    data, address = one.recvfrom(65535)
+                except BlockingIOError:
+                    return
+                except ConnectionError:
+                    continue
+                take(data, address)
+
+        asyncio.get_running_loop().add_reader(one, read)
+        return one
+
+    def _close(self, one: socket.socket) -> None:
+        asyncio.get_running_loop().remove_reader(one)
+        one.close()
+
+    def _send(self, link: Link, data: bytes, deliver: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
         now = loop.time()
         when = link.schedule(len(data), now, self._chance)
@@ -160,17 +181,6 @@ class Relay:
 
         handle = loop.call_at(when, arrive)
         self._pending.add(handle)
-
-
-class _Receiver(asyncio.DatagramProtocol):
-    def __init__(self, take: Any) -> None:
-        self._take = take
-
-    def datagram_received(self, data: bytes, addr: Address) -> None:
-        self._take(data, addr)
-
-    def error_received(self, exc: Exception) -> None:
-        """Nobody listens there at the moment: a network loses such packets without a word."""
 
 
 async def _control(relay: Relay, lifetime: float) -> None:
