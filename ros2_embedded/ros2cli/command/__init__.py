@@ -67,7 +67,7 @@ class _LateText:
         return text in self.value
 
     def __mod__(self, values: Any) -> str:
-        return self.value % values
+        return str(self.value % values)
 
 
 class SuppressUsageOutput:

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lifecycle nodes: transitions asked for and told, over real services and topics."""
+
+import sys
+
+from launch import LaunchDescription, LaunchService
+from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
+from launch.event_handlers import OnProcessIO
+import launch.logging
+from launch_ros.actions import LifecycleNode
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState
+from launch_ros.events.matchers import matches_node_name
+import pytest
+
+NODE = f'''#!{sys.executable}
+from lifecycle_msgs.msg import State, TransitionEvent
+from lifecycle_msgs.srv import ChangeState
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+NEXT = {{1: ('configure', 'configuring', State(id=2, label='inactive')),
+        3: ('activate', 'activating', State(id=3, label='active'))}}
+
+
+class Managed(Node):
+
+    def __init__(self):
+        super().__init__('managed')
+        self.publisher = self.create_publisher(TransitionEvent, '~/transition_event', 10)
+        self.create_service(ChangeState, '~/change_state', self.change)
+        print('ready', flush=True)
+
+    def change(self, request, response):
+        number = request.transition.id
+        response.success = number in NEXT
+        if response.success:
+            event = TransitionEvent()
+            event.transition.label, event.start_state.label, event.goal_state = NEXT[number]
+            self.publisher.publish(event)
+        return response
+
+
+rclpy.init()
+node = Managed()
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+'''
+
+
+@pytest.fixture(autouse=True)
+def _log_into(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    launch.logging.reset()
+    yield
+    launch.logging.reset()
+
+
+def test_a_node_is_configured_and_activated(tmp_path, capsys):
+    path = tmp_path / 'managed'
+    path.write_text(NODE)
+    path.chmod(0o755)
+    notes = []
+    node = LifecycleNode(
+        executable=str(path), name='managed', namespace='/ns', output='screen')
+
+    def note(context):
+        event = context.locals.event
+        notes.append((event.transition, event.start_state, event.goal_state,
+                      event.action is node))
+
+    def change(number):
+        return EmitEvent(event=ChangeState(
+            lifecycle_node_matcher=matches_node_name('/ns/managed'), transition_id=number))
+
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([
+        RegisterEventHandler(OnProcessIO(target_action=node, on_stdout=lambda event: (
+            change(2), change(1)) if b'ready' in event.text else None)),
+        RegisterEventHandler(OnStateTransition(
+            target_lifecycle_node=node, goal_state='inactive',
+            entities=[OpaqueFunction(function=note), change(3)])),
+        RegisterEventHandler(OnStateTransition(
+            target_lifecycle_node=node, transition='activate', start_state='activating',
+            goal_state='active', entities=[OpaqueFunction(function=note), Shutdown()])),
+        node, TimerAction(period=30.0, actions=[Shutdown(reason='too late')])]))
+    assert service.run() == 0
+    assert notes == [('configure', 'configuring', 'inactive', True),
+                     ('activate', 'activating', 'active', True)]
+    assert ("Failed to make transition 'TRANSITION_CLEANUP' for LifecycleNode '/ns/managed'"
+            ) in capsys.readouterr().out
