@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog`` beside a launch that runs on a container machine, and after one that was killed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import json
+import os
+from pathlib import Path
+import secrets
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from fogros2.store import Store
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.timeout(240)
+
+ROS2 = [sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())']
+#: A background job of a non-interactive shell ignores SIGINT, and so would its children.
+WITH_SIGINT = [
+    sys.executable, '-c', 'import os, signal, sys\n'
+    'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+    'os.execvp(sys.argv[1], sys.argv[1:])']
+
+
+def fog(*words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([*ROS2, 'fog', *words], capture_output=True, text=True, timeout=90,
+                          stdin=subprocess.DEVNULL)
+    assert not check or done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture
+def launched(
+    nothing_left: None, engine: str, children: list[subprocess.Popen[bytes]], tmp_path: Path,
+) -> Iterator[tuple[str, subprocess.Popen[bytes], Callable[[], str]]]:
+    """Launch the example; yield the machine's name, the launch, and what it has printed."""
+    name = f'cli-{secrets.token_hex(2)}'
+    log = tmp_path / 'launch.log'
+    with log.open('wb') as output:
+        child = subprocess.Popen(
+            [*WITH_SIGINT, *ROS2, 'launch', 'fogros2_examples', 'talker.container.launch.py',
+             f'name:={name}'], stdout=output, stderr=subprocess.STDOUT, cwd=tmp_path,
+            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path / 'ros'), 'PYTHONUNBUFFERED': '1'},
+            start_new_session=True)
+    children.append(child)
+    said = log.read_text
+    try:
+        wait_until(lambda: 'I heard' in said() or child.poll() is not None, timeout=60.0,
+                   what='the first message')
+        assert 'I heard' in said(), said()
+        yield name, child, said
+    finally:
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+            child.wait(60)
+
+
+def test_beside_a_running_launch(
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+) -> None:
+    name, child, said = launched
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    assert entry['state'] == 'running' and entry['launch_alive'] and entry['address']
+    assert 28000 < entry['time_left'] <= 28800
+
+    status = json.loads(fog('status', name, '--json').stdout)
+    assert status['problems'] == []
+    assert status['vpn']['latency'] < 100 and status['vpn']['received'] > 0
+    assert status['vpn']['handshake_age'] < 180
+    (node,) = status['agent']['nodes']
+    assert node['name'].startswith('talker') and node['state'] == 'running'
+    assert status['agent']['rss_kb'] < 30000
+    text = fog('status', name).stdout
+    assert 'round trip' in text and 'talker' in text
+
+    logs = fog('logs', name)
+    assert 'process started' in logs.stdout
+    assert 'Publishing' in logs.stdout + logs.stderr
+    nobody = fog('logs', name, '--node', 'nobody')
+    assert 'Publishing' not in nobody.stdout + nobody.stderr
+
+    assert fog('connect', name, '--', 'hostname').stdout.strip() == name
+    assert fog('connect', name, '--', 'sh', '-c', 'exit 7', check=False).returncode == 7
+    assert fog('connect', name, '--user', 'root', '--', 'true', check=False).returncode != 0
+
+    refused = fog('delete', name, '--yes', check=False)
+    assert refused.returncode == 1 and '--force' in refused.stderr
+    assert fog('gc', '--dry-run', '--json').returncode == 0
+    assert child.poll() is None
+
+    child.send_signal(signal.SIGINT)
+    assert child.wait(60) == 0, said()
+    assert name not in fog('list').stdout
+
+
+def test_logs_follow_until_interrupted(
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+    children: list[subprocess.Popen[bytes]], tmp_path: Path,
+) -> None:
+    name, _, _ = launched
+    log = tmp_path / 'follow.log'
+    with log.open('wb') as output:
+        follower = subprocess.Popen([*WITH_SIGINT, *ROS2, 'fog', 'logs', name, '-f'],
+                                    stdout=output, stderr=subprocess.STDOUT)
+    children.append(follower)
+    wait_until(lambda: log.read_text().count('Publishing') >= 3, timeout=30.0, what='three lines')
+    assert follower.poll() is None
+    follower.send_signal(signal.SIGINT)
+    assert follower.wait(20) in (0, signal.SIGINT, -signal.SIGINT)
+
+
+def test_another_terminal_joins(
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+) -> None:
+    name, _, _ = launched
+    exports = fog('env', name).stdout
+    listener = f'{sys.executable} -c "from fogros2_examples.listener import main; main()"'
+    heard = subprocess.run(
+        ['sh', '-c', f'{exports}\nexec {listener} --ros-args -p count:=2'], text=True,
+        capture_output=True, timeout=60)
+    assert heard.returncode == 0, heard.stderr
+    assert f'Hello World from {name}' in heard.stdout + heard.stderr
+
+
+def test_after_a_launch_that_was_killed(
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+) -> None:
+    name, child, _ = launched
+    os.killpg(child.pid, signal.SIGKILL)
+    child.wait(10)
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    assert entry['launch_alive'] is False and 'launch gone' in entry['state']
+    would = json.loads(fog('gc', '--dry-run', '--json').stdout)
+    assert [w['reason'] for w in would if w['name'] == name] == ['its launch is gone']
+    assert f'deleted {name}' in fog('delete', name, '--yes').stdout
+    assert not Store().machine(name).path.exists()
+
+
+def test_gc_after_a_launch_that_was_killed_without_a_store(
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The provider's tags are enough to end the machine; gc clears the robot's side."""
+    name, child, _ = launched
+    os.killpg(child.pid, signal.SIGKILL)
+    child.wait(10)
+    here = os.environ['FOGROS2_STATE_HOME']
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'lost'))
+    assert '(orphan)' in [line for line in fog('list').stdout.splitlines() if name in line][0]
+    assert f'deleted {name}' in fog('delete', name, '--yes').stdout
+    monkeypatch.setenv('FOGROS2_STATE_HOME', here)
+    assert f'leftovers of {name}' in fog('gc').stdout
+    assert fog('gc').stdout == 'nothing to clear\n'
