@@ -105,6 +105,7 @@ class Launch:
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._robot: Optional[RobotVpn] = None
         self._rmw = ''
+        self._robot_environment: Optional[dict[str, str]] = None
         self._closed = False
 
     # -- before anything is created -------------------------------------------------------------
@@ -120,12 +121,7 @@ class Launch:
         :raises FogError: the first thing that is wrong, with its remedy.
         """
         self.dds()
-        process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
-        if os.geteuid() != 0:
-            check_sudo()
-        if not Path('/dev/net/tun').exists():
-            raise PrerequisiteError('/dev/net/tun is missing on this computer',
-                                    'sudo modprobe tun')
+        check_robot()
         names = [spec.name for spec in specs]
         for name in names:
             check_name(name)
@@ -167,18 +163,28 @@ class Launch:
 
     def robot_environment(self) -> dict[str, str]:
         """
-        Return the variables that the robot's nodes need; valid before the VPN is there.
+        Return the variables that the robot's nodes need, with the VPN's interface there.
 
-        Peers are the machines known so far; those that come later find the robot by themselves.
+        A node takes the interfaces that it finds when it starts, so this one has to be there
+        before the first of them, well before any machine is. It takes a tenth of a second, once.
+
+        :raises FogError: this computer can't have it.
         """
         with self._lock:
-            interface = self._robot_vpn().interface
-            vendor = self.dds()
-            path = self.store.launch(self.id) / 'dds.xml'
-            peers = [self._machine_address(name) for name in self._indices]
-            write_private(path, vendor.render(
-                plan.robot_dds_interfaces(interface.name), peers).encode())
-            return dict(vendor.environment(str(path), self.user_environment))
+            if self._robot_environment is None:
+                check_robot()
+                vendor = self.dds()
+                lan = vendor.parse_lan(self.robot([vendor.ask_lan()]))
+                robot = self._robot_vpn()
+                interfaces = vendor.robot_interfaces(
+                    robot.interface.name, lan, self.user_environment)
+                path = self.store.launch(self.id) / 'dds.xml'
+                # no peers: the machines announce themselves
+                write_private(path, vendor.render(interfaces, ()).encode())
+                robot.ensure()
+                self._robot_environment = dict(
+                    vendor.environment(str(path), self.user_environment))
+            return dict(self._robot_environment)
 
     def expect(self, names: Iterable[str]) -> None:
         """Give machines their addresses ahead, so that nodes started meanwhile know them."""
@@ -693,13 +699,13 @@ class _Deployment:
 
     def _configure_dds(self, shell: Shell, interface: VpnInterface) -> dict[str, str]:
         vendor = self.launch.dds()
-        robot = self.launch._robot_vpn().interface
+        # the robot hears of a machine by multicast, machines of each other by asking
         with self.launch._lock:
-            others = [name for name in self.launch._indices if name != self.name]
-            peers = [robot.address, *(self.launch._machine_address(name) for name in others)]
+            peers = [self.launch._machine_address(name)
+                     for name in self.launch._indices if name != self.name]
         path = f'{self._agent_directory()}/dds.xml'
         shell.put(
-            vendor.render(plan.machine_dds_interfaces(interface.name), peers).encode(),
+            vendor.render(vendor.machine_interfaces(interface.name), peers).encode(),
             path, mode=0o600, timeout=self.timeouts.command)
         return dict(vendor.environment(path, {}))
 
@@ -839,6 +845,19 @@ def provider(name: str) -> Provider:
     """
     instance: Provider = plugin_system.load('fogros2.provider', name)()
     return instance
+
+
+def check_robot() -> None:
+    """
+    Check that this computer can be the robot's end of a VPN.
+
+    :raises PrerequisiteError: a program, a right or a device is missing.
+    """
+    process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
+    if os.geteuid() != 0:
+        check_sudo()
+    if not Path('/dev/net/tun').exists():
+        raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
 
 
 def check_sudo() -> None:

@@ -13,7 +13,7 @@ import sys
 from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
-from fogros2.model import DdsInterface, MachineSpec, Peer, VpnInterface
+from fogros2.model import MachineSpec, Peer, VpnInterface
 
 #: Kept free below the machines' addresses: .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
@@ -92,20 +92,6 @@ def machine_peers(
     """
     others = [peer for name, peer in sorted(machines.items()) if name != own_name]
     return [dataclasses.replace(robot, endpoint=None), *others]
-
-
-def robot_dds_interfaces(vpn: str) -> list[DdsInterface]:
-    """
-    Return the interfaces of the robot's nodes.
-
-    The VPN's is preferred, or nothing crosses it; it may come and go.
-    """
-    return [DdsInterface(vpn, priority=10, required=False), DdsInterface('lo')]
-
-
-def machine_dds_interfaces(vpn: str) -> list[DdsInterface]:
-    """Return the interfaces of a machine's nodes: the VPN, and itself; nothing else is open."""
-    return [DdsInterface(vpn, priority=10, required=False), DdsInterface('lo')]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, Optional
 
-from fogros2.model import DdsInterface
+from fogros2.model import Command, DdsInterface
 
 
 class DdsVendor(abc.ABC):
@@ -15,6 +15,31 @@ class DdsVendor(abc.ABC):
 
     #: Value of RMW_IMPLEMENTATION.
     rmw: ClassVar[str]
+
+    @abc.abstractmethod
+    def ask_lan(self) -> Command:
+        """Return the command, for the robot, whose output ``parse_lan`` reads."""
+
+    @abc.abstractmethod
+    def parse_lan(self, output: str) -> Optional[str]:
+        """Return the interface that nodes would take by themselves, None where there is none."""
+
+    @abc.abstractmethod
+    def robot_interfaces(
+        self, vpn: str, lan: Optional[str], user: Mapping[str, str],
+    ) -> list[DdsInterface]:
+        """
+        Return the interfaces of the robot's nodes: what is there without us, and the VPN.
+
+        :param vpn: name of the VPN's interface.
+        :param lan: of ``parse_lan``.
+        :param user: the environment as the user has it.
+        :raises DdsError: the user's configuration leaves no place for the VPN.
+        """
+
+    @abc.abstractmethod
+    def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
+        """Return the interfaces of a machine's nodes: the VPN and the machine itself."""
 
     @abc.abstractmethod
     def render(self, interfaces: Sequence[DdsInterface], peers: Sequence[str]) -> str:

@@ -29,9 +29,14 @@ from fogros2.model import Command, DdsInterface
 
 #: ROS 2 processes that a host can have in a domain, as its ports allow.
 MAX_PARTICIPANTS = 119
-#: The same where peers are asked by unicast: each of so many ports, by each participant in each
-#: interval, whether anything runs there or not. 32 is what Jazzy's rmw sets for itself.
-MAX_ASKED = 32
+#: Of these, how many a peer is asked for: each has a port, which each participant asks in each
+#: interval, whether anything runs there or not. Who is asked answers, so only two processes that
+#: both come later than that on their hosts don't find each other.
+ASKED = 10
+#: RTPS 2.5, 9.6.2.3: participant i of a domain is asked at 7410 + 250 * domain + 2 * i.
+PORT_BASE = 7410
+PORTS_PER_DOMAIN = 250
+MAX_DOMAIN = 232
 #: Seconds between a participant's announcements: how soon a host is found again whose lease
 #: ended in a long cut, or that came up after the nodes.
 SPDP_INTERVAL = 1
@@ -50,9 +55,41 @@ _NOT_LAN = re.compile('lo$|fog')
 
 
 class CycloneDds(DdsVendor):
-    """Renders CYCLONEDDS_URI: local first, then LAN, then VPN; patient with a link that is cut."""
+    """
+    Renders CYCLONEDDS_URI: local first, then LAN, then VPN; patient with a link that is cut.
+
+    :param domain: ROS_DOMAIN_ID, in which peers are asked.
+    """
 
     rmw: ClassVar[str] = 'rmw_cyclonedds_cpp'
+
+    def __init__(self, domain: int = 0) -> None:
+        if not 0 <= domain <= MAX_DOMAIN:
+            raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
+        self.domain = domain
+
+    def ask_lan(self) -> Command:
+        """Return the command whose output :meth:`parse_lan` reads."""
+        return Command(('ip', '-json', '-4', 'address', 'show', 'up'),
+                       what='look at the network interfaces')
+
+    def parse_lan(self, output: str) -> Optional[str]:
+        """
+        Return the interface that Cyclone takes by itself, so that what it reaches stays in reach.
+
+        That is the first one that can multicast, in the kernel's order; None where there is none.
+
+        :raises DdsError: it isn't what ``ip`` prints.
+        """
+        try:
+            for link in json.loads(output or '[]'):
+                name, flags = link.get('ifname', ''), link.get('flags', ())
+                if (link.get('addr_info') and 'MULTICAST' in flags
+                        and 'POINTOPOINT' not in flags and not _NOT_LAN.match(name)):
+                    return str(name)
+        except (ValueError, AttributeError, TypeError) as error:
+            raise DdsError(f"can't read the network interfaces: {error}") from error
+        return None
 
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
@@ -60,7 +97,7 @@ class CycloneDds(DdsVendor):
         """
         Return the interfaces of the robot's nodes, which get no peers.
 
-        :param lan: see :func:`parse_lan`.
+        :param lan: see :meth:`parse_lan`.
         :param user: the environment as the user has it; interfaces configured there are used in
             the LAN's place, and peers make the LAN come first, or they couldn't be asked.
         :raises DdsError: the user's configuration can't be read, or can't be added to.
@@ -70,6 +107,9 @@ class CycloneDds(DdsVendor):
             raise DdsError(
                 "CYCLONEDDS_URI's NetworkInterfaceAddress leaves no place for the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
+        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST':
+            # the user keeps to this computer: to it and its machines, then
+            lan = None
         has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
         listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
         interfaces = []
@@ -98,7 +138,6 @@ class CycloneDds(DdsVendor):
         multicast = any(interface.multicast for interface in interfaces)
         networks = [interface for interface in interfaces if not _is_loopback(interface)]
         asked = [] if _is_loopback(ordered[0]) and networks else list(dict.fromkeys(peers))
-        limit = MAX_ASKED if asked or not multicast else MAX_PARTICIPANTS
         if not multicast:
             asked.insert(0, LOOPBACK)
         return '\n'.join([
@@ -125,11 +164,12 @@ class CycloneDds(DdsVendor):
             '    <Discovery>',
             # a port that others can know: machines are asked by unicast
             '      <ParticipantIndex>auto</ParticipantIndex>',
-            f'      <MaxAutoParticipantIndex>{limit}</MaxAutoParticipantIndex>',
+            f'      <MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>',
             f'      <SPDPInterval>{SPDP_INTERVAL} s</SPDPInterval>',
             f'      <LeaseDuration>{LEASE_DURATION} s</LeaseDuration>',
             *_if(bool(asked), '      <Peers>'),
-            *(f'        <Peer address={quoteattr(address)}/>' for address in asked),
+            *(f'        <Peer address={quoteattr(address)}/>'
+              for host in asked for address in self._addresses(host)),
             *_if(bool(asked), '      </Peers>'),
             '    </Discovery>',
             '    <Internal>',
@@ -138,6 +178,12 @@ class CycloneDds(DdsVendor):
             '  </Domain>',
             '</CycloneDDS>',
             ''])
+
+    def _addresses(self, host: str) -> list[str]:
+        begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
+        # everything of this host is asked: it costs no network
+        count = MAX_PARTICIPANTS + 1 if host == LOOPBACK else ASKED
+        return [f'{host}:{port}' for port in range(begin, begin + 2 * count, 2)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
@@ -163,32 +209,6 @@ class CycloneDds(DdsVendor):
         else:
             uri = f'{theirs},{ours}' if theirs else ours
         return {'RMW_IMPLEMENTATION': self.rmw, 'CYCLONEDDS_URI': uri}
-
-
-def used_interfaces() -> Command:
-    """Return the command whose output :func:`parse_lan` reads."""
-    return Command(('ip', '-json', '-4', 'address', 'show', 'up'),
-                   what='look at the network interfaces')
-
-
-def parse_lan(output: str) -> Optional[str]:
-    """
-    Return the interface that Cyclone takes by itself, so that what it reaches stays in reach.
-
-    That is the first one that can multicast, in the kernel's order; None where there is none.
-
-    :param output: of :func:`used_interfaces`.
-    :raises DdsError: it isn't what ``ip`` prints.
-    """
-    try:
-        for link in json.loads(output or '[]'):
-            name, flags = link.get('ifname', ''), link.get('flags', ())
-            if (link.get('addr_info') and 'MULTICAST' in flags and 'POINTOPOINT' not in flags
-                    and not _NOT_LAN.match(name)):
-                return str(name)
-    except (ValueError, AttributeError, TypeError) as error:
-        raise DdsError(f"can't read the network interfaces: {error}") from error
-    return None
 
 
 def _fragments(uri: str) -> Iterator[str]:

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from fogros2 import process
-from fogros2.dds.cyclonedds import CycloneDds, parse_lan, used_interfaces
+from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
@@ -48,11 +48,11 @@ def test_an_interface_may_be_given_by_its_address() -> None:
 
 def test_without_multicast_peers_and_the_host_itself_are_asked() -> None:
     root = rendered(VPN, LOOPBACK, peers=('198.18.7.2', '198.18.7.3', '198.18.7.2'))
-    assert [peer['address'] for peer in attributes(root, 'Peer')] == [
-        '127.0.0.1', '198.18.7.2', '198.18.7.3']
+    hosts = [peer['address'].partition(':')[0] for peer in attributes(root, 'Peer')]
+    assert [hosts.count(f'{a}') for a in ('127.0.0.1', '198.18.7.2', '198.18.7.3')] == [
+        120, 10, 10]
     assert texts(root, 'AllowMulticast') == ['false']
     assert texts(root, 'ParticipantIndex') == ['auto']
-    assert texts(root, 'MaxAutoParticipantIndex') == ['32']
 
 
 def test_the_robot_prefers_itself_then_its_lan_then_the_vpn() -> None:
@@ -82,10 +82,18 @@ def test_a_machine_prefers_the_vpn_and_reaches_nothing_beyond() -> None:
     assert attributes(root, 'Peer') == []
 
 
-def test_machines_ask_each_other() -> None:
-    root = rendered(*CYCLONE.machine_interfaces('foga1b2c3m0'), peers=('198.18.7.3',))
-    assert attributes(root, 'Peer') == [{'address': '198.18.7.3'}]
-    assert texts(root, 'MaxAutoParticipantIndex') == ['32']
+@pytest.mark.parametrize('domain, port', [(0, 7410), (5, 8660)])
+def test_machines_ask_each_other_in_the_domain(domain: int, port: int) -> None:
+    interfaces = CYCLONE.machine_interfaces('foga1b2c3m0')
+    root = ElementTree.fromstring(CycloneDds(domain).render(interfaces, ['198.18.7.3']))
+    assert [peer['address'] for peer in attributes(root, 'Peer')] == [
+        f'198.18.7.3:{port + 2 * i}' for i in range(10)]
+    assert texts(root, 'MaxAutoParticipantIndex') == ['119']
+
+
+def test_a_domain_without_ports_is_refused() -> None:
+    with pytest.raises(DdsError, match='ROS_DOMAIN_ID 233'):
+        CycloneDds(233)
 
 
 @pytest.mark.parametrize('variable', ['CYCLONEDDS_URI', 'ROS_STATIC_PEERS'])
@@ -95,6 +103,12 @@ def test_peers_of_the_user_are_asked_from_the_lan(variable: str) -> None:
     root = rendered(*CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user))
     assert [interface['name'] for interface in attributes(root, 'NetworkInterface')] == [
         'eth0', 'lo', 'foga1b2c3']
+
+
+def test_a_user_who_keeps_to_this_computer_gets_no_lan() -> None:
+    interfaces = CYCLONE.robot_interfaces(
+        'foga1b2c3', 'eth0', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
+    assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
 
 
 def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
@@ -127,19 +141,19 @@ def test_the_lan_is_the_interface_that_cyclone_would_take() -> None:
     links = [link('lo', 'LOOPBACK'), link('fogffffff', 'MULTICAST', 'POINTOPOINT'),
              link('tun0', 'POINTOPOINT', 'MULTICAST'), {'ifname': 'eth0', 'flags': ['MULTICAST']},
              {}, link('wlan0', 'MULTICAST'), link('docker0', 'MULTICAST')]
-    assert parse_lan(json.dumps(links)) == 'wlan0'
-    assert parse_lan(json.dumps(links[:4])) is None
-    assert parse_lan('') is None
+    assert CYCLONE.parse_lan(json.dumps(links)) == 'wlan0'
+    assert CYCLONE.parse_lan(json.dumps(links[:4])) is None
+    assert CYCLONE.parse_lan('') is None
 
 
 @pytest.mark.parametrize('text', ['nonsense', '[1]', '7'])
 def test_what_ip_does_not_print_is_an_error(text: str) -> None:
     with pytest.raises(DdsError, match='network interfaces'):
-        parse_lan(text)
+        CYCLONE.parse_lan(text)
 
 
 def test_this_computers_interfaces_are_read() -> None:
-    parse_lan(process.run(used_interfaces(), timeout=10.0).stdout)
+    CYCLONE.parse_lan(process.run(CYCLONE.ask_lan(), timeout=10.0).stdout)
 
 
 def test_messages_are_small_only_where_all_of_them_cross_the_vpn() -> None:

@@ -48,12 +48,6 @@ def test_a_machine_dials_its_siblings_but_not_the_robot():
     assert peers == [Peer('robot', 'R', '198.18.7.1', None), planner]
 
 
-def test_vpn_is_preferred_and_may_be_absent():
-    vpn, loopback = plan.robot_dds_interfaces('fog1')
-    assert vpn.priority > loopback.priority
-    assert not vpn.required
-
-
 def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():
     environment = {
         'AMENT_PREFIX_PATH': '/home/me/ws/install/a:/opt/ros/jazzy',
