@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 launch`` as a process of a test's own, and what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from typing import Optional
+
+from fogros2.waiting import wait_until
+
+ROS2 = 'ros2'
+
+
+class Launched:
+    """
+    A ``ros2 launch`` process, its output read all the time.
+
+    :param words: what follows ``ros2 launch``.
+    :param environment: its variables, this process's unless given.
+    """
+
+    def __init__(
+        self, *words: str, environment: Optional[Mapping[str, str]] = None,
+    ) -> None:
+        self.said: list[str] = []
+        self.child = subprocess.Popen(
+            [*_WITH_SIGINT, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
+            start_new_session=True, env=None if environment is None else dict(environment))
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.child.stdout is not None
+        for line in self.child.stdout:
+            self.said.append(line)
+
+    @property
+    def text(self) -> str:
+        """All that it has said so far."""
+        return ''.join(list(self.said))
+
+    @property
+    def errors(self) -> list[str]:
+        """The lines it has logged as errors."""
+        return [line.rstrip() for line in list(self.said) if '[ERROR]' in line]
+
+    def wait_for(self, words: str, *, times: int = 1, timeout: float = 60.0) -> None:
+        """
+        Wait until lines with ``words`` came.
+
+        :raises AssertionError: the launch ended before.
+        """
+        def there() -> bool:
+            ended = self.child.poll() is not None
+            if ended:
+                self._reader.join(5.0)
+            if sum(words in line for line in list(self.said)) >= times:
+                return True
+            assert not ended, f'the launch ended before {words!r}:\n{self.text}'
+            return False
+
+        try:
+            wait_until(there, timeout=timeout, what=repr(words), longest=0.05)
+        except RuntimeError as error:
+            raise AssertionError(f'{error}:\n{self.text}') from error
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C."""
+        self.child.send_signal(signal.SIGINT)
+
+    def ended(self, timeout: float = 60.0) -> int:
+        """Wait for its end and return the exit status."""
+        code = self.child.wait(timeout)
+        self._reader.join(5.0)
+        return code
+
+    def kill(self) -> None:
+        """End it and all that it started here with SIGKILL."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.child.pid, signal.SIGKILL)
+        self.ended(10.0)
+
+
+@contextlib.contextmanager
+def launching() -> Iterator[Callable[..., Launched]]:
+    """Yield what starts launches; those that still run at the block's end are ended, in order."""
+    started: list[Launched] = []
+
+    def start(*words: str, environment: Optional[Mapping[str, str]] = None) -> Launched:
+        started.append(Launched(*words, environment=environment))
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for launch in started:
+            if launch.child.poll() is None:
+                launch.interrupt()
+        for launch in started:
+            try:
+                launch.ended(60.0)
+            finally:
+                launch.kill()
+
+
+def ros2(
+    *words: str, environment: Optional[Mapping[str, str]] = None, timeout: float = 60.0,
+) -> subprocess.CompletedProcess[str]:
+    """Run ``ros2`` with these words and return what it left; nobody is there to be asked."""
+    return subprocess.run(
+        [ROS2, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout,
+        env=None if environment is None else dict(environment))
+
+
+#: A shell that starts something in the background has SIGINT ignored, and all that it starts.
+_WITH_SIGINT: Sequence[str] = (
+    sys.executable, '-c', 'import os, signal, sys; '
+    'signal.signal(signal.SIGINT, signal.default_int_handler); '
+    'os.execvp(sys.argv[1], sys.argv[1:])')
