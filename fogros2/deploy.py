@@ -471,6 +471,8 @@ class _Deployment:
         self.provider = provider(spec.provider)
         self.folder: MachineDirectory = launch.store.machine(spec.name)
         self.record = Record(spec.name, spec.provider, spec)
+        #: Whether the computer is the provider's to make and to end, not somebody's own.
+        self.owned = spec.provider != 'ssh'
         self.reused = False
         self.failed = True
 
@@ -568,7 +570,7 @@ class _Deployment:
         self.folder.delete()
         undo.callback(self.launch.attempt, self.name, 'end', self._end)
         self._claim(token)
-        public_key = self._login_key()
+        public_key = self._login_key() if self.owned else ''
         config = {}
         if self.provider.agent_directory:
             config = plan.agent_config(
@@ -611,7 +613,7 @@ class _Deployment:
         with step(self.launch.report, self.name, 'connect'):
             assert machine.shell is not None
             endpoint = machine.shell
-            if self.folder.key_file.exists():
+            if self.owned:
                 endpoint = dataclasses.replace(endpoint, key_file=str(self.folder.key_file))
             self._save(shell=endpoint)
             shell = shells.connect(endpoint, name=self.name, timeout=self.timeouts.ssh)
@@ -795,8 +797,8 @@ class _Deployment:
     def _survives(self) -> bool:
         """Whether the computer stays when the launch ends, so that it has to be tidied up."""
         if self.failed and not self.reused:
-            return self.spec.provider == 'ssh'
-        return self.spec.on_exit == 'keep' or self.spec.provider == 'ssh'
+            return not self.owned
+        return self.spec.on_exit == 'keep' or not self.owned
 
     def _end(self) -> None:
         """End the machine by its ``on_exit``; the record goes only when the machine has gone."""
