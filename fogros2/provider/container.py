@@ -4,56 +4,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import dataclasses
-import datetime
+import contextlib
 import json
 import os
 from pathlib import Path
-import re
 import threading
 from typing import Any, ClassVar, Optional
 
 from fogros2 import process
 from fogros2.errors import (
     CommandError,
-    ConfigurationError,
+    DeadlineExceeded,
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
     ProviderError,
     Unsupported,
 )
-from fogros2.model import (
-    Command,
-    CreateRequest,
-    Endpoint,
-    Machine,
-    MachineSpec,
-    MachineState,
+from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
+from fogros2.provider import (
+    container_engine,
+    container_entry,
+    container_machine,
+    container_options,
+    container_root,
+    Provider,
 )
-from fogros2.provider import container_engine, container_entry, container_root, Provider
 from fogros2.provider.container_engine import Engine
-from fogros2.provider.options import convert, known
+from fogros2.provider.container_options import Options
 from fogros2.waiting import wait_until
-
-#: Labels beside the core's tags.
-ATTEMPT = 'fogros2-token'
-LOGIN = 'fogros2-login'
-MACHINE = 'fogros2-machine'
-DIRECTORY = 'fogros2-directory'
-ENDS_STOPPED = 'fogros2-ends-stopped'
-
-#: Roots of machines without an image; the engine removes each with its container.
-ROOTS = Path('/var/lib/fogros2')
-
-_STATES = {
-    'created': MachineState.PENDING, 'configured': MachineState.PENDING,
-    'initialized': MachineState.PENDING, 'restarting': MachineState.PENDING,
-    'running': MachineState.RUNNING, 'paused': MachineState.RUNNING,
-    'stopping': MachineState.STOPPING, 'removing': MachineState.STOPPING,
-    'exited': MachineState.STOPPED, 'stopped': MachineState.STOPPED,
-    'dead': MachineState.STOPPED,
-}
 
 #: File systems that can't hold the writable layer of an overlay.
 _NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
@@ -93,87 +72,14 @@ tar -xpf - --numeric-owner -C "$top/root"
 _THERE = 17
 
 _DESTROY = """\
-engine=$1 identity=$2 top=$3
-"$engine" rm -f -t 0 "$identity" >&2 || "$engine" rm -f "$identity" >&2 || :
+identity=$1 top=$2
+shift 2
+"$@" rm -f -t 0 "$identity" >/dev/null || "$@" rm -f "$identity" >/dev/null
+code=$?
 rm -rf -- "$top"
-rmdir -- "${top%/*}" 2>/dev/null || :
+rmdir -- "${top%/*}" 2>/dev/null
+exit $code
 """
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """
-    What a launch file may ask of a container.
-
-    :param image: name of an image; '' for this computer's own root (podman alone).
-    :param engine: auto, podman or docker.
-    :param user: login user, made with sudo rights and no password.
-    :param network: network of the engine's; '' for its default.
-    :param ip: fixed address in that network.
-    :param cpus: CPUs' worth of time, such as 1.5.
-    :param memory: such as '2g'.
-    :param gpus: 'all' or a number, as ``docker run --gpus`` takes it.
-    :param devices: such as '/dev/video0'.
-    :param ports: such as '8080:80' or '8080:80/udp'.
-    :param mounts: folders visible there read-only: 'path' or 'path:path there'.
-    :param env: variables of every login.
-    """
-
-    image: str = ''
-    engine: str = 'auto'
-    user: str = 'fog'
-    network: str = ''
-    ip: str = ''
-    cpus: float = 0.0
-    memory: str = ''
-    gpus: str = ''
-    devices: tuple[str, ...] = ()
-    ports: tuple[str, ...] = ()
-    mounts: tuple[str, ...] = ()
-    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def parse(cls, given: Mapping[str, Any]) -> Options:
-        """
-        Return the options of a spec.
-
-        :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
-        """
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        options_given = known(given, fields, 'a container machine')
-        options = cls(**{
-            name: convert(name, value, {} if name == 'env' else fields[name].default)
-            for name, value in options_given.items()})
-        _check_values(options)
-        return options
-
-
-def _check_values(options: Options) -> None:
-    if options.engine not in ('auto', *container_engine.ENGINES):
-        raise ConfigurationError(f"there is no container engine '{options.engine}'",
-                                 'engine= takes auto, podman or docker')
-    if options.engine == 'docker' and not options.image:
-        raise ConfigurationError("docker can't use this computer's own root",
-                                 "name an image with image='...', or take engine='podman'")
-    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
-        raise ConfigurationError(f"'{options.user}' can't be a user name")
-    for name in ('image', 'network', 'ip', 'memory', 'gpus'):
-        word = getattr(options, name)
-        # the engine would take it for an option of its own
-        if word.startswith('-') or any(c.isspace() for c in word):
-            raise ConfigurationError(f"option '{name}' can't be '{word}'")
-    if options.ip and not options.network:
-        raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
-    for name, value in options.env.items():
-        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name) or '"' in value or '\n' in value:
-            raise ConfigurationError(f"env= can't carry the variable {name!r}")
-    for mount in options.mounts:
-        source = mount.split(':')[0]
-        if mount.count(':') > 1 or not os.path.isabs(source) or '/..' in mount:
-            raise ConfigurationError(f"mounts= can't hold '{mount}'",
-                                     "it takes '/path' or '/path:/path there'")
-        if not os.path.exists(source):
-            raise ConfigurationError(f"'{source}' of mounts= doesn't exist")
 
 
 class ContainerProvider(Provider):
@@ -213,16 +119,16 @@ class ContainerProvider(Provider):
                 identity = self._create_from_root(engine, spec, request, options)
         except ProviderError as error:
             identity = self._existing(engine, spec.name, request.token, error)
-        return f'{engine.name}:{identity[:12]}:{request.token}'
+        return container_machine.machine_id(engine, identity, request.token)
 
     def _existing(
         self, engine: Engine, name: str, token: str, error: ProviderError,
     ) -> str:
         """Return the container that an earlier attempt with this token made, or raise."""
-        found = engine.inspect([container_name(name)])
+        found = engine.inspect([container_machine.container_name(name)])
         if not found:
             raise error
-        if labels_of(found[0]).get(ATTEMPT) != token:
+        if container_machine.labels_of(found[0]).get(container_machine.ATTEMPT) != token:
             raise NameTaken(f"there is a container machine '{name}' already",
                             f'ros2 fog delete {name}') from error
         return str(found[0]['Id'])
@@ -230,10 +136,10 @@ class ContainerProvider(Provider):
     def _create_from_root(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
     ) -> str:
-        top = directory(request.token)
+        top = container_machine.directory(request.token)
         system = container_root.system_mounts()
         kept = spec.on_exit == 'stop'
-        words = [*common_flags(spec, request, options)]
+        words = [*container_options.common_flags(spec, request, options)]
         for path in system:
             # the engine's own layer ends with the run; a machine that is stopped keeps its disk
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
@@ -241,7 +147,7 @@ class ContainerProvider(Provider):
         for mount in container_root.environment_mounts(spec.workspace):
             words += ['-v', f'{mount}:{mount}:ro']
         for mount in options.mounts:
-            words += ['-v', mount_flag(mount)]
+            words += ['-v', container_options.mount_flag(mount)]
         flags = list(engine.flags)
         if not kept:
             words.append('--rm')
@@ -269,9 +175,9 @@ class ContainerProvider(Provider):
     def _create_from_image(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
     ) -> str:
-        words = [*common_flags(spec, request, options)]
+        words = [*container_options.common_flags(spec, request, options)]
         for mount in options.mounts:
-            words += ['-v', mount_flag(mount)]
+            words += ['-v', container_options.mount_flag(mount)]
         if spec.on_exit != 'stop':
             words.append('--rm')
         archive = container_root.Archive()
@@ -292,30 +198,44 @@ class ContainerProvider(Provider):
 
     def describe(self, machine_id: str) -> Machine:
         """Return what the engine knows of a container now."""
-        engine, identity, _ = parse_id(machine_id)
+        engine, identity, _ = container_machine.parse_id(machine_id)
         found = engine.inspect([identity])
         if not found:
             raise MachineNotFound(f'container {identity} does not exist any more')
-        return self._machine(engine, found[0], complain=True)
+        state = container_machine.state_of(found[0])
+        if state is MachineState.STOPPED:
+            self._complain(engine, identity)
+        key = None
+        if state is MachineState.RUNNING:
+            # the first boot makes it in some 20 ms: asking the engine again takes longer
+            with contextlib.suppress(DeadlineExceeded):
+                key = wait_until(lambda: self._host_key(engine, found[0]), timeout=0.15,
+                                 interval=0.004, longest=0.02, what='the host key')
+        return container_machine.machine_of(engine, found[0], key)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the containers that carry all of ``tags`` as labels, of both engines."""
-        filters = [f'--filter=label={key}={value}' for key, value in tags.items()]
+        filters = [f'--filter=label={container_machine.ATTEMPT}',
+                   *(f'--filter=label={key}={value}' for key, value in tags.items())]
         for engine in container_engine.installed():
-            listed = engine.call('ps', '-aq', f'--filter=label={ATTEMPT}', *filters,
-                                 what='listing containers').stdout.split()
+            listed = engine.call('ps', '-aq', *filters, what='listing containers').stdout.split()
             if listed:
                 for entry in engine.inspect(listed):
-                    yield self._machine(engine, entry, complain=False)
+                    running = container_machine.state_of(entry) is MachineState.RUNNING
+                    yield container_machine.machine_of(
+                        engine, entry, self._host_key(engine, entry) if running else None)
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container and its root; returns when both are gone."""
-        engine, identity, token = parse_id(machine_id)
+        engine, identity, token = container_machine.parse_id(machine_id)
         result = process.run(
-            Command(('sh', '-c', _DESTROY, 'sh', engine.name, identity, str(directory(token))),
+            Command(('sh', '-c', _DESTROY, 'sh', identity,
+                     str(container_machine.directory(token)), *engine.argv()),
                     sudo=engine.sudo, what=f'removing container {identity}'),
             timeout=60.0, check=False)
-        if result.returncode == 0 and not result.stderr.strip():
+        with self._lock:
+            self._host_keys.pop(identity, None)
+        if result.returncode == 0:
             return
         if sudo := container_engine.sudo_hint(result.stderr):
             raise ProviderError(f'container {identity} was not removed', sudo)
@@ -323,63 +243,41 @@ class ContainerProvider(Provider):
         wait_until(lambda: not engine.inspect([identity]), timeout=20.0,
                    what=f'container {identity} to be removed',
                    hint=container_engine.last_line(result.stderr))
-        with self._lock:
-            self._host_keys.pop(identity, None)
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
-        engine, identity, _ = parse_id(machine_id)
+        engine, identity, _ = container_machine.parse_id(machine_id)
         found = engine.inspect([identity])
         if not found:
             raise MachineNotFound(f'container {identity} does not exist any more')
-        if ENDS_STOPPED not in labels_of(found[0]):
+        if container_machine.ENDS_STOPPED not in container_machine.labels_of(found[0]):
             raise Unsupported('a container made to be deleted at its end can not be stopped',
                               "create it with on_exit='stop'")
         engine.call('stop', '-t', '3', identity, what=f'stopping container {identity}')
 
     def start(self, machine_id: str) -> None:
         """Start a stopped container again."""
-        engine, identity, _ = parse_id(machine_id)
+        engine, identity, _ = container_machine.parse_id(machine_id)
         if not engine.inspect([identity]):
             raise MachineNotFound(f'container {identity} does not exist any more')
         engine.call('start', identity, what=f'starting container {identity}')
 
-    def _machine(self, engine: Engine, entry: Mapping[str, Any], *, complain: bool) -> Machine:
-        labels = labels_of(entry)
+    def _host_key(self, engine: Engine, entry: Mapping[str, Any]) -> Optional[str]:
+        """Return the public host key that a machine made at its first boot, if it has yet."""
         identity = str(entry['Id'])[:12]
-        token = labels[ATTEMPT]
-        state = _STATES.get(str(entry['State']['Status']), MachineState.PENDING)
-        address = address_of(entry)
-        shell = None
-        if state is MachineState.RUNNING and address:
-            key = self._host_key(engine, identity, token, bool(labels.get(DIRECTORY)))
-            if key:
-                shell = Endpoint('ssh', address, 22, labels[LOGIN], key)
-        elif state is MachineState.STOPPED and complain:
-            self._complain(engine, identity)
-        return Machine(
-            id=f'{engine.name}:{identity}:{token}', name=labels.get(MACHINE, ''),
-            provider=self.name, state=state, created=timestamp(str(entry['Created'])),
-            shell=shell, vpn_host=address,
-            tags={k: v for k, v in labels.items() if k not in (
-                ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED)},
-            end_command=container_entry.END_COMMAND)
-
-    def _host_key(self, engine: Engine, identity: str, token: str, own: bool) -> Optional[str]:
-        """Return the public host key that the machine made at its first boot, if it has yet."""
+        labels = container_machine.labels_of(entry)
         with self._lock:
             if identity in self._host_keys:
                 return self._host_keys[identity]
-        if own and os.geteuid() == 0:
-            path = host_key_file(token)
-            text = path.read_text() if path.exists() else ''
-        elif own:
-            text = process.run(
-                Command(('cat', str(host_key_file(token))),
-                        sudo=True), timeout=10.0, check=False).stdout
-        else:
+        path = container_machine.host_key_file(labels[container_machine.ATTEMPT])
+        if not labels.get(container_machine.DIRECTORY):
             log = engine.call('logs', identity, what='reading the host key', check=False).stdout
             text = _after(log, container_entry.HOST_KEY_MARK)
+        elif os.geteuid() == 0:
+            text = path.read_text() if path.exists() else ''
+        else:
+            text = process.run(Command(('cat', str(path)), sudo=True), timeout=10.0,
+                               check=False).stdout
         key = ' '.join(text.split()[:2])
         if not key:
             return None
@@ -397,100 +295,6 @@ class ContainerProvider(Provider):
 def _after(log: str, mark: str) -> str:
     found = [line[len(mark):] for line in log.splitlines() if line.startswith(mark)]
     return found[-1] if found else ''
-
-
-def container_name(machine: str) -> str:
-    """Return what the engine calls a machine."""
-    return f'fogros2-{machine}'
-
-
-def directory(token: str) -> Path:
-    """
-    Return where the root of the machine with this token lies.
-
-    :raises MachineNotFound: the token isn't one of ours, so nothing is ever removed by it.
-    """
-    if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]{3,63}', token):
-        raise MachineNotFound(f"'{token}' is no token of a container machine")
-    return ROOTS / token
-
-
-def host_key_file(token: str) -> Path:
-    """Return where a machine with this computer's root leaves its public host key."""
-    return directory(token) / 'root' / f'{container_entry.HOST_KEY}.pub'
-
-
-def parse_id(machine_id: str) -> tuple[Engine, str, str]:
-    """
-    Return the engine, the container's id and the token that a machine's id carries.
-
-    :raises MachineNotFound: it is no id of this provider's.
-    """
-    match = re.fullmatch(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)', machine_id)
-    if not match:
-        raise MachineNotFound(f"'{machine_id}' is no container machine")
-    return container_engine.named(match[1]), match[2], match[3]
-
-
-def labels_of(entry: Mapping[str, Any]) -> dict[str, str]:
-    """Return the labels in what the engine knows of a container."""
-    return dict(entry['Config']['Labels'] or {})
-
-
-def address_of(entry: Mapping[str, Any]) -> str:
-    """Return the container's first address, or ''."""
-    networks = (entry.get('NetworkSettings') or {}).get('Networks') or {}
-    return next((str(n['IPAddress']) for n in networks.values() if n.get('IPAddress')), '')
-
-
-def timestamp(text: str) -> float:
-    """Return an engine's time of creation in seconds since the epoch."""
-    match = re.match(r'(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(\.\d{1,6})?\d*(Z|[+-]\d\d:\d\d)', text)
-    if not match:
-        return 0.0
-    zone = '+00:00' if match[3] == 'Z' else match[3]
-    fraction = (match[2] or '.0').ljust(7, '0')
-    return datetime.datetime.fromisoformat(f'{match[1]}{fraction}{zone}').timestamp()
-
-
-def mount_flag(mount: str) -> str:
-    """Return the engine's form of a read-only mount."""
-    source, _, target = mount.partition(':')
-    return f'{source}:{target or source}:ro'
-
-
-def common_flags(spec: MachineSpec, request: CreateRequest, options: Options) -> Iterator[str]:
-    """Yield the engine's words for what a spec asks, with an image or without."""
-    yield from ('--name', container_name(spec.name), '--hostname', spec.name)
-    labels = {
-        **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
-        DIRECTORY: '' if options.image else 'root',
-    }
-    if spec.on_exit == 'stop':
-        labels[ENDS_STOPPED] = 'yes'
-    for key, value in labels.items():
-        yield from ('--label', f'{key}={value}')
-    # what WireGuard needs, and no more; ping takes NET_RAW, sshd's log AUDIT_WRITE
-    for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
-        yield from ('--cap-add', right)
-    yield from ('--device', '/dev/net/tun')
-    # the machine's name alone, not the names this computer's /etc/hosts knows
-    yield '--no-hosts'
-    yield from container_engine.limits()
-    if options.network:
-        yield from ('--network', options.network)
-    if options.ip:
-        yield from ('--ip', options.ip)
-    if options.cpus:
-        yield from ('--cpus', f'{options.cpus:g}')
-    if options.memory:
-        yield from ('--memory', options.memory)
-    if options.gpus:
-        yield from ('--gpus', options.gpus)
-    for device in options.devices:
-        yield from ('--device', device)
-    for port in options.ports:
-        yield from ('-p', port)
 
 
 def removal_hook(top: Path) -> str:

@@ -28,7 +28,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import container
+from fogros2.provider import container_machine
 from fogros2.provider.container import ContainerProvider
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ProviderContract
@@ -69,7 +69,7 @@ class Cloud:
         return [
             *(n for n in lines('podman', 'ps', '-a', '--format', '{{.Names}}')
               if n in [f'fogros2-{name}' for name in self.names]),
-            *(t for t in lines('ls', str(container.ROOTS)) if t in [p[2] for p in parts]),
+            *(t for t in lines('ls', str(container_machine.ROOTS)) if t in [p[2] for p in parts]),
             *(p[1] for p in parts if p[1] in mounts)]
 
     def create(self, spec: MachineSpec, **changes: object) -> str:
@@ -254,9 +254,10 @@ def test_the_end_command_ends_it_for_good(cloud):
             return False
 
         wait_until(gone, timeout=10.0, what='the machine to end')
+        root = container_machine.directory(machine.id.split(':')[2])
         wait_until(lambda: process.run(
-            Command(('test', '-e', str(container.directory(machine.id.split(':')[2]))), sudo=True),
-            timeout=10.0, check=False).returncode, timeout=10.0, what='its root to go')
+            Command(('test', '-e', str(root)), sudo=True), timeout=10.0, check=False).returncode,
+            timeout=10.0, what='its root to go')
         cloud.provider.destroy(machine.id)
 
 
@@ -350,10 +351,15 @@ def test_a_launch_killed_while_it_creates_leaves_all_or_nothing(cloud, cloud_net
         cloud.provider.destroy(machine.id)
 
 
+def agent_config(*, robot_timeout, boot_timeout):
+    return {
+        'machine': 'm', 'launch': 'abc', 'directory': ContainerProvider.agent_directory,
+        'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': robot_timeout,
+        'boot_timeout': boot_timeout, 'end_command': []}
+
+
 def test_the_guard_is_armed_at_boot_and_comes_back(cloud):
-    config = {'machine': 'm', 'launch': 'abc', 'directory': container.ContainerProvider.
-              agent_directory, 'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': 60,
-              'boot_timeout': 600, 'end_command': []}
+    config = agent_config(robot_timeout=60, boot_timeout=600)
     machine = cloud.reached(cloud.create(cloud.spec(), agent_config=config))
     with cloud.shell(machine) as shell:
         def guard() -> str:
@@ -370,9 +376,7 @@ def test_the_guard_is_armed_at_boot_and_comes_back(cloud):
 
 
 def test_a_guard_that_waits_in_vain_ends_the_machine(cloud):
-    config = {'machine': 'm', 'launch': 'abc', 'directory': container.ContainerProvider.
-              agent_directory, 'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': 1,
-              'boot_timeout': 1, 'end_command': []}
+    config = agent_config(robot_timeout=1, boot_timeout=1)
     machine_id = cloud.create(cloud.spec(), agent_config=config)
 
     def gone() -> bool:

@@ -15,8 +15,15 @@ import pytest
 
 from fogros2.errors import CommandError, ConfigurationError, MachineNotFound, PrerequisiteError
 from fogros2.model import Command, CreateRequest, MachineSpec, Result
-from fogros2.provider import container, container_engine, container_entry, container_root
-from fogros2.provider.container import Options
+from fogros2.provider import (
+    container,
+    container_engine,
+    container_entry,
+    container_machine,
+    container_options,
+    container_root,
+)
+from fogros2.provider.container_options import Options
 
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
 
@@ -210,7 +217,7 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
         'mounts': [str(tmp_path)], 'env': {'A': 'b'}, 'network': 'n', 'ip': '198.51.100.7',
         'devices': None,
     })
-    words = list(container.common_flags(
+    words = list(container_options.common_flags(
         MachineSpec('m', 'container', on_exit='stop'), REQUEST, options))
     for pair in (('--cpus', '2'), ('--memory', '1g'), ('-p', '80:80'), ('--gpus', 'all'),
                  ('--network', 'n'), ('--ip', '198.51.100.7'), ('--hostname', 'm'),
@@ -259,15 +266,15 @@ def test_an_engine_s_failure_has_a_remedy(stderr, hint):
 ])
 def test_only_our_own_ids_are_taken(machine_id):
     with pytest.raises(MachineNotFound):
-        engine, identity, token = container.parse_id(machine_id)
-        container.directory(token)
+        engine, identity, token = container_machine.parse_id(machine_id)
+        container_machine.directory(token)
 
 
 def test_times_of_both_engines_are_read():
-    second = 1763708340
-    assert container.timestamp('2025-11-21T06:59:00.123456789Z') == pytest.approx(second + 0.123)
-    assert container.timestamp('2025-11-21T08:59:00.1+02:00') == pytest.approx(second + 0.1)
-    assert container.timestamp('yesterday') == 0.0
+    read = container_machine.timestamp
+    assert read('2025-11-21T06:59:00.123456789Z') == pytest.approx(1763708340.123456)
+    assert read('2025-11-21T08:59:00.1+02:00') == pytest.approx(1763708340.1)
+    assert read('yesterday') == 0.0
 
 
 def entry_files(**changes) -> bytes:
