@@ -181,8 +181,8 @@ class CycloneDds(DdsVendor):
 
     def _addresses(self, host: str) -> list[str]:
         begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
-        # everything of this host is asked: it costs no network
-        count = MAX_PARTICIPANTS + 1 if host == LOOPBACK else ASKED
+        # it costs no network to ask more of this host
+        count = 4 * ASKED if host == LOOPBACK else ASKED
         return [f'{host}:{port}' for port in range(begin, begin + 2 * count, 2)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
