@@ -11,7 +11,7 @@ from . import (
     logging,
     substitutions,
 )
-from ._aliases import alias_submodules, missing
+from ._aliases import alias_submodules
 from ._base import (
     Action,
     BaseEventHandler,
@@ -45,7 +45,3 @@ alias_submodules(
     event_handler=('BaseEventHandler', 'EventHandler'),
     some_entities_type=('SomeEntitiesType', 'SomeEntitiesType_types_tuple'),
     some_substitutions_type=('SomeSubstitutionsType', 'SomeSubstitutionsType_types_tuple'))
-
-
-def __getattr__(name: str) -> object:
-    missing(__name__, name)

@@ -4,7 +4,7 @@ from importlib.machinery import ModuleSpec
 import re
 import sys
 from types import ModuleType
-from typing import Dict, Iterable, NoReturn, Optional, Tuple
+from typing import Dict, Iterable, Optional, Tuple
 
 _BEFORE_WORD = re.compile('(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])')
 _modules: Dict[str, Tuple[str, ...]] = {}
@@ -42,18 +42,3 @@ def alias_submodules(package: str, names: Iterable[str], **special: Tuple[str, .
             _modules[f"{package}.{_BEFORE_WORD.sub('_', name).lower()}"] = (name,)
     for module, content in special.items():
         _modules[f'{package}.{module}'] = content
-
-
-def missing(module: str, name: str) -> NoReturn:
-    """
-    Refuse a name that the embedded default lacks; for a module's ``__getattr__``.
-
-    :raises ImportError: for a name of ROS 2's: of an AttributeError, an import statement
-        wouldn't show the text.
-    :raises AttributeError: for any other.
-    """
-    if name in ('LifecycleTransition', 'ROSTimer', 'RosTimer', 'SetUseSimTime'):
-        raise ImportError(
-            f'{module}.{name} is not part of the embedded default: install ROS 2 '
-            '(https://docs.ros.org/en/jazzy/Installation.html) and use that instead')
-    raise AttributeError(f"module '{module}' has no attribute '{name}'")

@@ -6,15 +6,12 @@ Reads the files itself: importing :mod:`importlib.metadata` takes longer than al
 """
 from __future__ import annotations
 
-from collections import defaultdict
 import importlib
 import logging
 import os
 import re
 import sys
 from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
-
-EXTENSION_POINT_GROUP_NAME = 'ros2cli.extension_point'
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +46,7 @@ class EntryPoint(NamedTuple):
         return loaded
 
 
-def _metadata_files() -> Iterator[Tuple[str, str]]:
+def _metadata_files() -> Iterator[str]:
     seen = set()
     for directory in sys.path:
         try:
@@ -65,7 +62,7 @@ def _metadata_files() -> Iterator[Tuple[str, str]]:
             # Of a distribution that is there twice, the first on the path counts.
             if distribution not in seen:
                 seen.add(distribution)
-                yield distribution, path
+                yield path
 
 
 def _read(path: str) -> Iterator[EntryPoint]:
@@ -84,22 +81,11 @@ def _read(path: str) -> Iterator[EntryPoint]:
             yield EntryPoint(name.strip(), group, value.strip())
 
 
-def get_all_entry_points() -> Dict[str, Dict[str, Tuple[str, EntryPoint]]]:
-    """Return, by extension point and name, distributions' names and entry points."""
-    extension_points = get_entry_points(EXTENSION_POINT_GROUP_NAME)
-    entry_points: Dict[str, Dict[str, Tuple[str, EntryPoint]]] = defaultdict(dict)
-    for distribution, path in _metadata_files():
-        for entry_point in _read(path):
-            if entry_point.group in extension_points:
-                entry_points[entry_point.group][entry_point.name] = distribution, entry_point
-    return entry_points
-
-
 def get_entry_points(group_name: str) -> Dict[str, EntryPoint]:
     """Return the group's entry points by name."""
     return {
         entry_point.name: entry_point
-        for _, path in _metadata_files() for entry_point in _read(path)
+        for path in _metadata_files() for entry_point in _read(path)
         if entry_point.group == group_name}
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do."""
-from .._aliases import alias_submodules, missing
+from .._aliases import alias_submodules
 from ._environment import (
     AppendEnvironmentVariable,
     DeclareLaunchArgument,
@@ -38,7 +38,3 @@ __all__ = [
     'UnsetLaunchConfiguration']
 
 alias_submodules(__name__, __all__, shutdown_action=('Shutdown',))
-
-
-def __getattr__(name: str) -> object:
-    missing(__name__, name)

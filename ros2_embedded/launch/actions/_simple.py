@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import collections.abc
+import inspect
 import logging
 from typing import Any, Awaitable, Callable, Dict, Iterable, List, Optional, Tuple
 
@@ -144,7 +145,7 @@ class OpaqueCoroutine(Action):
         ignore_context: bool = False, **left_over_kwargs: Any
     ) -> None:
         super().__init__(**left_over_kwargs)
-        if not asyncio.iscoroutinefunction(coroutine):
+        if not inspect.iscoroutinefunction(coroutine):
             raise TypeError(
                 "OpaqueCoroutine expected a coroutine function for 'coroutine', "
                 f"got '{type(coroutine)}'")

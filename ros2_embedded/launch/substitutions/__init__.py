@@ -10,7 +10,7 @@ from typing import Any, Dict, Iterable, List, Optional, Sequence, Tuple, Type, U
 
 import launch.logging
 
-from .._aliases import alias_submodules, missing
+from .._aliases import alias_submodules
 from .._base import SomeSubstitutionsType, Substitution
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
@@ -492,7 +492,3 @@ class IfElseSubstitution(ParsedSubstitution):
 alias_submodules(__name__, __all__, boolean_substitution=(
     'AllSubstitution', 'AndSubstitution', 'AnySubstitution', 'NotSubstitution',
     'OrSubstitution'))
-
-
-def __getattr__(name: str) -> object:
-    missing(__name__, name)

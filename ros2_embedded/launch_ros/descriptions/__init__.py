@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 from launch import Action, Condition, SomeSubstitutionsType
-from launch._aliases import alias_submodules, missing
+from launch._aliases import alias_submodules
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
@@ -74,7 +74,3 @@ class ComposableNode:
 
 
 alias_submodules(__name__, ('ComposableNode',))
-
-
-def __getattr__(name: str) -> object:
-    missing(__name__, name)

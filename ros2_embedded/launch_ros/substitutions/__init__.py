@@ -8,7 +8,7 @@ from typing import Any, Tuple
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from launch import SomeSubstitutionsType
-from launch._aliases import alias_submodules, missing
+from launch._aliases import alias_submodules
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
 from launch.substitutions import (
@@ -110,7 +110,3 @@ class Parameter(ParsedSubstitution):
 
 alias_submodules(__name__, __all__, find_package=(
     'FindPackage', 'FindPackagePrefix', 'FindPackageShare'))
-
-
-def __getattr__(name: str) -> object:
-    missing(__name__, name)

@@ -61,32 +61,3 @@ class ExecutablesVerb(VerbExtension):
                 raise RuntimeError(f"Package '{name}' not found") from exc
             for path in sorted(paths):
                 print(path if args.full_path else f'{name} {os.path.basename(path)}')
-
-
-class XmlVerb(VerbExtension):
-    """Output the XML of the package manifest or a specific tag."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        argument = parser.add_argument('package_name', help='The package name')
-        argument.completer = package_name_completer
-        parser.add_argument(
-            '-t', '--tag', help="The XML tag to output (e.g. 'version')")
-
-    def main(self, *, args: Any) -> Optional[str]:
-        import xml.etree.ElementTree as ET
-        prefix = get_prefix_path(args.package_name)
-        if prefix is None:
-            return PACKAGE_NOT_FOUND
-        path = os.path.join(prefix, 'share', args.package_name, 'package.xml')
-        if not os.path.isfile(path):
-            return 'Package XML manifest not found'
-        tree = ET.parse(path)
-        if args.tag is None:
-            ET.dump(tree)
-            return None
-        elements = tree.findall(args.tag)
-        if not elements:
-            return 'XML tag not found'
-        for element in elements:
-            print(element.text)
-        return None
