@@ -99,7 +99,8 @@ class CycloneDds(DdsVendor):
 
         :param lan: see :meth:`parse_lan`.
         :param user: the environment as the user has it; interfaces configured there are used in
-            the LAN's place, and peers make the LAN come first, or they couldn't be asked.
+            the LAN's place, peers make the LAN come first, or they couldn't be asked, and who
+            keeps ROS 2 to this computer has no LAN.
         :raises DdsError: the user's configuration can't be read, or can't be added to.
         """
         text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
@@ -115,7 +116,9 @@ class CycloneDds(DdsVendor):
         interfaces = []
         if not any(re.search(r'"lo"|"127\.', attributes) for attributes in listed):
             interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
-        if lan is not None and not listed:
+        local = (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
+                 or user.get('ROS_LOCALHOST_ONLY') == '1')
+        if lan is not None and not listed and not local:
             interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
         # below 0, which is what an interface has whose priority the user didn't think of
         return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]

@@ -68,6 +68,13 @@ def test_the_robot_prefers_itself_then_its_lan_then_the_vpn() -> None:
     assert attributes(root, 'Peer') == []
 
 
+@pytest.mark.parametrize('user', [
+    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, {'ROS_LOCALHOST_ONLY': '1'}])
+def test_who_keeps_ros_to_the_robot_has_no_lan(user: dict[str, str]) -> None:
+    interfaces = CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user)
+    assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
+
+
 def test_a_robot_without_a_lan_still_takes_in_what_runs_beside() -> None:
     interfaces = CYCLONE.robot_interfaces('foga1b2c3', None, {})
     assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
