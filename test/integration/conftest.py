@@ -20,6 +20,19 @@ from fogros2.waiting import wait_until
 SUBNETS = [f'198.51.100.{host}/28' for host in range(0, 256, 16)]
 
 
+@pytest.fixture(scope='session')
+def domain() -> str:
+    """Return a ROS domain of this run's own: it meets neither another run nor the user's robot."""
+    return str(1 + uuid.uuid4().int % 100)
+
+
+@pytest.fixture(autouse=True)
+def own_domain(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the tests' nodes among themselves and off the network of this computer."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+
 def traces(state: Path) -> set[str]:
     """Return everything on this computer now that a launch may leave behind, one line each."""
     found = {f'interface {name}' for name in os.listdir('/sys/class/net')
