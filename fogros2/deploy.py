@@ -133,6 +133,10 @@ class Launch:
             machines = provider(spec.provider)
             shells.warm(machines.shell_kind)
             machines.check(spec)
+            if spec.on_exit == 'stop' and not owned(spec):
+                raise ConfigurationError(
+                    f"'{spec.name}' is a computer that exists already: no launch switches it off",
+                    "use on_exit='delete' to leave nothing there, or 'keep'")
             if spec.workspace is not None:
                 workspace.inspect(Path(spec.workspace))
             for package, executable in programs.get(spec.name, ()):
@@ -370,7 +374,7 @@ class RobotVpn:
                 if alive.returncode == 0:
                     continue
                 try:
-                    with step(self._launch.report, '', 'VPN repair'):
+                    with step(self._launch.report, '', 'VPN repair', fatal=False):
                         self._launch.robot(
                             self.vpn.repair(self.interface, self._sorted()), cancel=False)
                 except FogError:
@@ -453,7 +457,12 @@ class RunningMachine:
 
         It is called from a thread of the connection's and must not make requests of the agent.
         """
-        self.agent.subscribe(callback)
+        def tell(event: dict[str, Any]) -> None:
+            # an agent that leaves at the end as it was told is no news
+            if event['event'] != 'connection' or not self._launch.ending:
+                callback(event)
+
+        self.agent.subscribe(tell)
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
@@ -472,7 +481,7 @@ class _Deployment:
         self.folder: MachineDirectory = launch.store.machine(spec.name)
         self.record = Record(spec.name, spec.provider, spec)
         #: Whether the computer is the provider's to make and to end, not somebody's own.
-        self.owned = spec.provider != 'ssh'
+        self.owned = owned(spec)
         self.reused = False
         self.failed = True
 
@@ -806,7 +815,7 @@ class _Deployment:
         if self.failed and not self.reused:
             mode = 'delete'
         machine_id = self.record.machine_id
-        with step(self.launch.report, self.name, mode):
+        with step(self.launch.report, self.name, mode if self.owned else 'let go'):
             if mode == 'delete':
                 if machine_id is not None:
                     self.provider.destroy(machine_id)
@@ -847,6 +856,11 @@ def provider(name: str) -> Provider:
     """
     instance: Provider = plugin_system.load('fogros2.provider', name)()
     return instance
+
+
+def owned(spec: MachineSpec) -> bool:
+    """Return whether the computer is the provider's to make and to end, not somebody's own."""
+    return spec.provider != 'ssh'
 
 
 def check_robot() -> None:

@@ -30,12 +30,17 @@ class StepDone:
 
 @dataclasses.dataclass(frozen=True)
 class StepFailed:
-    """A step failed after ``seconds``; an undo that failed is one too."""
+    """
+    A step failed after ``seconds``; an undo that failed is one too.
+
+    :param fatal: the error goes on up and will be told there too; otherwise this is all.
+    """
 
     machine: str
     step: str
     seconds: float
     reason: str
+    fatal: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +70,15 @@ def silent(event: Event) -> None:
 
 
 @contextlib.contextmanager
-def step(report: Reporter, machine: str, name: str) -> Iterator[list[str]]:
+def step(
+    report: Reporter, machine: str, name: str, *, fatal: bool = True,
+) -> Iterator[list[str]]:
     """
     Report a step's start and end around the block; yields a list that takes the detail words.
 
     An exception is reported as StepFailed and goes on up.
+
+    :param fatal: whether whoever takes the exception tells it once more.
     """
     detail: list[str] = []
     report(StepStarted(machine, name))
@@ -77,6 +86,6 @@ def step(report: Reporter, machine: str, name: str) -> Iterator[list[str]]:
     try:
         yield detail
     except BaseException as error:
-        report(StepFailed(machine, name, time.monotonic() - begin, str(error)))
+        report(StepFailed(machine, name, time.monotonic() - begin, str(error), fatal))
         raise
     report(StepDone(machine, name, time.monotonic() - begin, ', '.join(detail)))

@@ -48,9 +48,12 @@ class Console:
                     f'{_where(event.machine)}: {event.step} {event.seconds:.2f} s{detail}')
             elif isinstance(event, StepFailed):
                 self._running.pop((event.machine, event.step), None)
-                self._logger.error(
-                    f'{_where(event.machine)}: {event.step} failed after {event.seconds:.2f} s: '
-                    f'{event.reason}')
+                what = f'{_where(event.machine)}: {event.step} failed after {event.seconds:.2f} s'
+                if event.fatal:
+                    # the launch ends with the reason: one line of error, not two
+                    self._logger.info(what)
+                else:
+                    self._logger.warning(f'{what}: {event.reason}')
             elif isinstance(event, Progress):
                 self._running[event.machine, event.step] = _bar(event)
             elif isinstance(event, OutputLine):

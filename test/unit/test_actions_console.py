@@ -51,11 +51,13 @@ def test_lines(lines):
     console(OutputLine('planner', 'building'))
     console(StepDone('planner', 'sync', 1.234, '3 files'))
     console(StepFailed('', 'VPN interface', 0.5, 'no TUN'))
+    console(StepFailed('', 'VPN repair', 0.5, 'no TUN', fatal=False))
     assert lines == [
         ('DEBUG', 'planner: sync ...'),
         ('DEBUG', 'planner: building'),
         ('INFO', 'planner: sync 1.23 s (3 files)'),
-        ('ERROR', 'robot: VPN interface failed after 0.50 s: no TUN')]
+        ('INFO', 'robot: VPN interface failed after 0.50 s'),
+        ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN')]
 
 
 def test_log_level(lines):
