@@ -79,7 +79,7 @@ class Settings:
 
     bitrate: int = 8_000_000
     quality: float = 23.0
-    preset: str = 'ultrafast'
+    preset: str = 'superfast'
     gop: int = 300
     rate: float = 30.0
     encoder: str = SOFTWARE

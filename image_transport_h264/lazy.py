@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-#: A stream's packets: those the network lost come again, if they are not too old by then.
+#: A stream's packets: for recorders and others who ask for it, those the network lost come again.
 STREAM_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
@@ -24,6 +24,10 @@ IMAGE_QOS = QoSProfile(
 #: What is of no use late.
 FEEDBACK_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE)
+#: Pieces of packets: whoever takes them has no use for those that come late.
+PIECES_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE)
 REQUEST_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,

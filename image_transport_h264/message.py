@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 import importlib
+import struct
 from typing import Any, Optional
 
 from sensor_msgs.msg import CompressedImage, Image
@@ -13,7 +14,10 @@ from std_msgs.msg import Header
 from image_transport_h264.codec import Packet, Picture
 
 #: What follows the stream's name in the names of the topics that belong to it.
-KEY_REQUEST, FEEDBACK, CAMERA_INFO = 'keyframe', 'feedback', 'camera_info'
+KEY_REQUEST, FEEDBACK, PIECES, CAMERA_INFO = 'keyframe', 'feedback', 'pieces', 'camera_info'
+
+#: seconds, nanoseconds, length of the frame id
+_HEADER = struct.Struct('>iIH')
 
 
 def picture(message: Image) -> Picture:
@@ -43,6 +47,20 @@ def compressed(header: Header, packet: Packet) -> CompressedImage:
     ``format`` is 'h264' alone, as viewers know it: what it was before coding is in the packet.
     """
     return CompressedImage(header=header, format=packet.format, data=octets(packet.data))
+
+
+def with_header(header: Header, data: bytes) -> bytes:
+    """Return a packet with its message's header in front, for the way in pieces."""
+    name: bytes = header.frame_id.encode()
+    return _HEADER.pack(header.stamp.sec, header.stamp.nanosec, len(name)) + name + data
+
+
+def header_and_data(whole: bytes) -> tuple[Header, bytes]:
+    """Return what ``with_header`` put together."""
+    seconds, nanoseconds, length = _HEADER.unpack_from(whole)
+    header = Header(frame_id=whole[_HEADER.size:_HEADER.size + length].decode(errors='replace'))
+    header.stamp.sec, header.stamp.nanosec = seconds, nanoseconds
+    return header, whole[_HEADER.size + length:]
 
 
 def camera_info_topic(topic: str) -> str:

@@ -15,19 +15,19 @@ from collections import deque
 import dataclasses
 from typing import Optional
 
-#: Seconds of waiting, over so many acknowledgements in a row, that make a queue.
-QUEUE = 0.05
-QUEUE_ACKNOWLEDGEMENTS = 3
-#: Seconds of waiting that make one by themselves.
-LONG_QUEUE = 0.3
+#: Seconds of waiting that make a queue if nothing, over so many seconds and acknowledgements, took
+#: less: what a loss or a busy processor holds up is followed by something quick.
+QUEUE, QUEUE_SECONDS, QUEUE_ACKNOWLEDGEMENTS = 0.04, 0.3, 4
 #: Seconds that packets may be under way, beyond the usual, before new pictures are left out.
-LATEST = 0.15
+LATEST = 0.25
 #: Seconds after which a packet counts as lost, and the link as unknown.
 LOST = 1.5
 #: Seconds over which the quickest round trip and the rate of arrival are taken.
 MEMORY, ARRIVALS = 10.0, 0.5
 #: What is left of the measured rate, and how the bitrate grows afterwards.
 YIELD, GROWTH, GROWTH_INTERVAL, CALM = 0.8, 1.15, 0.25, 0.5
+#: Seconds after a loss for which more are expected.
+LOSS_MEMORY = 20.0
 #: Bits per pixel below which fewer pictures look better than worse ones.
 LEAST_BITS = 0.03
 LEAST_BITRATE = 50_000
@@ -54,11 +54,13 @@ class Governor:
         self._sent: deque[_Sent] = deque()
         self._trips: deque[tuple[float, float]] = deque()
         self._arrivals: deque[tuple[float, int]] = deque()
-        self._waiting = 0
+        self._waits: deque[tuple[float, float]] = deque()
         self._cut = -1e9
         self._calm_since = 0.0
         self._grown = 0.0
         self._rate = 0.0
+        self._lost = 0
+        self._loss: Optional[float] = None
 
     @property
     def round_trip(self) -> float:
@@ -70,10 +72,21 @@ class Governor:
         if self.heard is not None:
             self._sent.append(_Sent(sequence, size * 8, now))
 
-    def acknowledged(self, sequence: int, now: float) -> None:
-        """Note that the receiver has a packet; those before it are there too, or lost."""
+    def loses(self, now: float) -> bool:
+        """Return whether packets were lost of late."""
+        return self._loss is not None and now - self._loss < LOSS_MEMORY
+
+    def acknowledged(self, sequence: int, lost: int, now: float) -> None:
+        """
+        Note that the receiver has a packet; those before it are there too, or lost.
+
+        :param lost: packets that didn't come whole, since the receiver began to count.
+        """
         if self.heard is None:
             self._calm_since = now
+        elif lost > self._lost:
+            self._loss = now
+        self._lost = lost
         self.heard = now
         sent = None
         while self._sent and (sequence - self._sent[0].sequence) & 0xffffffff < 0x80000000:
@@ -90,11 +103,14 @@ class Governor:
         # a large packet takes its time on any link: that is no queue
         wire = sent.bits / max(self.bitrate, self._rate)
         waited = trip - self.round_trip - wire
-        self._waiting = self._waiting + 1 if waited > QUEUE else 0
-        if waited > QUEUE:
+        self._waits.append((now, waited))
+        while self._waits[0][0] < now - QUEUE_SECONDS:
+            self._waits.popleft()
+        least = min(waited for _, waited in self._waits)
+        if least > QUEUE:
             self._calm_since = now
-            if sent.when > self._cut and (
-                    waited > LONG_QUEUE or self._waiting >= QUEUE_ACKNOWLEDGEMENTS):
+            if (sent.when > self._cut and len(self._waits) >= QUEUE_ACKNOWLEDGEMENTS
+                    and now - self._waits[0][0] > 0.7 * QUEUE_SECONDS):
                 self._yield(now)
 
     def may_send(self, now: float, pixels: int, interval: float) -> bool:
@@ -105,9 +121,6 @@ class Governor:
         """
         self._forget(now)
         if self._sent and now - self._sent[0].when > self.round_trip + LATEST:
-            self._calm_since = now
-            if self._sent[0].when > self._cut:
-                self._yield(now)
             return False
         # a little early is in time: pictures come with jitter
         return interval * self.bitrate >= 0.8 * LEAST_BITS * pixels or interval > 1.0
@@ -129,7 +142,7 @@ class Governor:
     def _yield(self, now: float) -> None:
         """Go below the rate at which packets arrived."""
         self._cut = now
-        self._waiting = 0
+        self._waits.clear()
         rate = self._arrival_rate(now)
         if rate:
             self._rate = rate

@@ -7,25 +7,32 @@ import abc
 from collections.abc import Callable
 import secrets
 import time
+from typing import Optional
 
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Empty, UInt64MultiArray
+from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
+from image_transport_h264.annexb import Tag
 from image_transport_h264.codec import CodecError, Decoder, Missing, peek
 from image_transport_h264.lazy import (
+    best_effort,
     FEEDBACK_QOS,
     IMAGE_QOS,
     LazyNode,
+    PIECES_QOS,
     REQUEST_QOS,
     STREAM_QOS,
     Tap,
 )
-from image_transport_h264.message import FEEDBACK, KEY_REQUEST
+from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
+from image_transport_h264.repair import Assembler
 from image_transport_h264.worker import Worker
 
 Publish = Callable[[Image], None]
+#: A packet, and whether it came whole and not in pieces.
+Coded = tuple[Header, bytes, bool]
 #: Packets that may wait for the decoder; more of them means that it can't follow.
 WAITING = 8
 #: Seconds after which a request for a key is repeated.
@@ -115,22 +122,45 @@ class VideoReceiver(Receiver):
         self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)
         self._feedback = node.create_publisher(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', FEEDBACK_QOS)
-        self._worker: Worker[CompressedImage] = Worker('decode', self._decode, WAITING)
-        self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._worker.put)
+        self._worker: Worker[Coded] = Worker('decode', self._decode, WAITING)
+        self._assembler = Assembler()
+        self._counted: Optional[Tag] = None
+        self._acknowledged: Optional[Tag] = None
+        self._lost = 0
+        # what the network loses is repaired by pieces or a new key: waiting for it to come again
+        # would hold up what has come
+        self._tap = Tap(node, CompressedImage, stream, best_effort(STREAM_QOS), self._whole,
+                        adapt=False)
+        self._pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
+                           adapt=False)
 
     def want(self, wanted: bool) -> None:
         """Subscribe to the stream, or end it."""
         self._tap.want(wanted)
+        self._pieces.want(wanted)
 
     def stop(self) -> None:
         """End the thread."""
         self._worker.stop()
 
-    def _decode(self, coded: CompressedImage) -> None:
-        data = bytes(coded.data)
+    def _whole(self, coded: CompressedImage) -> None:
+        self._worker.put((coded.header, bytes(coded.data), True))
+
+    def _piece(self, piece: UInt8MultiArray) -> None:
+        whole = self._assembler.add(bytes(piece.data))
+        if whole is not None:
+            self._worker.put((*message.header_and_data(whole), False))
+
+    def _decode(self, coded: Coded) -> None:
+        header, data, whole = coded
         tag = peek(data)
         if tag is not None:
-            self._feedback.publish(UInt64MultiArray(data=[self._identity, tag.sequence]))
+            if whole:
+                self._count(tag)
+            if self._acknowledged != tag:
+                self._acknowledged = tag
+                self._feedback.publish(UInt64MultiArray(
+                    data=[self._identity, tag.sequence, self._lost]))
         try:
             picture = self._decoder.decode(data)
         except Missing as error:
@@ -144,7 +174,17 @@ class VideoReceiver(Receiver):
             return
         # of pictures that come in a burst, after a repaired loss, the last ones are of interest
         if picture is not None and self._worker.waiting < 2:
-            self._publish(message.image(coded.header, picture))
+            self._publish(message.image(header, picture))
+
+    def _count(self, tag: Tag) -> None:
+        """Count the packets that are missing between those that came whole."""
+        last = self._counted
+        if last is not None and tag.stream == last.stream:
+            gap = (tag.sequence - last.sequence) & 0xffffffff
+            if gap > 0x80000000:
+                return
+            self._lost += max(0, gap - 1)
+        self._counted = tag
 
     def _ask(self) -> None:
         """Ask for a key, and again only after a while."""

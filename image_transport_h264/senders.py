@@ -15,26 +15,29 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Empty, Header, UInt64MultiArray
+from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
 from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
 from image_transport_h264.lazy import (
-    best_effort,
     FEEDBACK_QOS,
     IMAGE_QOS,
     LazyNode,
+    PIECES_QOS,
     REQUEST_QOS,
     STREAM_QOS,
 )
-from image_transport_h264.message import FEEDBACK, KEY_REQUEST
+from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.rate import Governor
+from image_transport_h264.repair import pieces
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
 #: Receivers that say nothing for so long no longer hold the others back.
 SILENT = 3.0
 #: Seconds over which the stream's rate is taken.
 RATE_SECONDS = 1.0
+#: Packets are sent again in pieces only where the bitrate allows so many times what is used.
+ROOM = 2.0
 #: A higher bitrate is worth a key only from this factor on.
 WORTH = 1.4
 
@@ -120,7 +123,7 @@ class StillSender(Sender):
 PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ('bitrate', 8_000_000, 'most bits per second that the stream takes'),
     ('quality', 23.0, "libx264's constant rate factor, 0 to 51, less is better"),
-    ('preset', 'ultrafast', "libx264's preset"),
+    ('preset', 'superfast', "libx264's preset"),
     ('gop', 300, 'most pictures from one key to the next'),
     ('max_rate', 0.0, 'most pictures per second, 0 for all'),
     ('encoder', 'auto', "'auto', 'libx264' or another of FFmpeg's H.264 encoders"),
@@ -165,10 +168,12 @@ class VideoSender(Sender):
                 publisher = node.offer(kind, f'{base}/{topic}', STREAM_QOS, self._matched)
                 self._others.append((publisher, kind, make))
                 self.publishers.append(publisher)
+        self._pieces = node.create_publisher(
+            UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS)
         node.create_subscription(
             Empty, f'{stream}/{KEY_REQUEST}', self._key_requested, REQUEST_QOS)
         node.create_subscription(
-            UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, best_effort(FEEDBACK_QOS))
+            UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, FEEDBACK_QOS)
 
     # --- in the executor's thread
 
@@ -189,14 +194,14 @@ class VideoSender(Sender):
                 self._key_wanted = True
 
     def _heard(self, feedback: UInt64MultiArray) -> None:
-        if len(feedback.data) != 2:
+        if len(feedback.data) != 3:
             return
-        receiver, sequence = feedback.data
+        receiver, sequence, lost = feedback.data
         with self._lock:
             governor = self._governors.get(receiver)
             if governor is None:
                 governor = self._governors[receiver] = Governor(self._asked.bitrate)
-            governor.acknowledged(sequence, time.monotonic())
+            governor.acknowledged(sequence, lost, time.monotonic())
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         names = {name for name, _, _ in PARAMETERS}
@@ -234,14 +239,28 @@ class VideoSender(Sender):
                 self._key_wanted |= key
             return
         left = time.monotonic()
+        again: list[bytes] = []
+        if self._protect(left):
+            again = pieces(packet.tag.stream, packet.tag.sequence,
+                           message.with_header(image.header, packet.data))
+        size = len(packet.data) + sum(map(len, again))
         with self._lock:
             if packet.key:
                 self._last_key = left
             self._last_sent = now
-            self._sent.append((now, len(packet.data) * 8))
+            self._sent.append((now, size * 8))
             for governor in self._governors.values():
-                governor.sent(packet.tag.sequence, len(packet.data), left)
+                governor.sent(packet.tag.sequence, size, left)
         self._publish(image.header, packet)
+        for piece in again:
+            self._pieces.publish(UInt8MultiArray(data=message.octets(piece)))
+
+    def _protect(self, now: float) -> bool:
+        """Return whether the packet goes in pieces as well: a link loses, and has room."""
+        with self._lock:
+            used = sum(bits for _, bits in self._sent) / RATE_SECONDS
+            return any(governor.loses(now) and used * ROOM < governor.bitrate
+                       for governor in self._governors.values())
 
     def _publish(self, header: Header, packet: Packet) -> None:
         self._video.publish(message.compressed(header, packet))
