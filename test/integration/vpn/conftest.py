@@ -14,6 +14,7 @@ The relay passes UDP on, as a NAT would, so that the machine can't dial the robo
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
 import itertools
 import json
 import os
@@ -33,7 +34,8 @@ from fogros2.waiting import wait_until
 
 HERE = Path(__file__).parent
 RELAY = HERE.parents[1] / 'relay.py'
-ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
+NETWORK = '198.18.7.0/24'
+ROBOT, MACHINE, SECOND = '198.18.7.1', '198.18.7.2', '198.18.7.3'
 PORT = 51820
 #: What makes a node find its Python, its packages and its middleware.
 PASSED = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'HOME', 'ROS_DISTRO',
@@ -120,11 +122,10 @@ class Lab:
             'robot', 'machine', 'net', 'lan')}
         self.vpn = WireGuard()
         self.dds = CycloneDds()
-        network = '198.18.7.0/24'
         self.interfaces = {
-            'robot': VpnInterface(f'{self.mark}r', ROBOT, network, PORT,
+            'robot': VpnInterface(f'{self.mark}r', ROBOT, NETWORK, PORT,
                                   str(folder / 'r/vpn.key'), guarded=True),
-            'machine': VpnInterface(f'{self.mark}m', MACHINE, network, PORT,
+            'machine': VpnInterface(f'{self.mark}m', MACHINE, NETWORK, PORT,
                                     str(folder / 'm/vpn.key'))}
         self.children: list[Child] = []
         self.relay: Child | None = None
@@ -153,6 +154,26 @@ class Lab:
         """Put a second computer beside the robot."""
         self.lan_name = 'lan0'
         self.link('robot', 'lan0', '192.168.77.1/24', 'lan', 'lan0', '192.168.77.2/24')
+
+    def second(self) -> None:
+        """Add a second machine to the VPN, beside the first."""
+        self.spaces['second'] = f'{self.mark}s'
+        self.ip('netns', 'add', self.spaces['second'])
+        self.ip('-n', self.spaces['second'], 'link', 'set', 'lo', 'up')
+        self.link('robot', 'e1', '198.51.100.130/26', 'second', 'e0', '198.51.100.131/26')
+        self.link('machine', 'e1', '203.0.113.130/26', 'second', 'e1', '203.0.113.131/26')
+        interface = VpnInterface(f'{self.mark}s', SECOND, NETWORK, PORT,
+                                 str(self.folder / 's/vpn.key'))
+        self.interfaces['second'] = interface
+        key = self.run('second', self.vpn.keys(interface)).stdout.strip()
+        peers = self.peers()
+        first, robot = peers['robot'][0], peers['machine'][0]
+        self.do('second', self.vpn.up(interface, [
+            robot, dataclasses.replace(first, endpoint=f'203.0.113.130:{PORT}')]))
+        self.do('machine', self.vpn.peers(self.interfaces['machine'], [
+            robot, Peer('second', key, SECOND, f'203.0.113.131:{PORT}')]))
+        self.do('robot', self.vpn.peers(self.interfaces['robot'], [
+            first, Peer('second', key, SECOND, f'198.51.100.131:{PORT}')]))
 
     def close(self) -> None:
         for child in reversed(self.children):
@@ -261,10 +282,14 @@ class Lab:
         environment = {'RMW_IMPLEMENTATION': self.dds.rmw}
         if uri is None:
             path = self.folder / f'dds {host}.xml'
-            interfaces = (
-                self.dds.machine_interfaces(self.interfaces[host].name) if host == 'machine'
-                else self.dds.robot_interfaces(self.interfaces[host].name, self.lan_name, {}))
-            path.write_text(self.dds.render(interfaces, []))
+            name = self.interfaces[host].name
+            if host == 'robot':
+                text = self.dds.render(self.dds.robot_interfaces(name, self.lan_name, {}), [])
+            else:
+                others = {'machine': SECOND, 'second': MACHINE}
+                peers = [others[host]] if 'second' in self.interfaces else []
+                text = self.dds.render(self.dds.machine_interfaces(name), peers)
+            path.write_text(text)
             environment.update(self.dds.environment(str(path), {}))
         elif uri:
             environment['CYCLONEDDS_URI'] = uri

@@ -70,6 +70,16 @@ def test_the_lan_and_terminals_talk_with_robot_nodes_as_before(vpn: Lab) -> None
     heals(robot, machine, time.monotonic())
 
 
+def test_two_machines_hear_the_robot_and_each_other(vpn: Lab) -> None:
+    vpn.second()
+    first = vpn.node('machine', 'to:/first', 'from:/second', 'from:/robot')
+    second = vpn.node('second', 'to:/second', 'from:/first', 'from:/robot')
+    robot = vpn.node('robot', 'to:/robot', 'from:/first', 'from:/second')
+    for child, topic in ((first, '/second'), (first, '/robot'), (second, '/first'),
+                         (second, '/robot'), (robot, '/first'), (robot, '/second')):
+        child.wait('topic', topic, count=5)
+
+
 def test_a_cut_is_survived(vpn: Lab) -> None:
     robot, beside, machine = start(vpn)
     vpn.bad(cut=True)
