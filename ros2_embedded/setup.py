@@ -21,11 +21,10 @@ def ros2_found() -> str | None:
     for entry in sys.path:
         if entry.startswith('/opt/ros/'):
             return f'{entry} on the Python path'
-    if os.environ.get('ROS_DISTRO'):
-        for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-            if prefix and Path(prefix, 'share', 'rclpy').is_dir():
-                if Path(prefix).resolve() != Path(sys.prefix).resolve():
-                    return f'ROS 2 {os.environ["ROS_DISTRO"]} in {prefix}'
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        manifest = Path(prefix, 'share', 'rclpy', 'package.xml')
+        if prefix and manifest.is_file() and 'embedded default' not in manifest.read_text():
+            return f'ROS 2 {os.environ.get("ROS_DISTRO", "")} in {prefix}'
     return None
 
 
@@ -111,16 +110,12 @@ setup(
             'ros2pkg.verb = ros2cli.verb:VerbExtension',
         ],
         'ros2topic.verb': verbs(
-            'topic', list='ListVerb', info='InfoVerb', type='TypeVerb', find='FindVerb')
+            'topic', list='ListVerb', info='InfoVerb', type='TypeVerb')
         + ['echo = ros2cli.verb.topic_echo:EchoVerb', 'pub = ros2cli.verb.topic_pub:PubVerb',
-           'hz = ros2cli.verb.topic_rate:HzVerb', 'bw = ros2cli.verb.topic_rate:BwVerb',
-           'delay = ros2cli.verb.topic_rate:DelayVerb'],
+           'hz = ros2cli.verb.topic_rate:HzVerb', 'bw = ros2cli.verb.topic_rate:BwVerb'],
         'ros2node.verb': verbs('node', list='ListVerb', info='InfoVerb'),
-        'ros2service.verb': verbs(
-            'service', list='ListVerb', call='CallVerb', type='TypeVerb', find='FindVerb'),
-        'ros2param.verb': verbs(
-            'param', list='ListVerb', get='GetVerb', set='SetVerb', describe='DescribeVerb',
-            dump='DumpVerb', load='LoadVerb', delete='DeleteVerb'),
+        'ros2service.verb': verbs('service', list='ListVerb', call='CallVerb', type='TypeVerb'),
+        'ros2param.verb': verbs('param', list='ListVerb', get='GetVerb', set='SetVerb'),
         'ros2pkg.verb': verbs(
             'pkg', list='ListVerb', prefix='PrefixVerb', executables='ExecutablesVerb'),
     },

@@ -10,7 +10,6 @@ from ros2cli.verb import VerbExtension
 from ros2cli.verb.node import (
     get_absolute_node_name,
     get_node_names,
-    parse_node_name,
     wait_for_node,
 )
 
@@ -57,13 +56,6 @@ def call(node: Any, node_name: str, method: str, *arguments: Any) -> Any:
         raise RuntimeError(
             f'Exception while calling service of node {node_name}: {future.exception()}')
     return future.result()
-
-
-def _report(result: Any, done: str, failed: str) -> int:
-    text = (done if result.successful else failed) + (f': {result.reason}' if result.reason
-                                                      else '')
-    print(text, file=sys.stdout if result.successful else sys.stderr)
-    return 0
 
 
 class _OneNodeVerb(VerbExtension):
@@ -165,81 +157,6 @@ class SetVerb(_OneNodeVerb):
         from rclpy.parameter import get_parameter_value
         parameter = Parameter(name=args.parameter_name, value=get_parameter_value(args.value))
         result = call(node, name, 'set_parameters', [parameter]).results[0]
-        return _report(result, 'Set parameter successful', 'Setting parameter failed')
-
-
-class DeleteVerb(_OneNodeVerb):
-    """Delete parameter."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
-        parser.add_argument('parameter_name', help='Name of the parameter')
-
-    def do(self, node: Any, name: str, args: Any) -> Any:
-        result = call(node, name, 'delete_parameters', [args.parameter_name]).results[0]
-        return _report(result, 'Deleted parameter successfully', 'Deleting parameter failed')
-
-
-class DescribeVerb(_OneNodeVerb):
-    """Show descriptive information about declared parameters."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
-        parser.add_argument('parameter_names', nargs='+', help='Names of the parameters')
-
-    def do(self, node: Any, name: str, args: Any) -> Any:
-        found = call(node, name, 'describe_parameters', args.parameter_names).descriptors
-        for one in found:
-            print('Parameter name:', one.name)
-            print('  Type:', _type_text(one.type))
-            if one.description:
-                print('  Description:', one.description)
-            print('  Constraints:')
-            if one.read_only:
-                print('    Read only: true')
-            for limits in [*one.floating_point_range, *one.integer_range][:1]:
-                print('    Min value:', limits.from_value)
-                print('    Max value:', limits.to_value)
-                if limits.step:
-                    print('    Step:', limits.step)
-            if one.additional_constraints:
-                print('    Additional constraints:', one.additional_constraints)
-
-
-class DumpVerb(_OneNodeVerb):
-    """Show all of the parameters of a node in a YAML file format."""
-
-    def do(self, node: Any, name: str, args: Any) -> Any:
-        from rclpy.parameter import parameter_value_to_python
-        import yaml
-        names = sorted(call(node, name, 'list_parameters').result.names)
-        values = call(node, name, 'get_parameters', names).values
-        tree: dict[str, Any] = {}
-        for one, value in zip(names, values):
-            *above, last = one.split('.')
-            place = tree
-            for part in above:
-                place = place.setdefault(part, {})
-            place[last] = parameter_value_to_python(value)
-        print(yaml.dump({parse_node_name(name).full_name: {'ros__parameters': tree}},
-                        default_flow_style=False))
-
-
-class LoadVerb(_OneNodeVerb):
-    """Load parameter file for a node."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
-        parser.add_argument('parameter_file', help='Parameter file')
-        parser.add_argument(
-            '--no-use-wildcard', action='store_true',
-            help="Do not load parameters in the '/**' namespace into the node")
-
-    def do(self, node: Any, name: str, args: Any) -> Any:
-        from rclpy.parameter import parameter_dict_from_yaml_file
-        wildcard = not args.no_use_wildcard
-        parameters = list(parameter_dict_from_yaml_file(args.parameter_file, wildcard).values())
-        results = call(node, name, 'set_parameters', parameters).results
-        for one, result in zip(parameters, results):
-            _report(result, f'Set parameter {one.name} successful',
-                    f'Set parameter {one.name} failed')
+        text = 'Set parameter successful' if result.successful else 'Setting parameter failed'
+        print(f'{text}: {result.reason}' if result.reason else text,
+              file=sys.stdout if result.successful else sys.stderr)

@@ -64,23 +64,6 @@ class TypeVerb(VerbExtension):
         return 1 if types is None else 0
 
 
-class FindVerb(VerbExtension):
-    """Output a list of available services of a given type."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        parser.add_argument('service_type', help='Name of the ROS service type to filter for '
-                                                 "(e.g. 'rcl_interfaces/srv/ListParameters')")
-        _add_list_arguments(parser)
-
-    def main(self, *, args: Any) -> Any:
-        found = [name for name, types in _services(args) if args.service_type in types]
-        if args.count_services:
-            print(len(found))
-            return
-        for name in found:
-            print(name)
-
-
 class CallVerb(VerbExtension):
     """Call a service."""
 

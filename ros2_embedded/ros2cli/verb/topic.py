@@ -224,27 +224,3 @@ class TypeVerb(VerbExtension):
         for kind in types or []:
             print(kind)
         return 1 if types is None else 0
-
-
-class FindVerb(VerbExtension):
-    """Output a list of available topics of a given type."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        add_strategy_node_arguments(parser)
-        parser.add_argument(
-            'topic_type',
-            help="Name of the ROS topic type to filter for (e.g. 'std_msg/msg/String')")
-        parser.add_argument('-c', '--count-topics', action='store_true',
-                            help='Only display the number of topics discovered')
-        parser.add_argument('--include-hidden-topics', action='store_true',
-                            help='Consider hidden topics as well')
-
-    def main(self, *, args: Any) -> Any:
-        with NodeStrategy(args) as node:
-            topics = get_topic_names_and_types(
-                node=node, include_hidden_topics=args.include_hidden_topics)
-        found = [name for name, types in topics if args.topic_type in types]
-        if args.count_topics:
-            print(len(found))
-        else:
-            print(*found, sep='\n', end='\n' if found else '')

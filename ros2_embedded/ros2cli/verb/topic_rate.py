@@ -122,32 +122,3 @@ class BwVerb(VerbExtension):
         print(f'Subscribed to [{args.topic}]')
         _measure(args, args.topic, lambda data, now: received.append((now, len(data))), report,
                  raw=True)
-
-
-class DelayVerb(VerbExtension):
-    """Display delay of topic from timestamp in header."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        parser.add_argument('topic', help='Topic name to calculate the delay for')
-        parser.add_argument(
-            '--window', '-w', dest='window_size', type=positive_int, default=10000,
-            help='window size, in # of messages, for calculating rate, string to '
-                 '(default: 10000)')
-        add_direct_node_arguments(parser)
-
-    def main(self, *, args: Any) -> Any:
-        delays: deque[float] = deque(maxlen=args.window_size)
-
-        def received(message: Any, now: int) -> None:
-            if not hasattr(message, 'header'):
-                raise RuntimeError('msg does not have header')
-            stamp = message.header.stamp
-            delays.append((now - stamp.sec * 10 ** 9 - stamp.nanosec) / 1e9)
-
-        def report(now: int) -> None:
-            if delays:
-                mean, least, greatest, deviation = _spread(delays)
-                print(f'average delay: {mean:.3f}\n\tmin: {least:.3f}s max: {greatest:.3f}s '
-                      f'std dev: {deviation:.5f}s window: {len(delays)}')
-
-        _measure(args, args.topic, received, report, raw=False)
