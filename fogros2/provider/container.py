@@ -68,6 +68,8 @@ tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
 
+#: Ended in order, killed, and terminated.
+_GOOD_ENDS = (0, 137, 143)
 #: What it exits with when the token has been used.
 _THERE = 17
 
@@ -204,7 +206,7 @@ class ContainerProvider(Provider):
             raise MachineNotFound(f'container {identity} does not exist any more')
         state = container_machine.state_of(found[0])
         if state is MachineState.STOPPED:
-            self._complain(engine, identity)
+            self._complain(engine, found[0])
         key = None
         if state is MachineState.RUNNING:
             # the first boot makes it in some 20 ms: asking the engine again takes longer
@@ -285,11 +287,16 @@ class ContainerProvider(Provider):
             self._host_keys[identity] = key
         return key
 
-    def _complain(self, engine: Engine, identity: str) -> None:
-        log = engine.call('logs', identity, what='reading its log', check=False).stdout
-        reason = _after(log, container_entry.ERROR_MARK)
-        if reason:
-            raise ProviderError(f'container {identity} could not start: {reason}')
+    def _complain(self, engine: Engine, entry: Mapping[str, Any]) -> None:
+        """Raise what a container said that ended by an error, as images may that lack much."""
+        if int(entry['State']['ExitCode']) in _GOOD_ENDS:
+            return
+        identity = str(entry['Id'])[:12]
+        log = engine.call('logs', identity, what='reading its log', check=False)
+        reason = _after(log.stdout, container_entry.ERROR_MARK) \
+            or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
+        raise ProviderError(f'container {identity} could not start: {reason}',
+                            'it needs sshd, sudo, rsync and python3, or apt-get and a network')
 
 
 def _after(log: str, mark: str) -> str:

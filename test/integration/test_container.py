@@ -28,7 +28,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import container_machine
+from fogros2.provider import container_machine, container_root
 from fogros2.provider.container import ContainerProvider
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ProviderContract
@@ -387,6 +387,68 @@ def test_a_guard_that_waits_in_vain_ends_the_machine(cloud):
         return False
 
     wait_until(gone, timeout=20.0, what='the machine to end itself')
+
+
+@pytest.fixture
+def image(engine: str) -> Iterator[str]:
+    """Return an image without users or keys; its programs are this computer's, by mounts."""
+    name = f'localhost/fogt{uuid.uuid4().hex[:8]}'
+    archive = container_root.Archive()
+    for folder in ('proc', 'sys', 'dev', 'tmp', 'etc/ssh', 'usr', 'root', 'home', 'var/mail'):
+        archive.folder(folder)
+    for link in ('bin', 'sbin', 'lib', 'lib64', 'lib32'):
+        if os.path.islink(f'/{link}'):
+            archive.link(link, os.readlink(f'/{link}'))
+    for path in ('/etc/ld.so.cache', '/etc/nsswitch.conf', '/etc/login.defs', '/etc/shells'):
+        if os.path.exists(path):
+            archive.file(path[1:], Path(path).read_bytes())
+    archive.file('etc/passwd', b'root:x:0:0:root:/root:/bin/sh\n'
+                 b'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin\n')
+    archive.file('etc/group', b'root:x:0:\nnogroup:x:65534:\n')
+    archive.file('etc/shadow', b'root:*:::::::\n', 0o600)
+    archive.file('etc/sudoers', b'root ALL=(ALL:ALL) ALL\n', 0o440)
+    for service in ('sudo', 'other', 'useradd', 'chpasswd'):
+        archive.file(f'etc/pam.d/{service}', b''.join(
+            b'%s sufficient pam_permit.so\n' % kind
+            for kind in (b'auth', b'account', b'session', b'password')))
+    process.run(Command((engine, 'import', '-', name), sudo=True, input=archive.data()),
+                timeout=60.0)
+    yield name
+    process.run(Command((engine, 'rmi', name), sudo=True), timeout=60.0)
+
+
+@pytest.mark.skipif(not os.path.islink('/bin'), reason='needs a system with a merged /usr')
+def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
+    spec = cloud.spec(on_exit='stop', options={'image': image, 'mounts': ['/usr']})
+    machine = cloud.reached(cloud.create(spec))
+    with cloud.shell(machine) as shell:
+        assert said(shell, 'hostname') == spec.name
+        assert said(shell, 'pwd') == '/home/fog'
+        assert said(shell, 'id', '-u', sudo=True) == '0'
+        shell.put(b'kept', '~/file', mode=0o600)
+    assert cloud.create(spec, token=machine.id.split(':')[2]) == machine.id
+    cloud.provider.stop(machine.id)
+    cloud.provider.start(machine.id)
+    again = cloud.reached(machine.id)
+    assert again.shell.host_key == machine.shell.host_key
+    with cloud.shell(again) as shell:
+        assert said(shell, 'cat', 'file') == 'kept'
+
+
+def test_an_image_that_lacks_too_much_says_so(image, cloud):
+    mounts = [path for path in ('/usr/lib', '/usr/lib64', '/usr/lib32') if os.path.isdir(path)]
+    machine_id = cloud.create(cloud.spec(on_exit='stop', options={
+        'image': image, 'mounts': [f"{os.path.realpath('/bin/sh')}:/bin/sh", *mounts]}))
+
+    def fails() -> str:
+        try:
+            cloud.provider.describe(machine_id)
+        except ProviderError as error:
+            return str(error)
+        return ''
+
+    assert 'the image lacks sshd sudo rsync python3' in wait_until(
+        lambda: fails() or None, timeout=20.0, what='the machine to complain')
 
 
 def test_a_full_disk_of_a_machine_is_said_to_be_full(cloud, tmp_path):
