@@ -227,7 +227,22 @@ class Launch:
             mine.set_exception(error)
             raise
         mine.set_result(machine)
+        self._warm()
         return machine
+
+    def _warm(self) -> None:
+        """
+        Start the machines' launch processes once all machines are up.
+
+        Nodes start sooner by what that takes; before, it would take the processors from machines
+        on the same computer that are still coming up.
+        """
+        ups = list(self._ups.values())
+        if not all(up.done() for up in ups):
+            return
+        for machine in self.machines():
+            with contextlib.suppress(FogError):  # the first start would say the same
+                machine.warm()
 
     def _robot_vpn(self) -> RobotVpn:
         """Return the robot's VPN, chosen but not necessarily up."""
@@ -438,6 +453,13 @@ class RunningMachine:
         self.interface = interface
         self._launch = launch
         self._undo = undo
+        self._warm = False
+
+    def warm(self) -> None:
+        """Start the process that will run the nodes, unless it runs."""
+        if not self._warm:
+            self._warm = True
+            self.agent.request('launch')
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """Start nodes; what becomes of them arrives as events."""
@@ -747,7 +769,7 @@ class _Deployment:
                 shell.put(agent_source().read_bytes(), program, mode=0o700)
                 shell.put(model.to_json(config).encode(), f'{directory}/config.json', mode=0o600)
                 self._on(shell, [Command(
-                    ('python3', program, 'serve', '--detach', '--config',
+                    ('python3', '-IS', program, 'serve', '--detach', '--config',
                      f'{directory}/config.json'), sudo=True, what='start the agent')])
             self._save(agent=directory, agent_program=program)
             # no cancel: it is needed on the way down as well, and each request has its deadline
@@ -775,7 +797,6 @@ class _Deployment:
                        'peer': robot.address},
             environment={**ros.environment, **dds, **self.spec.environment},
             setup=list(ros.setup), ros_command=list(ros.command))
-        agent.request('launch')
         heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, self.launch.id)
         undo.callback(heartbeat.close)
         try:

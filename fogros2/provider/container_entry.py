@@ -71,7 +71,7 @@ echo "{host_key_mark}$(cat $key.pub)"
 
 _GUARD = """\
 while :; do
-    python3 /{folder}/agent.py serve --config /{folder}/agent.json &
+    python3 -IS /{folder}/agent.py serve --config /{folder}/agent.json &
     guard=$!
     wait $guard
     code=$?
