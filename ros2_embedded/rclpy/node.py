@@ -2,6 +2,7 @@
 """Nodes."""
 
 from collections.abc import Callable, Iterator
+import sys
 from typing import Any
 import weakref
 
@@ -511,6 +512,11 @@ class Node(NodeParameters, NodeGraph):
         self._wake_executor()
 
     # --- destroying ---
+
+    def __del__(self) -> None:
+        if not getattr(self, '_destroyed', True) and not sys.is_finalizing() \
+                and hasattr(self, '_record') and self._context.ok():
+            self.destroy_node()
 
     def _destroy(self, things: list[Any], thing: Any, *endpoints: Reader | Writer | None) -> bool:
         if thing not in things:
