@@ -53,36 +53,38 @@ class SSHShell:
 
     # -- connection -----------------------------------------------------------------------------
 
-    def channel(self) -> paramiko.Channel:
+    def channel(self, timeout: Optional[float] = None) -> paramiko.Channel:
         """
         Return a new channel of the connection, which is opened as needed.
 
+        :param timeout: seconds it may take, at most those of the constructor.
         :raises ConnectError: the machine can't be reached.
-        :raises DeadlineExceeded: it takes no more channels.
+        :raises DeadlineExceeded: it takes no more channels, or answers no more.
         """
+        patience = min(self._timeout, timeout or self._timeout)
         return wait_until(
-            self._try_channel, timeout=self._timeout, what=f"a session on '{self.name}'",
-            hint='raise MaxSessions of its SSH server', longest=0.1)
+            lambda: self._try_channel(patience), timeout=patience, longest=0.1,
+            what=f"a session on '{self.name}'", hint='raise MaxSessions of its SSH server')
 
-    def _try_channel(self) -> Optional[paramiko.Channel]:
-        transport = self._connected()
+    def _try_channel(self, patience: float) -> Optional[paramiko.Channel]:
+        transport = self._connected(patience)
         import paramiko
         begin = time.monotonic()
         try:
-            return transport.open_session(window_size=1 << 22, timeout=self._timeout)
+            return transport.open_session(window_size=1 << 22, timeout=patience)
         except (paramiko.SSHException, EOFError, OSError):
             # Lost, as we find out only now, and nothing has been started yet; or as many
             # sessions as the server allows, and one of ours will end. What is raised doesn't
             # tell: paramiko keeps one exception for all threads. Nor does is_active().
-            if not transport.is_alive() or time.monotonic() - begin >= self._timeout:
+            if not transport.is_alive() or time.monotonic() - begin >= patience:
                 self._drop(transport)
             return None
 
-    def _connected(self) -> paramiko.Transport:
+    def _connected(self, patience: float) -> paramiko.Transport:
         with self._lock:
             if self._transport is None or not self._transport.is_alive():
                 self._transport = ssh_connection.connect(
-                    self.endpoint, name=self.name, timeout=self._timeout)
+                    self.endpoint, name=self.name, timeout=patience)
             return self._transport
 
     def _drop(self, transport: paramiko.Transport) -> None:
@@ -110,7 +112,7 @@ class SSHShell:
         begin = time.monotonic()
         if cancel is not None and cancel.is_set():
             raise Cancelled(_what(command))
-        channel = self.start(line)
+        channel = self.start(line, timeout)
         output = _Output(on_output)
         try:
             feeder = _feed(channel, command.input)
@@ -130,16 +132,17 @@ class SSHShell:
                 command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
         return result
 
-    def start(self, line: str) -> paramiko.Channel:
+    def start(self, line: str, timeout: Optional[float] = None) -> paramiko.Channel:
         """
         Start a command line there and return its channel.
 
+        :param timeout: seconds until it runs, at most those of the constructor.
         :raises ConnectError: the machine can't be reached.
         """
         import paramiko
 
         for attempt in (1, 2):
-            channel = self.channel()
+            channel = self.channel(timeout)
             try:
                 channel.exec_command(line)
                 return channel
@@ -208,7 +211,7 @@ class SSHShell:
         if pid:
             with contextlib.suppress(FogError):  # the machine may be what doesn't answer
                 self.run(Command(('sh', '-c', command_line.end_script(pid)), sudo=sudo),
-                         timeout=5.0, check=False)
+                         timeout=3.0, check=False)
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file there (folders made as needed): aside first, then moved into place."""

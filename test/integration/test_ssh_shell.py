@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import os
 from pathlib import Path
+import signal
 import socket
 import subprocess
 import sys
@@ -403,3 +404,23 @@ def test_without_a_terminal_bytes_go_as_they_are(server):
         capture_output=True, timeout=60, check=False)
     assert (child.returncode, child.stderr) == (5, b'no\n')
     assert child.stdout == data
+
+
+def test_a_machine_that_falls_silent_costs_no_more_than_the_time_out(server, shell):
+    shell.run(Command(('true',)), timeout=10.0)
+    sessions = server.sessions()
+    for pid in sessions:
+        os.kill(pid, signal.SIGSTOP)
+    listener = server.child
+    assert listener is not None
+    os.kill(listener.pid, signal.SIGSTOP)
+    try:
+        begin = time.monotonic()
+        with pytest.raises((ConnectError, DeadlineExceeded)):
+            shell.run(Command(('true',)), timeout=0.5)
+        assert time.monotonic() - begin < 5.0
+    finally:
+        for pid in (*sessions, listener.pid):
+            os.kill(pid, signal.SIGCONT)
+    # the silent connection was given up for a new one
+    assert shell.run(Command(('echo', 'back')), timeout=10.0).stdout == 'back\n'
