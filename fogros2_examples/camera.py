@@ -84,7 +84,8 @@ class Camera(Node):
                       step=3 * self.next.shape[1])
         image.header.stamp, image.header.frame_id = stamp, self.frame_id
         # rclpy takes an array of bytes as it is; anything else it looks at byte by byte
-        image.data = array.array('B', self.next.tobytes())
+        image.data = array.array('B')
+        image.data.frombytes(self.next.data.cast('B'))
         self.info.header = image.header
         self.images.publish(image)
         self.infos.publish(self.info)

@@ -8,13 +8,14 @@ unit with a Tag. Deep pictures (16 bit, float) go through FFV1 instead, lossless
 
 from __future__ import annotations
 
+import array
 import dataclasses
 from fractions import Fraction
 import functools
 import os
 import secrets
 import time
-from typing import Optional
+from typing import Any, Optional
 import zlib
 
 import av
@@ -78,7 +79,7 @@ class Settings:
     """
 
     bitrate: int = 8_000_000
-    quality: float = 23.0
+    quality: float = 25.0
     preset: str = 'superfast'
     gop: int = 300
     rate: float = 30.0
@@ -323,8 +324,8 @@ class Decoder:
                               f'{width}x{height}', 'damage')
         data = _pixels(frame, layout, width, height, step)
         if tag is not None and layout.alpha:
-            _put_alpha(data, tag)
-        return Picture(width, height, encoding, step, data.reshape(-1).data, big)
+            _put_alpha(numpy.frombuffer(data, numpy.uint8).reshape(height, step), tag)
+        return Picture(width, height, encoding, step, data, big)
 
 
 def peek(data: bytes) -> Optional[Tag]:
@@ -468,6 +469,16 @@ def _decoder(show_damage: bool) -> VideoCodecContext:
 
 # --- pixels in and out of FFmpeg's frames -------------------------------------------------------
 
+def _reformat(frame: VideoFrame, **options: Any) -> VideoFrame:
+    """
+    Convert a frame in one thread.
+
+    swscale's slices write a few bytes past their last row (9.5, 4:2:2 of some widths): with
+    several threads that row may be ready already.
+    """
+    return frame.reformat(threads=1, **options)
+
+
 def _padded(rows: Pixels, layout: Layout, even: bool) -> Pixels:
     """Return the rows, the last row and column repeated where sides have to be even."""
     height, row = rows.shape
@@ -506,7 +517,7 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
     if layout.kind == 'yuv422':
         frame = VideoFrame(width, height, layout.av_format)
         lines(frame)[:height, :rows.shape[1]] = rows
-        return frame.reformat(format=coding.av_format)
+        return _reformat(frame, format=coding.av_format)
     # FFmpeg reads the message's own memory
     shared = numpy.lib.stride_tricks.as_strided(
         rows, (height, width, layout.pixel_bytes), (rows.strides[0], layout.pixel_bytes, 1),
@@ -514,37 +525,46 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
     frame = VideoFrame.from_numpy_buffer(shared, layout.av_format)
     if coding.av_format == layout.av_format:
         return frame
-    return frame.reformat(
-        format=coding.av_format, dst_colorspace=Colorspace.ITU601,
+    return _reformat(
+        frame, format=coding.av_format, dst_colorspace=Colorspace.ITU601,
         dst_color_range=ColorRange.JPEG if coding.full_range else ColorRange.MPEG)
 
 
-def _pixels(frame: VideoFrame, layout: Layout, width: int, height: int, step: int) -> Pixels:
-    """Return the frame's pixels in a new array (height, step) of the layout."""
-    out = numpy.zeros((height, step), numpy.uint8) if step > width * layout.pixel_bytes else (
-        numpy.empty((height, step), numpy.uint8))
+def _pixels(
+    frame: VideoFrame, layout: Layout, width: int, height: int, step: int,
+) -> array.array[int]:
+    """Return the frame's pixels as ``step * height`` bytes in the layout."""
+    # as an array that rclpy takes over as it is: the only copy behind the codec is made into it
+    memory = array.array('B', [0]) * (height * step)
+    out = numpy.frombuffer(memory, numpy.uint8).reshape(height, step)
+    _convert(frame, layout, width, height, out)
+    return memory
+
+
+def _convert(
+    frame: VideoFrame, layout: Layout, width: int, height: int, out: Pixels,
+) -> None:
     row = width * layout.pixel_bytes
     if layout.kind == 'grey' and frame.format.name.startswith(('gray', 'yuv', 'nv')):
         out[:, :row] = lines(frame)[:height, :width]
-        return out
+        return
     if layout.kind == 'yuv422':
-        converted = frame.reformat(
-            format=layout.av_format, src_color_range=ColorRange.MPEG,
+        converted = _reformat(
+            frame, format=layout.av_format, src_color_range=ColorRange.MPEG,
             dst_color_range=ColorRange.MPEG)
     else:
         # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten
         narrow = layout.alpha and frame.width % 16 != 0
         av_format = layout.av_format.replace('a', '24') if narrow else layout.av_format
-        converted = frame.reformat(
-            format=av_format, src_colorspace=_colorspace(frame),
+        converted = _reformat(
+            frame, format=av_format, src_colorspace=_colorspace(frame),
             dst_colorspace=Colorspace.ITU601)
         if narrow:
             colours = lines(converted)[:height, :3 * width].reshape(height, width, 3)
             for channel in range(3):
                 out[:, channel:row:4] = colours[:, :, channel]
-            return out
+            return
     out[:, :row] = lines(converted)[:height, :row]
-    return out
 
 
 def _colorspace(frame: VideoFrame) -> int:

@@ -35,6 +35,8 @@ def image(header: Header, shown: Picture) -> Image:
 
 def octets(data: Any) -> 'array.array[int]':
     """Return bytes as the array that rclpy takes without looking at each of them."""
+    if isinstance(data, array.array):
+        return data
     values = array.array('B')
     values.frombytes(data)
     return values

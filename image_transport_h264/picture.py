@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import array
 import dataclasses
 from typing import Literal, Union
 
 import numpy
 from numpy.typing import NDArray
 
-Buffer = Union[bytes, bytearray, memoryview]
+Buffer = Union[bytes, bytearray, memoryview, 'array.array[int]']
 Pixels = NDArray[numpy.uint8]
 Kind = Literal['rgb', 'grey', 'yuv422', 'deep']
 

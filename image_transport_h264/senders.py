@@ -122,7 +122,7 @@ class StillSender(Sender):
 #: name, default, what it is for
 PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ('bitrate', 8_000_000, 'most bits per second that the stream takes'),
-    ('quality', 23.0, "libx264's constant rate factor, 0 to 51, less is better"),
+    ('quality', 25.0, "libx264's constant rate factor, 0 to 51, less is better"),
     ('preset', 'superfast', "libx264's preset"),
     ('gop', 300, 'most pictures from one key to the next'),
     ('max_rate', 0.0, 'most pictures per second, 0 for all'),
