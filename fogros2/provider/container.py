@@ -107,20 +107,28 @@ class ContainerProvider(Provider):
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')
+        container_engine.answers(engine)
         if not options.image:
             check_root()
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create the container and start it; returns when the engine has started it."""
         options = Options.parse(spec.options)
-        engine = container_engine.select(options.engine, options.image or None)
-        try:
-            if options.image:
-                identity = self._create_from_image(engine, spec, request, options)
-            else:
-                identity = self._create_from_root(engine, spec, request, options)
-        except ProviderError as error:
-            identity = self._existing(engine, spec.name, request.token, error)
+        ways = container_engine.candidates(
+            container_engine.select(options.engine, options.image or None))
+        engine = next(ways)
+        create = self._create_from_image if options.image else self._create_from_root
+        while True:
+            try:
+                identity = create(engine, spec, request, options)
+                container_engine.remember(engine)
+                break
+            except ProviderError as error:
+                another = next(ways, None)
+                if another is None or not container_engine.is_runtime_trouble(error):
+                    identity = self._existing(engine, spec.name, request.token, error)
+                    break
+                engine = another
         return container_machine.machine_id(engine, identity, request.token)
 
     def _existing(
@@ -141,7 +149,7 @@ class ContainerProvider(Provider):
         top = container_machine.directory(request.token)
         system = container_root.system_mounts()
         kept = spec.on_exit == 'stop'
-        words = [*container_options.common_flags(spec, request, options)]
+        words = [*container_options.common_flags(engine, spec, request, options)]
         for path in system:
             # the engine's own layer ends with the run; a machine that is stopped keeps its disk
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
@@ -177,7 +185,7 @@ class ContainerProvider(Provider):
     def _create_from_image(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
     ) -> str:
-        words = [*container_options.common_flags(spec, request, options)]
+        words = [*container_options.common_flags(engine, spec, request, options)]
         for mount in options.mounts:
             words += ['-v', container_options.mount_flag(mount)]
         if spec.on_exit != 'stop':
@@ -220,7 +228,14 @@ class ContainerProvider(Provider):
         filters = [f'--filter=label={container_machine.ATTEMPT}',
                    *(f'--filter=label={key}={value}' for key, value in tags.items())]
         for engine in container_engine.installed():
-            listed = engine.call('ps', '-aq', *filters, what='listing containers').stdout.split()
+            result = engine.call('ps', '-aq', *filters, what='listing containers', check=False)
+            if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
+                raise ProviderError(
+                    f'{engine.name} lists no containers: '
+                    f'{container_engine.last_line(result.stderr)}',
+                    container_engine.sudo_hint(result.stderr))
+            # a socket that docker's service left behind has no containers
+            listed = result.stdout.split()
             if listed:
                 for entry in engine.inspect(listed):
                     running = container_machine.state_of(entry) is MachineState.RUNNING

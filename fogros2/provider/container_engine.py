@@ -9,6 +9,7 @@ import json
 import os
 from pathlib import Path
 import resource
+import threading
 from typing import Any, Optional
 
 from fogros2 import process
@@ -17,6 +18,8 @@ from fogros2.model import Command, Result
 
 ENGINES = ('podman', 'docker')
 DOCKER_SOCKET = Path('/var/run/docker.sock')
+_LOCK = threading.Lock()
+_WORKED: dict[str, Engine] = {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +127,9 @@ def installed() -> Iterator[Engine]:
 
 def named(name: str) -> Engine:
     """Return the engine that a machine's id names."""
-    return podman() if name == 'podman' else docker()
+    with _LOCK:
+        worked = _WORKED.get(name)
+    return worked or (podman() if name == 'podman' else docker())
 
 
 def podman() -> Engine:
@@ -139,6 +144,49 @@ def docker() -> Engine:
     """Return docker, with sudo where its socket is root's alone."""
     return Engine('docker', sudo=not (
         os.environ.get('DOCKER_HOST') or os.access(DOCKER_SOCKET, os.W_OK)))
+
+
+def candidates(engine: Engine) -> Iterator[Engine]:
+    """
+    Yield ways to call an engine, the likeliest first: what worked before, what fits the control
+    groups, then what works on computers that tell nothing of the kind.
+    """
+    with _LOCK:
+        worked = _WORKED.get(engine.name)
+    found = [worked] if worked else []
+    found.append(engine)
+    if engine.name == 'podman':
+        for runtime in ((), ('--runtime', 'crun'), ('--runtime', 'runc')):
+            if not runtime or process.which(runtime[1]):
+                found += [dataclasses.replace(engine, flags=(*runtime, *manager))
+                          for manager in ((), ('--cgroup-manager', 'cgroupfs'))]
+    return iter(dict.fromkeys(found))
+
+
+def remember(engine: Engine) -> None:
+    """Keep for this process how an engine had to be called."""
+    with _LOCK:
+        _WORKED[engine.name] = engine
+
+
+def is_runtime_trouble(error: ProviderError) -> bool:
+    """Return whether other flags may help: the runtime and the control groups don't fit."""
+    text = str(error).lower()
+    return any(word in text for word in ('cgroup', 'oci runtime', 'sd-bus', 'dbus', 'systemd'))
+
+
+def answers(engine: Engine) -> None:
+    """
+    Check that an engine that is a service runs.
+
+    :raises PrerequisiteError: it doesn't, or isn't ours to use.
+    """
+    if engine.name == 'docker':
+        result = engine.call('version', what='asking docker', check=False)
+        if result.returncode != 0:
+            raise PrerequisiteError(
+                f'docker does not answer: {last_line(result.stderr)}',
+                sudo_hint(result.stderr) or 'sudo systemctl start docker')
 
 
 def flags_for(*, unified: bool, systemd: bool, runc: bool) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from typing import Any
 from fogros2.errors import ConfigurationError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider import container_engine
+from fogros2.provider.container_engine import Engine
 from fogros2.provider.container_machine import (
     ATTEMPT,
     container_name,
@@ -105,7 +106,9 @@ def mount_flag(mount: str) -> str:
     return f'{source}:{target or source}:ro'
 
 
-def common_flags(spec: MachineSpec, request: CreateRequest, options: Options) -> Iterator[str]:
+def common_flags(
+    engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
+) -> Iterator[str]:
     """Yield the engine's words for what a spec asks, with an image or without."""
     yield from ('--name', container_name(spec.name), '--hostname', spec.name)
     labels = {
@@ -132,7 +135,9 @@ def common_flags(spec: MachineSpec, request: CreateRequest, options: Options) ->
     if options.memory:
         yield from ('--memory', options.memory)
     if options.gpus:
-        yield from ('--gpus', options.gpus)
+        # podman takes them as what the vendor describes (CDI)
+        yield from (('--gpus', options.gpus) if engine.name == 'docker' else
+                    ('--device', f'nvidia.com/gpu={options.gpus}'))
     for device in options.devices:
         yield from ('--device', device)
     for port in options.ports:

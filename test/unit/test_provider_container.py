@@ -13,7 +13,13 @@ import tarfile
 
 import pytest
 
-from fogros2.errors import CommandError, ConfigurationError, MachineNotFound, PrerequisiteError
+from fogros2.errors import (
+    CommandError,
+    ConfigurationError,
+    MachineNotFound,
+    PrerequisiteError,
+    ProviderError,
+)
 from fogros2.model import Command, CreateRequest, MachineSpec, Result
 from fogros2.provider import (
     container,
@@ -23,6 +29,7 @@ from fogros2.provider import (
     container_options,
     container_root,
 )
+from fogros2.provider.container_engine import Engine
 from fogros2.provider.container_options import Options
 
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
@@ -218,7 +225,7 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
         'devices': None,
     })
     words = list(container_options.common_flags(
-        MachineSpec('m', 'container', on_exit='stop'), REQUEST, options))
+        Engine('docker'), MachineSpec('m', 'container', on_exit='stop'), REQUEST, options))
     for pair in (('--cpus', '2'), ('--memory', '1g'), ('-p', '80:80'), ('--gpus', 'all'),
                  ('--network', 'n'), ('--ip', '198.51.100.7'), ('--hostname', 'm'),
                  ('--name', 'fogros2-m'), ('--device', '/dev/net/tun'),
@@ -236,6 +243,29 @@ def test_control_groups_decide_podman_s_flags():
     assert flags(unified=False, systemd=False, runc=True) == (
         '--runtime', 'runc', '--cgroup-manager', 'cgroupfs')
     assert flags(unified=False, systemd=True, runc=False) == ()
+
+
+def test_other_flags_are_tried_where_control_groups_mislead(monkeypatch):
+    monkeypatch.setattr(container_engine, '_WORKED', {})
+    monkeypatch.setattr(container_engine.process, 'which', lambda p: p if p == 'runc' else None)
+    guess = Engine('podman', ('--cgroup-manager', 'cgroupfs'))
+    ways = [engine.flags for engine in container_engine.candidates(guess)]
+    assert ways == [
+        ('--cgroup-manager', 'cgroupfs'), (), ('--runtime', 'runc'),
+        ('--runtime', 'runc', '--cgroup-manager', 'cgroupfs')]
+    worked = Engine('podman', ('--runtime', 'runc'))
+    container_engine.remember(worked)
+    assert next(container_engine.candidates(guess)) == worked
+    assert container_engine.named('podman') == worked
+    assert list(container_engine.candidates(Engine('docker'))) == [Engine('docker')]
+
+
+@pytest.mark.parametrize('message, trouble', [
+    ('Error: crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error', True),
+    ('Error: the container name "x" is already in use', False),
+])
+def test_trouble_with_the_runtime_is_told_from_other_trouble(message, trouble):
+    assert container_engine.is_runtime_trouble(ProviderError(message)) is trouble
 
 
 def test_limits_never_ask_for_more_than_there_is():
