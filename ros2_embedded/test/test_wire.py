@@ -211,3 +211,20 @@ def test_we_show_in_its_graph_and_answer_its_commands(side):
     finally:
         side.executor.shutdown()
         thread.join(LIMIT)
+
+
+def test_type_hashes_are_those_that_ros_2_generated():
+    import json
+
+    from rosidl_embedded.definition import table, TABLES
+    from rosidl_embedded.typehash import type_hash
+    prefix = output('sh', '-c', 'echo ${AMENT_PREFIX_PATH%%:*}').strip()
+    compared = 0
+    for package in (one.stem for one in TABLES.glob('*.txt')):
+        for name in table(package):
+            file = Path(prefix, 'share', package, f'{name}.json')
+            if file.is_file():
+                for one in json.loads(file.read_text())['type_hashes']:
+                    assert type_hash(one['type_name']) == one['hash_string'], one['type_name']
+                    compared += 1
+    assert compared > 500

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two processes find each other without any configuration."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+TALKER = '''
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('talker')
+publisher = node.create_publisher(String, 'chatter', 10)
+while publisher.get_subscription_count() == 0:
+    rclpy.spin_once(node, timeout_sec=0.05)
+publisher.publish(String(data='found'))
+publisher.wait_for_all_acked()
+'''
+LISTENER = '''
+import rclpy
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('listener')
+found, message = wait_for_message(String, node, 'chatter', qos_profile=10, time_to_wait=15)
+print(message.data if found else 'nothing', flush=True)
+'''
+NETWORKS = {
+    'loopback': 'ip link set lo up',
+    'loopback and a link': 'ip link set lo up; ip link add one type veth peer name two; '
+                           'ip addr add 198.51.100.2/24 dev one; ip link set one up; '
+                           'ip link set two up'}
+
+
+def namespaces():
+    return shutil.which('unshare') and shutil.which('ip') and subprocess.run(
+        ['unshare', '--net', 'true'], stderr=subprocess.DEVNULL).returncode == 0
+
+
+@pytest.mark.skipif(not namespaces(), reason='no right to make a network of its own')
+@pytest.mark.parametrize('scope', ['SUBNET', 'LOCALHOST'])
+@pytest.mark.parametrize('network', NETWORKS)
+def test_discovery_without_configuration(network, scope):
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
+    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = scope
+    script = f'{NETWORKS[network]}; "$0" -c "$1" & "$0" -c "$2"; kill $! 2>/dev/null; wait'
+    done = subprocess.run(
+        ['unshare', '--net', 'sh', '-c', script, sys.executable, TALKER, LISTENER],
+        env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout == 'found\n', done.stderr
