@@ -13,7 +13,7 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2.errors import AgentError, Cancelled, ConnectError, DeadlineExceeded, FogError
+from fogros2.errors import AgentAbsent, AgentError, Cancelled, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
 from fogros2.waiting import wait_until
@@ -164,6 +164,8 @@ class AgentClient:
             with self._lock:
                 self._pending.pop(number, None)
         reply = pending.reply
+        if isinstance(self._error, AgentAbsent):
+            raise self._error
         if not reply.get('ok'):
             raise AgentError(str(reply.get('error', 'refused')), str(reply.get('hint', '')))
         return reply

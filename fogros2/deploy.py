@@ -27,6 +27,7 @@ from fogros2 import shell as shells
 from fogros2.agent_client import agent_source, AgentClient, Heartbeat
 from fogros2.dds import DdsVendor
 from fogros2.errors import (
+    AgentAbsent,
     Cancelled,
     ConfigurationError,
     ConnectError,
@@ -772,11 +773,24 @@ class _Deployment:
                     ('python3', '-IS', program, 'serve', '--detach', '--config',
                      f'{directory}/config.json'), sudo=True, what='start the agent')])
             self._save(agent=directory, agent_program=program)
-            # no cancel: it is needed on the way down as well, and each request has its deadline
-            agent = AgentClient(shell, directory, agent_path=program)
+            def reach() -> Optional[AgentClient]:
+                # no cancel: it is needed on the way down as well, and requests have deadlines
+                agent = AgentClient(shell, directory, agent_path=program)
+                try:
+                    # the record said that the launch before is gone: its agent may not know yet
+                    agent.request(
+                        'configure', timeout=self.timeouts.agent, force=self.reused, **config)
+                except FogError as error:
+                    agent.close()
+                    if isinstance(error, AgentAbsent):
+                        return None  # the machine's SSH server may be there before its agent
+                    raise
+                return agent
+
+            agent = wait_until(
+                reach, timeout=self.timeouts.agent, cancel=self.launch.cancel,
+                what=f"the agent of '{self.name}'")
             undo.callback(agent.close)
-            # the record said that the launch before is gone: its agent may not know yet
-            agent.request('configure', timeout=self.timeouts.agent, force=self.reused, **config)
             rearming = _Rearming(agent, self.launch.id, self.spec.robot_timeout / 4)
             self.rearming = undo.enter_context(contextlib.closing(rearming))
             return agent

@@ -18,6 +18,7 @@ What can go wrong, one tree::
       VpnError
       DdsError
       AgentError                 the agent refused or vanished
+        AgentAbsent              no agent listens on the machine, not yet or not any more
       StoreError                 local state can't be read or written
       DeadlineExceeded           a wait ran out of time
       Cancelled                  the launch was asked to end while this ran
@@ -118,6 +119,10 @@ class DdsError(FogError):
 
 class AgentError(FogError):
     """The agent on the machine refused a command, or vanished."""
+
+
+class AgentAbsent(AgentError):
+    """No agent listens on the machine, not yet or not any more."""
 
 
 class StoreError(FogError):
