@@ -61,9 +61,9 @@ class WireGuard(Vpn):
         """Return the command that prints the public key; the private one is root's alone."""
         key = shlex.quote(interface.key_file)
         folder = shlex.quote(interface.key_file.rpartition('/')[0] or '.')
-        # written aside and moved, so that a key that is there is a whole one
+        # written aside and moved, so that a key that is there is a whole one; -C follows no link
         return Command.script(
-            f'umask 077\n'
+            f'umask 077; set -C\n'
             f'if [ ! -s {key} ]; then\n'
             f'  mkdir -p {folder}; wg genkey >{key}.$$; mv -f {key}.$$ {key}\n'
             f'fi\n'
@@ -309,7 +309,9 @@ def _check(peer: Peer) -> None:
 
 
 def _noted(interface: VpnInterface) -> str:
-    return shlex.quote(f'{interface.key_file}.noted')
+    # not beside the key, whose folder may be the login user's: root wouldn't write where another
+    # can lay a link
+    return f'/run/{_name(interface)}.noted'
 
 
 def _print(lines: Sequence[str]) -> str:

@@ -58,7 +58,7 @@ def test_all_but_looking_needs_root() -> None:
 
 def test_the_private_key_is_made_where_it_stays() -> None:
     text = script(WireGuard().keys(ROBOT))
-    assert text.splitlines()[0] == 'umask 077'
+    assert text.splitlines()[0] == 'umask 077; set -C'
     assert 'wg genkey >/state/vpn.key' in text
     assert text.splitlines()[-1] == 'wg pubkey </state/vpn.key'
 
@@ -98,9 +98,10 @@ def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
     wireguard = WireGuard()
     text = script(*wireguard.repair(MACHINE, [TO_ROBOT]))
     assert f'seen {OTHER}' in text and 'seen()' not in script(*wireguard.up(MACHINE, [TO_ROBOT]))
-    assert "/run/it'\"'\"'s/vpn.key.noted" in text
-    assert "/run/it'\"'\"'s/vpn.key.noted" in script(wireguard.alive(MACHINE))
-    assert "/run/it'\"'\"'s/vpn.key.noted" in script(*wireguard.down(MACHINE))
+    assert '</run/foga1b2c3m0.noted' in text
+    assert '>/run/foga1b2c3m0.noted' in script(wireguard.alive(MACHINE))
+    down = script(*wireguard.down(MACHINE))
+    assert "rm -f '/run/it'\"'\"'s/vpn.key' /run/foga1b2c3m0.noted" in down
 
 
 @pytest.mark.parametrize('change', [

@@ -77,6 +77,7 @@ def traces(lab: Lab, host: str) -> list[str]:
               if interface.name in line]
     found += [str(path) for path in Path('/var/run/wireguard').glob(f'{interface.name}*')]
     found += [str(path) for path in Path(interface.key_file).parent.glob('*')]
+    found += [str(path) for path in Path('/run').glob(f'{interface.name}*')]
     return found + ([f'process {lab.wireguard_go(host)}'] if lab.wireguard_go(host) else [])
 
 
