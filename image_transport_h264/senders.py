@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import abc
-from collections import deque
 from collections.abc import Callable, Sequence
 import dataclasses
 import threading
 import time
-from typing import Any, Optional
+from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
@@ -19,6 +18,7 @@ from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
 from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
+from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
     FEEDBACK_QOS,
     IMAGE_QOS,
@@ -28,18 +28,9 @@ from image_transport_h264.lazy import (
     STREAM_QOS,
 )
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
-from image_transport_h264.rate import Governor
 from image_transport_h264.repair import pieces
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
-#: Receivers that say nothing for so long no longer hold the others back.
-SILENT = 3.0
-#: Seconds over which the stream's rate is taken.
-RATE_SECONDS = 1.0
-#: Packets are sent again in pieces only where the bitrate allows so many times what is used.
-ROOM = 2.0
-#: A higher bitrate is worth a key only from this factor on.
-WORTH = 1.4
 
 
 class Sender(abc.ABC):
@@ -141,17 +132,12 @@ class VideoSender(Sender):
         values = {name: node.declare_parameter(
             name, default, ParameterDescriptor(description=what)).value
             for name, default, what in PARAMETERS}
-        self._asked = _settings(values)
-        self._max_rate = _rate(values['max_rate'])
-        self._adapt = bool(values['adapt'])
+        self._control = Control(
+            _settings(values), float(values['max_rate']), bool(values['adapt']))
         node.add_on_set_parameters_callback(self._set)
-        self._encoder = Encoder(self._asked)
-        self._governors: dict[int, Governor] = {}
+        self._encoder = Encoder(self._control.asked)
         self._key_wanted = False
-        self._last_key = self._last_sent = self._next_due = -1e9
-        self._sent: deque[tuple[float, int]] = deque()
-        self._interval = 1 / 30
-        self._arrived: Optional[float] = None
+        self._last_key = -1e9
         self._known = 0
         self._changed = changed
         self._video = node.offer(CompressedImage, stream, STREAM_QOS, self._matched)
@@ -188,9 +174,8 @@ class VideoSender(Sender):
 
     def _key_requested(self, _: Empty) -> None:
         with self._lock:
-            trips = [governor.round_trip for governor in self._governors.values()]
             # one that left less than a round trip ago is the answer already
-            if time.monotonic() - self._last_key > 1.5 * max(trips, default=0.0) + 0.02:
+            if time.monotonic() - self._last_key > 1.5 * self._control.round_trip + 0.02:
                 self._key_wanted = True
 
     def _heard(self, feedback: UInt64MultiArray) -> None:
@@ -198,25 +183,19 @@ class VideoSender(Sender):
             return
         receiver, sequence, lost = feedback.data
         with self._lock:
-            governor = self._governors.get(receiver)
-            if governor is None:
-                governor = self._governors[receiver] = Governor(self._asked.bitrate)
-            governor.acknowledged(sequence, lost, time.monotonic())
+            self._control.heard(receiver, sequence, lost, time.monotonic())
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         names = {name for name, _, _ in PARAMETERS}
         changed = {p.name: p.value for p in parameters if p.name in names}
         with self._lock:
-            values = {**dataclasses.asdict(self._asked), 'max_rate': self._max_rate,
-                      'adapt': self._adapt, **changed}
+            control = self._control
+            values = {**dataclasses.asdict(control.asked), 'max_rate': control.max_rate,
+                      'adapt': control.adapt, **changed}
             try:
-                self._asked, self._max_rate = _settings(values), _rate(values['max_rate'])
+                control.ask(_settings(values), float(values['max_rate']), bool(values['adapt']))
             except (TypeError, ValueError) as error:
                 return SetParametersResult(successful=False, reason=str(error))
-            self._adapt = bool(values['adapt'])
-            for governor in self._governors.values():
-                governor.ceiling = self._asked.bitrate
-                governor.bitrate = min(governor.bitrate, governor.ceiling)
         return SetParametersResult(successful=True)
 
     # --- in the worker's thread
@@ -226,10 +205,9 @@ class VideoSender(Sender):
         now = time.monotonic()
         picture = message.picture(image)
         with self._lock:
-            self._time(now)
-            if not self._due(now, picture.width * picture.height):
+            if not self._control.due(now, picture.width * picture.height):
                 return
-            self._encoder.settings = self._fit(now)
+            self._encoder.settings = self._control.settings(self._encoder.settings, now)
             key, self._key_wanted = self._key_wanted, False
         try:
             packet = self._encoder.encode(picture, key=key, seconds=now)
@@ -238,29 +216,21 @@ class VideoSender(Sender):
             with self._lock:
                 self._key_wanted |= key
             return
-        left = time.monotonic()
+        with self._lock:
+            protects = self._control.protects(now)
         again: list[bytes] = []
-        if self._protect(left):
+        if protects:
             again = pieces(packet.tag.stream, packet.tag.sequence,
                            message.with_header(image.header, packet.data))
-        size = len(packet.data) + sum(map(len, again))
+        left = time.monotonic()
         with self._lock:
             if packet.key:
                 self._last_key = left
-            self._last_sent = now
-            self._sent.append((now, size * 8))
-            for governor in self._governors.values():
-                governor.sent(packet.tag.sequence, size, left)
+            self._control.sent(
+                packet.tag.sequence, len(packet.data) + sum(map(len, again)), left)
         self._publish(image.header, packet)
         for piece in again:
             self._pieces.publish(UInt8MultiArray(data=message.octets(piece)))
-
-    def _protect(self, now: float) -> bool:
-        """Return whether the packet goes in pieces as well: a link loses, and has room."""
-        with self._lock:
-            used = sum(bits for _, bits in self._sent) / RATE_SECONDS
-            return any(governor.loses(now) and used * ROOM < governor.bitrate
-                       for governor in self._governors.values())
 
     def _publish(self, header: Header, packet: Packet) -> None:
         self._video.publish(message.compressed(header, packet))
@@ -270,55 +240,9 @@ class VideoSender(Sender):
             if publisher.get_subscription_count():
                 publisher.publish(make(kind, header, packet))
 
-    def _time(self, now: float) -> None:
-        """Follow the rate at which images come."""
-        if self._arrived is not None:
-            self._interval += 0.1 * (min(now - self._arrived, 1.0) - self._interval)
-        self._arrived = now
-        while self._sent and self._sent[0][0] < now - RATE_SECONDS:
-            self._sent.popleft()
-
-    def _due(self, now: float, pixels: int) -> bool:
-        if self._max_rate:
-            # pictures come with jitter: one that is early by less than half its time is in time
-            if now < self._next_due - 0.5 * self._interval:
-                return False
-            self._next_due = max(self._next_due + 1 / self._max_rate, now)
-        for receiver in [r for r, g in self._governors.items()
-                         if (g.heard or 0) < now - SILENT and len(self._governors) > 1]:
-            del self._governors[receiver]
-        if not self._adapt:
-            return True
-        return all(governor.may_send(now, pixels, now - self._last_sent)
-                   for governor in self._governors.values())
-
-    def _fit(self, now: float) -> Settings:
-        """Return the settings that the slowest receiver's link takes."""
-        current = self._encoder.settings
-        used = sum(bits for _, bits in self._sent) / RATE_SECONDS
-        for governor in self._governors.values():
-            governor.grow(now, used)
-        wanted = self._asked.bitrate
-        if self._adapt:
-            wanted = min([wanted, *(g.bitrate for g in self._governors.values())])
-        settled = dataclasses.replace(
-            self._asked, bitrate=current.bitrate, rate=current.rate) == current
-        more = wanted > WORTH * current.bitrate or wanted == self._asked.bitrate
-        if settled and (wanted == current.bitrate or wanted > current.bitrate
-                        and not (more and used > 0.5 * current.bitrate)):
-            return current
-        rate = min(1000.0, max(1.0, 1 / max(self._interval, 0.001)))
-        return dataclasses.replace(self._asked, bitrate=wanted, rate=rate)
-
 
 def _settings(values: dict[str, Any]) -> Settings:
     return Settings(
         bitrate=int(values['bitrate']), quality=float(values['quality']),
         preset=str(values['preset']), gop=int(values['gop']), encoder=str(values['encoder']),
         lossless=bool(values['lossless']))
-
-
-def _rate(value: float) -> float:
-    if not 0 <= value <= 1000:
-        raise ValueError(f'max_rate {value} is not between 0 and 1000')
-    return float(value)

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the encoder does about the links to all its receivers: bitrate, frame rate, protection."""
+
+from __future__ import annotations
+
+from collections import deque
+import dataclasses
+from typing import Optional
+
+from image_transport_h264.codec import Settings
+from image_transport_h264.rate import Governor
+
+#: Receivers that say nothing for so long no longer hold the others back.
+SILENT = 3.0
+#: Seconds over which the stream's rate is taken.
+RATE_SECONDS = 1.0
+#: Packets are sent again in pieces only where the bitrate allows so many times what is used.
+ROOM = 2.0
+#: A higher bitrate is worth a key only from this factor on, and only if the lower one binds.
+WORTH, BINDING = 1.4, 0.5
+
+
+class Control:
+    """
+    Follows all receivers; the one with the slowest link decides.
+
+    :param asked: what the user wants, kept where the links allow it.
+    :param max_rate: most pictures per second, 0 for all.
+    :param adapt: without, nothing but ``max_rate`` is done.
+    """
+
+    def __init__(self, asked: Settings, max_rate: float = 0.0, adapt: bool = True) -> None:
+        self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
+        self._governors: dict[int, Governor] = {}
+        self._sent: deque[tuple[float, int]] = deque()
+        self._interval = 1 / 30
+        self._arrived: Optional[float] = None
+        self._last_sent = self._next_due = -1e9
+
+    @property
+    def round_trip(self) -> float:
+        """The slowest receiver's quickest round trip of late, in seconds; 0 while unknown."""
+        return max((governor.round_trip for governor in self._governors.values()), default=0.0)
+
+    def ask(self, asked: Settings, max_rate: float, adapt: bool) -> None:
+        """Take what the user wants from now on."""
+        if not 0 <= max_rate <= 1000:
+            raise ValueError(f'max_rate {max_rate} is not between 0 and 1000')
+        self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
+        for governor in self._governors.values():
+            governor.ceiling = asked.bitrate
+            governor.bitrate = min(governor.bitrate, governor.ceiling)
+
+    def heard(self, receiver: int, sequence: int, lost: int, now: float) -> None:
+        """Note an acknowledgement."""
+        governor = self._governors.get(receiver)
+        if governor is None:
+            governor = self._governors[receiver] = Governor(self.asked.bitrate)
+        governor.acknowledged(sequence, lost, now)
+
+    def due(self, now: float, pixels: int) -> bool:
+        """Return whether the picture that has come is to be sent."""
+        if self._arrived is not None:
+            self._interval += 0.1 * (min(now - self._arrived, 1.0) - self._interval)
+        self._arrived = now
+        while self._sent and self._sent[0][0] < now - RATE_SECONDS:
+            self._sent.popleft()
+        if self.max_rate:
+            # pictures come with jitter: one that is early by less than half its time is in time
+            if now < self._next_due - 0.5 * self._interval:
+                return False
+            self._next_due = max(self._next_due + 1 / self.max_rate, now)
+        for receiver in [receiver for receiver, governor in self._governors.items()
+                         if (governor.heard or 0) < now - SILENT and len(self._governors) > 1]:
+            del self._governors[receiver]
+        # each one is asked, as each one forgets what is lost
+        said = [governor.may_send(now, pixels, now - self._last_sent)
+                for governor in self._governors.values()]
+        return all(said) or not self.adapt
+
+    def settings(self, current: Settings, now: float) -> Settings:
+        """
+        Return what to encode with; ``current`` as long as a change isn't worth a key.
+
+        :param current: what was encoded with so far.
+        """
+        used = self._used()
+        for governor in self._governors.values():
+            governor.grow(now, used)
+        wanted = self.asked.bitrate
+        if self.adapt:
+            wanted = min([wanted, *(g.bitrate for g in self._governors.values())])
+        same = dataclasses.replace(
+            self.asked, bitrate=current.bitrate, rate=current.rate) == current
+        if same and wanted >= current.bitrate:
+            more = wanted > WORTH * current.bitrate or wanted == self.asked.bitrate
+            if wanted == current.bitrate or not more or used < BINDING * current.bitrate:
+                return current
+        rate = min(1000.0, max(1.0, 1 / max(self._interval, 0.001)))
+        return dataclasses.replace(self.asked, bitrate=wanted, rate=rate)
+
+    def protects(self, now: float) -> bool:
+        """Return whether packets go in pieces as well: a link loses, and has room."""
+        return any(governor.loses(now) and self._used() * ROOM < governor.bitrate
+                   for governor in self._governors.values())
+
+    def sent(self, sequence: int, size: int, now: float) -> None:
+        """Note that a packet of ``size`` bytes, repetitions included, leaves."""
+        self._last_sent = now
+        self._sent.append((now, size * 8))
+        for governor in self._governors.values():
+            governor.sent(sequence, size, now)
+
+    def _used(self) -> float:
+        return sum(bits for _, bits in self._sent) / RATE_SECONDS

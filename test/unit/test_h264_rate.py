@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptation against a simulated link, on a simulated clock: nothing here waits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import dataclasses
+import heapq
+import random
+
+import numpy
+import pytest
+
+pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+from image_transport_h264.codec import Encoder, Picture, Settings
+from image_transport_h264.control import Control
+
+WIDTH, HEIGHT = 160, 120
+PIXELS = WIDTH * HEIGHT
+#: As much to code in each picture as a VGA scene has.
+RESTLESS = 55
+#: Seconds that the link's queue holds.
+QUEUE = 1.0
+Rate = Callable[[float], float]
+
+
+@dataclasses.dataclass
+class Record:
+    """A packet's fate: seconds on the simulated clock."""
+
+    sent: float
+    arrived: float
+    size: int
+    bitrate: int
+
+
+def pictures() -> Iterator[Picture]:
+    """Yield pictures with some noise in each, which is what costs bits."""
+    noise = numpy.random.default_rng(1)
+    y, x = numpy.mgrid[0:HEIGHT, 0:WIDTH]
+    number = 0
+    while True:
+        soft = 128 + 60 * numpy.sin((x + number) / 9) * numpy.cos(y / 7)
+        grey = soft[:, :, None] + noise.normal(0, RESTLESS, (HEIGHT, WIDTH, 3))
+        rows = numpy.clip(grey, 0, 255).astype(numpy.uint8)
+        yield Picture(WIDTH, HEIGHT, 'bgr8', WIDTH * 3, rows.tobytes())
+        number += 1
+
+
+def stream(
+    rate: Rate, seconds: float, *, control: Control | None = None, delay: float = 0.005,
+    stall: Callable[[float], float] = lambda now: 0.0, loss: float = 0.0,
+    cut: Callable[[float], bool] = lambda now: False,
+) -> list[Record]:
+    """
+    Send pictures over a link and return what became of them.
+
+    :param rate: the link's bits per second at a time; what its queue can't hold is lost.
+    :param stall: seconds that an acknowledgement sent at a time is late, as on a busy computer.
+    :param loss: part of the packets that never come.
+    :param cut: whether nothing comes through at a time.
+    """
+    control = control or Control(Settings(bitrate=8_000_000))
+    encoder, chance = Encoder(control.asked), random.Random(1)
+    free, lost, records = 0.0, 0, []
+    acknowledgements: list[tuple[float, int, int]] = []
+    source = pictures()
+    for number in range(int(seconds * 30)):
+        now = 100 + number / 30
+        picture = next(source)
+        while acknowledgements and acknowledgements[0][0] <= now:
+            when, sequence, count = heapq.heappop(acknowledgements)
+            control.heard(1, sequence, count, when)
+        if not control.due(now, PIXELS):
+            continue
+        encoder.settings = control.settings(encoder.settings, now)
+        packet = encoder.encode(picture, seconds=now)
+        control.sent(packet.tag.sequence, len(packet.data), now)
+        if free - now > QUEUE or cut(now) or chance.random() < loss:
+            lost += 1
+            records.append(Record(now - 100, now - 100, 0, encoder.settings.bitrate))
+            continue
+        free = max(free, now) + len(packet.data) * 8 / rate(now)
+        records.append(Record(now - 100, free + delay - 100, len(packet.data),
+                              encoder.settings.bitrate))
+        heapq.heappush(acknowledgements, (
+            free + 2 * delay + stall(now), packet.tag.sequence, lost))
+    return records
+
+
+def between(records: list[Record], begin: float, end: float) -> list[Record]:
+    return [record for record in records if begin <= record.sent < end]
+
+
+def late(records: list[Record]) -> float:
+    """Return the worst time that a packet took."""
+    return max(record.arrived - record.sent for record in records)
+
+
+def bits(records: list[Record], seconds: float) -> float:
+    return sum(record.size for record in records) * 8 / seconds
+
+
+def test_a_link_with_room_is_left_alone() -> None:
+    records = stream(lambda now: 50e6, 4)
+    assert len(records) == 120
+    assert {record.bitrate for record in records} == {8_000_000}
+
+
+def test_the_rate_drops_from_10_to_1_megabit_and_returns() -> None:
+    """Within a second the stream fits; latency stays bounded; it recovers afterwards."""
+    records = stream(lambda now: 1e6 if 104 <= now < 110 else 10e6, 20)
+    before = between(records, 2, 4)
+    assert bits(before, 2) > 1.3e6
+    squeezed = between(records, 5, 10)
+    assert bits(squeezed, 5) < 1.0e6
+    assert late(between(records, 4, 5)) < 1.0
+    assert late(between(records, 5.5, 10)) < 0.35
+    # still most of the pictures: the bitrate gave way first
+    assert len(squeezed) > 0.8 * 150
+    after = between(records, 17, 20)
+    assert len(after) == 90
+    assert bits(after, 3) > 0.9 * bits(before, 2)
+
+
+def test_a_link_too_slow_for_the_size_costs_pictures() -> None:
+    """Below what a picture needs at the least, fewer are sent, and none waits in a queue."""
+    control = Control(Settings(bitrate=8_000_000))
+    records = stream(lambda now: 40e3, 20, control=control)
+    end = between(records, 12, 20)
+    assert 8 < len(end) < 200
+    assert late(end) < 1.5
+
+
+def test_a_busy_computer_is_no_queue() -> None:
+    """Acknowledgements that are late now and then lower nothing."""
+    records = stream(lambda now: 50e6, 8,
+                     stall=lambda now: 0.2 if int(now * 30) % 20 == 0 else 0.0)
+    assert {record.bitrate for record in records} == {8_000_000}
+    assert len(records) >= 235
+
+
+def test_losses_are_no_queue_but_bring_protection() -> None:
+    control = Control(Settings(bitrate=8_000_000))
+    records = stream(lambda now: 50e6, 6, control=control, loss=0.05)
+    assert {record.bitrate for record in records} == {8_000_000}
+    assert len(records) >= 175
+    assert control.protects(106.0)
+    assert not control.protects(140.0)
+
+
+def test_a_cut_link_is_tried_again() -> None:
+    records = stream(lambda now: 10e6, 16, cut=lambda now: 102 <= now < 106)
+    assert len(between(records, 2.5, 6)) < 25
+    assert len(between(records, 14, 16)) > 50
+
+
+def test_no_acknowledgements_hold_nothing_back() -> None:
+    control = Control(Settings())
+    assert all(control.due(n / 30, PIXELS) for n in range(300))
+    assert control.settings(Settings(), 10.0) == Settings()
+
+
+def test_max_rate() -> None:
+    control = Control(Settings(), max_rate=10.0)
+    jitter = random.Random(3)
+    sent = sum(control.due(n / 30 + jitter.uniform(0, 0.01), PIXELS) for n in range(300))
+    assert 97 <= sent <= 103
+
+
+def test_the_slowest_receiver_decides_until_it_is_gone() -> None:
+    control, encoder = Control(Settings(bitrate=8_000_000)), Encoder()
+    now, queue, lowest = 0.0, 0.0, 8_000_000
+    for number in range(300):
+        now = number / 30
+        if control.due(now, PIXELS):
+            encoder.settings = control.settings(encoder.settings, now)
+            control.sent(number, 4000, now)
+        control.heard(1, number, 0, now + 0.005)
+        if number < 90:
+            queue += 0.02
+            control.heard(2, max(0, number - int(queue * 30)), 0, now + 0.006)
+        if number == 90:
+            lowest = encoder.settings.bitrate
+    assert lowest < 8_000_000
+    assert control.settings(encoder.settings, now).bitrate >= lowest
+
+
+def test_what_the_user_asks_for_is_the_ceiling() -> None:
+    control = Control(Settings(bitrate=8_000_000))
+    control.heard(1, 0, 0, 0.0)
+    control.ask(Settings(bitrate=500_000), 0.0, True)
+    assert control.settings(Settings(), 1.0).bitrate == 500_000
+    with pytest.raises(ValueError, match='max_rate'):
+        control.ask(Settings(), -1.0, True)
