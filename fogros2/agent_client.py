@@ -13,7 +13,14 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2.errors import AgentAbsent, AgentError, Cancelled, ConnectError, DeadlineExceeded, FogError
+from fogros2.errors import (
+    AgentAbsent,
+    AgentError,
+    Cancelled,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+)
 from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
 from fogros2.waiting import wait_until
@@ -235,7 +242,7 @@ class AgentClient:
     def _hopeless(self, seconds: float) -> bool:
         """Tell whether to give up on an agent that hasn't said a word for so long."""
         if self._absent is not None and (not self._ever or seconds > self._restart):
-            self._error = AgentError(self._absent, 'its machine may have ended')
+            self._error = AgentAbsent(self._absent, 'its machine may have ended')
         elif not self._ever and seconds > self._restart:
             self._error = AgentError(
                 'the program that should reach the agent ends without a word',

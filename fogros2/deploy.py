@@ -152,8 +152,22 @@ class Launch:
         """
         if not self._rmw:
             self._rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
-        vendor: DdsVendor = plugin_system.load('fogros2.dds', self._rmw)()
+        vendor: DdsVendor = plugin_system.load('fogros2.dds', self._rmw)(domain=self.domain)
         return vendor
+
+    @property
+    def domain(self) -> int:
+        """
+        The ROS domain of all nodes of the launch.
+
+        :raises ConfigurationError: ROS_DOMAIN_ID is no number.
+        """
+        text = self.user_environment.get('ROS_DOMAIN_ID') or '0'
+        try:
+            return int(text)
+        except ValueError:
+            raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
+                                     'use 0 to 101') from None
 
     def underlay(self, workspace_root: Optional[str]) -> plan.Underlay:
         """
@@ -331,7 +345,7 @@ class RobotVpn:
         self._public_key = ''
         self._stop = threading.Event()
         self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-            domain=int(launch.user_environment.get('ROS_DOMAIN_ID') or 0))
+            domain=launch.domain)
         used = addresses.parse_used(launch.robot([addresses.used_networks()]))
         network = addresses.choose_subnet(
             used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))

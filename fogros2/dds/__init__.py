@@ -11,7 +11,11 @@ from fogros2.model import Command, DdsInterface
 
 
 class DdsVendor(abc.ABC):
-    """A ROS middleware that can be told its interfaces and peers; pure."""
+    """
+    A ROS middleware that can be told its interfaces and peers; pure.
+
+    Made with ``domain=``, the ROS domain of the launch.
+    """
 
     #: Value of RMW_IMPLEMENTATION.
     rmw: ClassVar[str]
