@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Encoder and decoder as processes of their own, seen through ROS topics alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import itertools
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+import numpy
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Empty, UInt64MultiArray
+
+from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.model import DdsInterface
+from image_transport_h264 import annexb, message
+from image_transport_h264.codec import Encoder, peek, Picture, Settings
+
+ROOT = Path(__file__).parents[2]
+WIDTH, HEIGHT = 96, 64
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+_domains = itertools.count(os.getpid())
+
+
+class Bench:
+    """A node in this process, and the processes under test."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
+            filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+        self.node = Node('bench', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.processes: list[tuple[subprocess.Popen[str], list[str], threading.Thread]] = []
+
+    def start(self, role: str, *words: str) -> list[str]:
+        """Start an encoder or decoder; return the lines that it writes, which grow."""
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / f'image_transport_h264/scripts/{role}'), '--ros-args',
+             *words], env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            text=True)
+        lines: list[str] = []
+        assert process.stdout is not None
+        reader = threading.Thread(target=lambda: lines.extend(process.stdout or ()), daemon=True)
+        reader.start()
+        self.processes.append((process, lines, reader))
+        return lines
+
+    def pair(self, *words: str, codec: str = 'h264') -> tuple[list[str], list[str]]:
+        """Start both, from /camera to /seen/camera."""
+        common = ['-p', f'codec:={codec}', '-p', f'stream:=/camera/{codec}']
+        return (self.start('encoder', '-r', 'image:=/camera', *common, *words),
+                self.start('decoder', '-r', 'image:=/seen/camera', *common))
+
+    def until(
+        self, condition: Callable[[], object], what: str, *, timeout: float = 20.0,
+        meanwhile: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Let the node work, and do something 30 times a second, until a condition holds."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, f'{what} did not come in {timeout} s'
+            meanwhile()
+            step = time.monotonic() + 1 / 30
+            while time.monotonic() < step:
+                self.executor.spin_once(timeout_sec=0.01)
+
+    def heard(self, kind: Any, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
+        """Return the messages of a topic, a list that grows."""
+        messages: list[Any] = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def close(self) -> None:
+        for process, _, _ in self.processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        codes = []
+        for process, _, reader in self.processes:
+            try:
+                codes.append(process.wait(15))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                codes.append(process.wait())
+            reader.join(5)
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        assert set(codes) <= {0}, [''.join(lines) for _, lines, _ in self.processes]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """Return a bench whose DDS stays on the loopback, in a domain of its own."""
+    vendor = CycloneDds()
+    path = tmp_path / 'dds.xml'
+    path.write_text(vendor.render([DdsInterface('lo')], []))
+    for key, value in vendor.environment(str(path), {}).items():
+        monkeypatch.setenv(key, value)
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(20 + next(_domains) % 80))
+    made = Bench(tmp_path)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def image(
+    number: int, encoding: str = 'bgr8', pixel: int = 3, width: int = WIDTH,
+    height: int = HEIGHT, pad: int = 0, big: int = 0,
+) -> Image:
+    """Return image ``number`` of a sequence: soft, so that any codec keeps it."""
+    y, x = numpy.mgrid[0:height, 0:width * pixel]
+    waves = (128 + 60 * numpy.sin((x // pixel + number) / 19) * numpy.cos(y / 23))
+    rows = numpy.pad(waves.astype(numpy.uint8), ((0, 0), (0, pad)))
+    made = Image(height=height, width=width, encoding=encoding, step=rows.shape[1],
+                 is_bigendian=big, data=message.octets(rows.tobytes()))
+    made.header.frame_id = f'frame {number}'
+    made.header.stamp.sec, made.header.stamp.nanosec = 1000 + number, 7 * number
+    return made
+
+
+def source(bench: Bench, **options: Any) -> Callable[[], None]:
+    """Return what publishes the next image on /camera."""
+    publisher = bench.node.create_publisher(Image, '/camera', RELIABLE)
+    count = iter(range(1_000_000))
+    return lambda: publisher.publish(image(next(count), **options))
+
+
+@pytest.mark.parametrize(('encoding', 'options'), [
+    ('bgr8', {}), ('rgb8', {'width': 97, 'height': 63, 'pad': 5}), ('mono8', {'pixel': 1}),
+    ('rgba8', {'pixel': 4, 'big': 1}), ('yuv422', {'pixel': 2}),
+    ('16UC1', {'pixel': 2, 'pad': 2}), ('32FC1', {'pixel': 4, 'width': 31})], ids=str)
+def test_what_goes_in_comes_out(bench: Bench, encoding: str, options: dict[str, int]) -> None:
+    """All fields of header and image, and nearly the same pixels; depth to the bit."""
+    bench.pair()
+    seen = bench.heard(Image, '/seen/camera')
+    bench.until(lambda: len(seen) >= 5, 'an image',
+                meanwhile=source(bench, encoding=encoding, **options))
+    for got in seen:
+        number = got.header.stamp.sec - 1000
+        sent = image(number, encoding, **options)
+        assert got.header == sent.header
+        assert (got.height, got.width, got.encoding, got.step, got.is_bigendian) == (
+            sent.height, sent.width, sent.encoding, sent.step, sent.is_bigendian)
+        a, b = (numpy.frombuffer(m.data, numpy.uint8).astype(int) for m in (got, sent))
+        assert numpy.abs(a - b).mean() < (0.01 if encoding in ('16UC1', '32FC1') else 4)
+
+
+@pytest.mark.parametrize('codec', ['jpeg', 'png', 'raw'])
+def test_the_other_codecs(bench: Bench, codec: str) -> None:
+    pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
+    bench.pair(codec=codec)
+    seen = bench.heard(Image, '/seen/camera')
+    bench.until(lambda: len(seen) >= 3, 'an image', meanwhile=source(bench, encoding='rgb8'))
+    sent = image(seen[-1].header.stamp.sec - 1000, 'rgb8')
+    a, b = (numpy.frombuffer(m.data, numpy.uint8).astype(int) for m in (seen[-1], sent))
+    assert seen[-1].header == sent.header
+    assert seen[-1].encoding == 'rgb8'
+    assert numpy.abs(a - b).max() == 0 if codec != 'jpeg' else numpy.abs(a - b).mean() < 4
+
+
+def test_no_subscriber_no_work(bench: Bench) -> None:
+    """The raw topic and the stream are subscribed to while someone sees the images."""
+    bench.pair()
+    node, publish = bench.node, source(bench)
+    bench.until(lambda: len(node.get_publishers_info_by_topic('/seen/camera')) == 1,
+                'the decoder', meanwhile=publish)
+    bench.until(lambda: len(node.get_publishers_info_by_topic('/camera/h264')) == 1,
+                'the encoder', meanwhile=publish)
+    assert node.count_subscribers('/camera') == node.count_subscribers('/camera/h264') == 0
+    seen: list[Any] = []
+    subscription = node.create_subscription(Image, '/seen/camera', seen.append, RELIABLE)
+    bench.until(lambda: seen, 'an image', meanwhile=publish)
+    assert node.count_subscribers('/camera') == node.count_subscribers('/camera/h264') == 1
+    node.destroy_subscription(subscription)
+    bench.until(lambda: node.count_subscribers('/camera') == 0
+                and node.count_subscribers('/camera/h264') == 0, 'the end of the work')
+
+
+def test_who_joins_late_gets_a_key(bench: Bench) -> None:
+    """Hours of P-pictures away from the next key, whoever comes gets one with the next image."""
+    bench.pair('-p', 'gop:=1000000')
+    publish = source(bench)
+    seen = bench.heard(Image, '/seen/camera')
+    bench.until(lambda: len(seen) >= 10, 'images', meanwhile=publish)
+    packets = bench.heard(CompressedImage, '/camera/h264', BEST_EFFORT)
+    bench.until(lambda: len(packets) >= 5, 'packets', meanwhile=publish)
+    tags = [peek(bytes(packet.data)) for packet in packets]
+    assert any(tag is not None and tag.key for tag in tags[:3])
+    # and the one that was there already has missed nothing
+    before = len(seen)
+    bench.until(lambda: len(seen) >= before + 5, 'images', meanwhile=publish)
+    numbers = [one.header.stamp.sec for one in seen[-5:]]
+    assert numbers == sorted(numbers)
+
+
+def test_a_key_is_sent_when_asked_for(bench: Bench) -> None:
+    bench.start('encoder', '-r', 'image:=/camera', '-p', 'gop:=1000000')
+    packets = bench.heard(CompressedImage, '/camera/h264')
+    publish = source(bench)
+    bench.until(lambda: len(packets) >= 10, 'packets', meanwhile=publish)
+    ask = bench.node.create_publisher(Empty, '/camera/h264/keyframe', RELIABLE)
+    bench.until(ask.get_subscription_count, 'the encoder', meanwhile=publish)
+    begin = len(packets)
+    ask.publish(Empty())
+    bench.until(lambda: any(annexb.IDR in annexb.kinds(bytes(p.data)) for p in packets[begin:]),
+                'a key', meanwhile=publish)
+    assert {packet.format for packet in packets} == {'h264'}
+    assert packets[-1].header.frame_id.startswith('frame ')
+
+
+def test_after_a_loss_nothing_is_shown_until_a_key(bench: Bench) -> None:
+    """The decoder asks for the key by itself, and acknowledges what comes."""
+    bench.start('decoder', '-r', 'image:=/seen/camera', '-p', 'stream:=/s')
+    seen = bench.heard(Image, '/seen/camera')
+    asked = bench.heard(Empty, '/s/keyframe')
+    feedback = bench.heard(UInt64MultiArray, '/s/feedback', BEST_EFFORT)
+    publisher = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
+    bench.until(publisher.get_subscription_count, 'the decoder')
+    encoder, sent = Encoder(Settings(gop=1000)), iter(range(1000))
+
+    def packet(key: bool = False) -> CompressedImage:
+        plain = image(next(sent))
+        made = encoder.encode(message.picture(plain), key=key)
+        return message.compressed(plain.header, made)
+
+    bench.until(lambda: len(seen) >= 3, 'images',
+                meanwhile=lambda: publisher.publish(packet(key=not seen)))
+    bench.until(lambda: len(feedback) >= 3, 'acknowledgements',
+                meanwhile=lambda: publisher.publish(packet()))
+    packet()  # lost
+    asked.clear()
+    lost = next(sent) - 1
+    bench.until(lambda: asked, 'a request', meanwhile=lambda: publisher.publish(packet()))
+    assert all(one.header.stamp.sec - 1000 < lost for one in seen)
+    bench.until(lambda: seen[-1].header.stamp.sec - 1000 > lost, 'an image after the key',
+                meanwhile=lambda: publisher.publish(packet(key=True)))
+    assert feedback[-1].data[2] >= 1
+
+
+def test_parameters_change_while_it_runs(bench: Bench) -> None:
+    bench.pair('-r', '__node:=encoder')
+    seen, publish = bench.heard(Image, '/seen/camera'), source(bench)
+    bench.until(lambda: len(seen) >= 3, 'images', meanwhile=publish)
+    client = bench.node.create_client(SetParameters, '/encoder/set_parameters')
+    bench.until(client.service_is_ready, 'the service', meanwhile=publish)
+
+    def ask(name: str, **value: Any) -> Any:
+        kinds = {'integer_value': ParameterType.PARAMETER_INTEGER,
+                 'double_value': ParameterType.PARAMETER_DOUBLE,
+                 'string_value': ParameterType.PARAMETER_STRING,
+                 'bool_value': ParameterType.PARAMETER_BOOL}
+        kind = kinds[next(iter(value))]
+        future = client.call_async(SetParameters.Request(parameters=[
+            ParameterMessage(name=name, value=ParameterValue(type=kind, **value))]))
+        bench.until(future.done, 'the answer', meanwhile=publish)
+        return future.result().results[0]
+
+    for name, value in (
+            ('bitrate', {'integer_value': 400_000}), ('quality', {'double_value': 35.0}),
+            ('preset', {'string_value': 'ultrafast'}), ('gop', {'integer_value': 10}),
+            ('max_rate', {'double_value': 15.0}), ('encoder', {'string_value': 'libx264'}),
+            ('lossless', {'bool_value': True})):
+        assert ask(name, **value).successful, name
+    for name, value in (('bitrate', {'integer_value': 0}), ('quality', {'double_value': 99.0}),
+                        ('preset', {'string_value': 'warp'}),
+                        ('max_rate', {'double_value': -1.0})):
+        answer = ask(name, **value)
+        assert not answer.successful
+        assert str(next(iter(value.values()))) in answer.reason
+    after = len(seen)
+    bench.until(lambda: len(seen) >= after + 5, 'images', meanwhile=publish)
+    sent = image(seen[-1].header.stamp.sec - 1000)
+    assert bytes(seen[-1].data) == bytes(sent.data)
+
+
+def test_camera_info_goes_along(bench: Bench) -> None:
+    bench.pair()
+    infos, seen = bench.heard(CameraInfo, '/seen/camera_info'), bench.heard(Image, '/seen/camera')
+    publisher, publish = bench.node.create_publisher(CameraInfo, '/camera_info', 10), source(bench)
+    info = CameraInfo(width=WIDTH, height=HEIGHT, distortion_model='plumb_bob')
+    info.header.stamp.sec = 77
+    info.k[0] = 123.5
+
+    def both() -> None:
+        publish()
+        publisher.publish(info)
+
+    bench.until(lambda: infos and seen, 'image and camera info', meanwhile=both)
+    assert infos[0] == info
+
+
+def test_bad_images_cost_a_line_each_kind(bench: Bench) -> None:
+    """No step, too little data, an unknown encoding, no pixels: told once; good ones go on."""
+    lines, _ = bench.pair()
+    seen = bench.heard(Image, '/seen/camera')
+    publish = source(bench)
+    bench.until(lambda: seen, 'an image', meanwhile=publish)
+    publisher = bench.node.create_publisher(Image, '/camera', RELIABLE)
+    bench.until(publisher.get_subscription_count, 'the encoder')
+    bad = {'step': image(0), 'bytes of data': image(0), 'bayer_rggb8': image(0),
+           'no pixels': image(0)}
+    bad['step'].step = 0
+    bad['bytes of data'].data = message.octets(bytes(100))
+    bad['bayer_rggb8'].encoding = 'bayer_rggb8'
+    bad['no pixels'].height = 0
+
+    def all_kinds() -> None:
+        for one in bad.values():
+            publisher.publish(one)
+            # the encoder keeps the newest alone: each needs its turn
+            for _ in range(3):
+                bench.executor.spin_once(timeout_sec=0.005)
+        publish()
+
+    bench.until(lambda: all(any(kind in line for line in lines) for kind in bad),
+                'a line for each kind', meanwhile=all_kinds)
+    after = len(seen)
+    bench.until(lambda: len(seen) >= after + 5, 'good images', meanwhile=all_kinds)
+    for kind in bad:
+        assert sum(kind in line for line in lines) == 1, lines
+    assert not any('Traceback' in line for line in lines)
+
+
+def test_packets_that_are_none_cost_a_line(bench: Bench) -> None:
+    lines = bench.start('decoder', '-r', 'image:=/seen/camera', '-p', 'stream:=/s')
+    seen = bench.heard(Image, '/seen/camera')
+    publisher = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
+    bench.until(publisher.get_subscription_count, 'the decoder')
+    noise = CompressedImage(format='h264', data=message.octets(b'\0\0\1\x65' + bytes(range(256))))
+    bench.until(lambda: any('not shown' in line for line in lines), 'a line',
+                meanwhile=lambda: publisher.publish(noise))
+    encoder, plain = Encoder(), image(1)
+
+    def both() -> None:
+        publisher.publish(noise)
+        packet = encoder.encode(message.picture(plain), key=True)
+        publisher.publish(message.compressed(plain.header, packet))
+
+    bench.until(lambda: seen, 'an image', meanwhile=both)
+    assert sum('not shown' in line for line in lines) == 1
+
+
+def test_a_codec_that_does_not_exist_is_told(bench: Bench) -> None:
+    lines = bench.start('encoder', '-p', 'codec:=vhs')
+    process = bench.processes.pop()[0]
+    assert process.wait(20) != 0
+    bench.until(lambda: any("'vhs' is not one of h264, jpeg, png, raw" in line
+                            for line in lines), 'a line that says so')
+
+
+def test_pictures_are_not_copied_on_their_way() -> None:
+    """The decoder's memory is the message's, and the encoder reads the message's."""
+    plain = image(1)
+    picture = message.picture(plain)
+    assert isinstance(picture, Picture)
+    assert numpy.shares_memory(numpy.frombuffer(picture.data, numpy.uint8),
+                               numpy.frombuffer(plain.data, numpy.uint8))
+    shown = message.image(plain.header, Picture(1, 1, 'mono8', 1, message.octets(b'x')))
+    assert bytes(shown.data) == b'x'
