@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what a launch file says of streams to the nodes that carry them; pure but for plugins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+import difflib
+from typing import Any, Literal, Optional, Union
+
+from fogros2 import plugin_system
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport import ImageTransport
+from fogros2.image_transport.topics import check
+from fogros2.model import NodeSpec, Stream
+
+GROUP = 'fogros2.image_transport'
+Direction = Literal['to_cloud', 'to_robot']
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class StreamTopic:
+    """
+    A topic that crosses the VPN encoded.
+
+    ::
+
+        CloudNode(machine=..., stream_topics=[
+            ('/camera', 'h264'),
+            StreamTopic('/annotated', 'h264', 'to_robot', bitrate=2_000_000)])
+
+    :param topic: the full name that publisher and subscriber use.
+    :param transport: 'h264', 'compressed', 'raw', or another that is installed.
+    :param direction: 'to_cloud' (the robot publishes) or 'to_robot'.
+    :param parameters: the transport's own; see doc/h264.md.
+    """
+
+    topic: str
+    transport: str
+    direction: Direction
+    parameters: Mapping[str, Any]
+
+    def __init__(
+        self, topic: str, transport: str = 'h264', direction: Direction = 'to_cloud',
+        **parameters: Any,
+    ) -> None:
+        for name, value in (('topic', topic), ('transport', transport),
+                            ('direction', direction), ('parameters', parameters)):
+            object.__setattr__(self, name, value)
+
+
+#: What launch files may write.
+Entry = Union[StreamTopic, tuple[str, str]]
+
+
+def stream(entry: Entry, machine: str) -> Stream:
+    """
+    Return the stream between the robot and ``machine`` that an entry asks for.
+
+    :raises ConfigurationError: not an entry; an unknown transport (the hint lists those there
+        are) or direction; a topic that can't be carried.
+    """
+    if isinstance(entry, tuple) and len(entry) == 2:
+        entry = StreamTopic(*entry)
+    if not isinstance(entry, StreamTopic):
+        raise ConfigurationError(f'{entry!r} is no topic to stream',
+                                 "write ('/camera', 'h264') or StreamTopic(...)")
+    known = plugin_system.names(GROUP)
+    if entry.transport not in known:
+        near = difflib.get_close_matches(entry.transport, known, n=1)
+        raise ConfigurationError(
+            f"{entry.topic}: no image transport is called '{entry.transport}'",
+            (f"did you mean '{near[0]}'? " if near else '') + f"there are: {', '.join(known)}")
+    if entry.direction not in ('to_cloud', 'to_robot'):
+        raise ConfigurationError(f"{entry.topic}: direction '{entry.direction}' is unknown",
+                                 "there are 'to_cloud' and 'to_robot'")
+    there = entry.direction == 'to_cloud'
+    made = Stream(entry.topic, entry.transport, source=None if there else machine,
+                  target=machine if there else None, options=dict(entry.parameters))
+    check(made)
+    return made
+
+
+def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
+    """
+    Return the nodes that carry streams, by the machine that they run on (None: the robot).
+
+    One that several streams need, an encoder whose topic goes to two machines, is there once.
+
+    :raises ConfigurationError: two streams of a topic want it encoded in two ways.
+    :raises PrerequisiteError: a transport's own dependency isn't installed.
+    """
+    found: dict[Optional[str], dict[str, NodeSpec]] = {}
+    for one in streams:
+        transport: ImageTransport = plugin_system.load(GROUP, one.transport)()
+        for machine, spec in ((one.source, transport.encoder(one)),
+                              (one.target, transport.decoder(one))):
+            there = found.setdefault(machine, {})
+            if there.setdefault(spec.id, spec) != spec:
+                raise ConfigurationError(
+                    f'{one.topic} is streamed twice with different parameters',
+                    'give both streams the same ones')
+    return {machine: list(specs.values()) for machine, specs in found.items()}

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera here, image processing on a container machine; images cross as H.264, both ways."""
+
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2.image_transport.streams import StreamTopic
+
+
+def generate_launch_description():
+    """Describe the demo; ``count:=300`` ends it after 300 images."""
+    machine = ContainerInstance(name=LaunchConfiguration('name'))
+    return FogROSLaunchDescription([
+        DeclareLaunchArgument('name', default_value='video-machine',
+                              description='what the machine is called'),
+        DeclareLaunchArgument('source', default_value='synthetic',
+                              description="'synthetic', a video file, or a device (/dev/video0)"),
+        DeclareLaunchArgument('count', default_value='0',
+                              description='images after which the launch ends, 0 for never'),
+        CloudNode(machine=machine, package='fogros2_examples', executable='image_processor',
+                  output='screen', stream_topics=[
+                      ('/camera', 'h264'),
+                      StreamTopic('/annotated', 'h264', 'to_robot')]),
+        Node(package='fogros2_examples', executable='camera', output='screen',
+             parameters=[{'source': LaunchConfiguration('source'),
+                          'count': LaunchConfiguration('count')}], on_exit=Shutdown()),
+    ])
