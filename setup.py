@@ -3,7 +3,7 @@
 One ROS package of build type ament_python, installable by pip as well.
 
 colcon looks for no package below a package, so this one also installs the index markers,
-``share/`` and ``lib/`` of ``fogros2_examples``.
+``share/`` and ``lib/`` of ``fogros2_examples`` and ``image_transport_h264``.
 """
 
 from pathlib import Path
@@ -13,7 +13,8 @@ from setuptools import find_packages, setup
 VERSION = '0.1.0'
 #: Packages whose nodes ``ros2 run`` and launch files find: package -> its executables.
 EXECUTABLES = {
-    'fogros2_examples': ['talker', 'listener'],
+    'fogros2_examples': ['talker', 'listener', 'camera', 'image_processor'],
+    'image_transport_h264': ['encoder', 'decoder'],
 }
 
 
@@ -30,19 +31,26 @@ def data_files():
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
 
 
+#: What nodes that handle images need; a robot that streams none doesn't.
+VIDEO = ['av', 'numpy', 'opencv-python-headless']
+
 setup(
     name='fogros2',
     version=VERSION,
     description='Runs nodes of a ROS 2 launch file on machines in the cloud',
     license='Apache-2.0',
     python_requires='>=3.10',
-    packages=find_packages(include=['fogros2*', 'fogros2_examples*', 'ros2fog_cli*']),
+    packages=find_packages(include=[
+        'fogros2*', 'fogros2_examples*', 'image_transport_h264*', 'ros2fog_cli*']),
     package_data={'fogros2': ['py.typed']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
         'bench': ['matplotlib'],
-        'test': ['pytest', 'pytest-timeout', 'ruff', 'mypy', 'types-paramiko', 'types-PyYAML'],
+        'test': [
+            'hypothesis', 'mypy', 'pytest', 'pytest-timeout', 'ruff', 'types-paramiko',
+            'types-PyYAML', *VIDEO],
+        'video': VIDEO,
     },
     zip_safe=False,
     entry_points={
@@ -59,6 +67,15 @@ setup(
         ],
         'fogros2.dds': [
             'rmw_cyclonedds_cpp = fogros2.dds.cyclonedds:CycloneDds',
+        ],
+        'fogros2.image_transport': [
+            'compressed = fogros2.image_transport.compressed:Compressed',
+            'ffmpeg = fogros2.image_transport.republish:Ffmpeg',
+            'h264 = fogros2.image_transport.h264:H264',
+            'raw = fogros2.image_transport.raw:Raw',
+            'republished_compressed = '
+            'fogros2.image_transport.republish:RepublishedCompressed',
+            'theora = fogros2.image_transport.republish:Theora',
         ],
         'ros2cli.command': [
             'fog = ros2fog_cli.command.fog:FogCommand',
