@@ -107,7 +107,8 @@ class AgentClient:
         self._ever = self._lost = False
         self._absent: Optional[str] = None
         self._next: Optional[int] = None
-        self._log_request = 0
+        #: The number of the request whose answer says where the log begins, 0 is a ping's.
+        self._log_request = -1
         self._thread: Optional[threading.Thread] = None
 
     @property

@@ -106,6 +106,18 @@ def test_a_reply_goes_to_its_request(make):
         'python3', '-IS', '/run/x/agent.py', 'connect', '--directory', '/run/x')
 
 
+def test_a_silence_before_the_subscription_does_not_stand_for_it(make):
+    stream = ScriptedStream(lambda request: [
+        {'id': request['id'], 'ok': True, **({} if request['command'] == 'ping' else {'next': 1})}])
+    client = make(stream, silence=0.2)
+    client.request('configure')
+    until(lambda: any(request['command'] == 'ping' for request in stream.asked))
+    # answered in order, so the ping's answer has been read
+    client.request('configure')
+    client.subscribe(lambda event: None)
+    assert any(request['command'] == 'log' for request in stream.asked)
+
+
 def test_a_refusal_carries_its_hint(make):
     client = make(ScriptedStream(lambda request: [
         {'id': request['id'], 'ok': False, 'error': 'no', 'hint': 'do x'}]))
