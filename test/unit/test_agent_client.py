@@ -107,8 +107,10 @@ def test_a_reply_goes_to_its_request(make):
 
 
 def test_a_silence_before_the_subscription_does_not_stand_for_it(make):
-    stream = ScriptedStream(lambda request: [
-        {'id': request['id'], 'ok': True, **({} if request['command'] == 'ping' else {'next': 1})}])
+    def answer(request):
+        said = {} if request['command'] == 'ping' else {'next': 1}
+        return [{'id': request['id'], 'ok': True, **said}]
+    stream = ScriptedStream(answer)
     client = make(stream, silence=0.2)
     client.request('configure')
     until(lambda: any(request['command'] == 'ping' for request in stream.asked))
