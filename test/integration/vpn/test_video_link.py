@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""H.264 over a VPN whose link gets slow, loses packets, and recovers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
+from fogros2.waiting import wait_until
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[2]
+
+
+def stream(vpn: Any, *parameters: str) -> Any:
+    """Start camera and encoder on the robot, decoder and viewer on the machine; the viewer."""
+    def start(host: str, *words: str) -> Any:
+        name = vpn.interfaces[host].name
+        interfaces = (vpn.dds.robot_interfaces(name, vpn.lan_name, {}) if host == 'robot'
+                      else vpn.dds.machine_interfaces(name))
+        path = vpn.folder / f'video {host}.xml'
+        path.write_text(vpn.dds.render(interfaces, []))
+        environment = dict(vpn.dds.environment(str(path), {}))
+        found = [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]
+        environment['PYTHONPATH'] = ':'.join(found)
+        return vpn.start(host, [sys.executable, *words], **environment)
+
+    scripts = ROOT / 'image_transport_h264/scripts'
+    start('robot', str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera',
+          *parameters)
+    start('machine', str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen',
+          '-p', 'stream:=/camera/h264')
+    viewer = start('machine', str(HERE / 'video_node.py'), 'viewer')
+    start('robot', str(HERE / 'video_node.py'), 'camera').wait('ready', timeout=30.0)
+    viewer.wait('image', count=30, timeout=30.0)
+    return viewer
+
+
+def during(viewer: Any, begin: float, seconds: float) -> list[dict[str, Any]]:
+    """Return what arrived in a stretch of time that may not be over yet."""
+    wait_until(lambda: time.monotonic() > begin + seconds, timeout=seconds + 5.0,
+               what='the stretch to be over')
+    return [line for line in viewer.lines('image')
+            if begin <= line['arrival'] < begin + seconds]
+
+
+def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
+    """A second later the stream fits, nothing waits in a queue, and it recovers."""
+    vpn.relay.tell({'rate': 10e6, 'queue': 1.0})
+    # a quality that takes about 3 Mbit/s
+    viewer = stream(vpn, '-p', 'quality:=14.0')
+    vpn.relay.tell({'rate': 1e6})
+    begin = time.monotonic()
+    squeezed = during(viewer, begin + 2.0, 4.0)
+    assert len(squeezed) > 25
+    latencies = sorted(line['latency'] for line in squeezed)
+    assert latencies[len(latencies) // 2] < 0.4
+    assert latencies[-1] < 1.2
+    vpn.relay.tell({'rate': 10e6})
+    back = during(viewer, time.monotonic() + 5.0, 2.0)
+    assert len(back) > 45
+    assert sorted(line['latency'] for line in back)[len(back) // 2] < 0.15
+
+
+def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
+    """2 % of the packets lost and 20 ms each way."""
+    vpn.relay.tell({'rate': 10e6, 'delay': 0.02, 'loss': 0.02})
+    viewer = stream(vpn)
+    lines = during(viewer, time.monotonic() + 1.0, 5.0)
+    assert len(lines) > 130
+    latencies = sorted(line['latency'] for line in lines)
+    assert latencies[len(lines) // 2] < 0.1
+    # smears would show at once: they cost tens of decibels
+    compared = [line['psnr'] for line in lines if 'psnr' in line]
+    assert len(compared) >= 15
+    assert min(compared) > 30
