@@ -77,6 +77,8 @@ ROBOT_PROGRAMS = {
     'ssh-keygen': 'openssh-client',
 }
 AGENT_FOLDER = '/run/fogros2'
+#: Seconds between two uses of sudo's ticket, which lives for some minutes after each.
+TICKET_REFRESH = 30.0
 
 
 class Launch:
@@ -343,6 +345,7 @@ class RobotVpn:
         self._up = False
         self._members: dict[str, VpnMember] = {}
         self._public_key = ''
+        self._asks = False
         self._stop = threading.Event()
         self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
             domain=launch.domain)
@@ -395,7 +398,11 @@ class RobotVpn:
 
     def _keep(self) -> None:
         """Get the interface's program going again when it died; nodes don't notice."""
+        asked = time.monotonic()
         while not self._stop.wait(1.0):
+            if time.monotonic() - asked > TICKET_REFRESH:
+                asked = time.monotonic()
+                self._refresh_ticket()
             with self._lock:
                 if self._stop.is_set():
                     return
@@ -409,6 +416,17 @@ class RobotVpn:
                             self.vpn.repair(self.interface, self._sorted()), cancel=False)
                 except FogError:
                     pass  # reported by the step; the next round tries again
+
+    def _refresh_ticket(self) -> None:
+        """Keep sudo from wanting a password before all is taken down; say so once if it does."""
+        if process.refresh_ticket():
+            self._asks = False
+        elif not self._asks:
+            self._asks = True
+            self._launch.report(StepFailed(
+                '', 'root', 0.0, 'sudo wants a password again, so taking this launch down will '
+                'leave its containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; '
+                'else `sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
 
     def _take_down(self) -> None:
         self._stop.set()
@@ -934,7 +952,7 @@ def check_sudo() -> None:
     if process.which('sudo') is None:
         raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
                                 'run the launch as root, or install sudo')
-    if process.run(Command(('sudo', '-n', 'true')), timeout=10.0, check=False).returncode:
+    if not process.refresh_ticket():
         raise PrerequisiteError('a VPN interface takes root, and sudo wants a password',
                                 'run `sudo -v` first, then launch again')
 

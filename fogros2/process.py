@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from typing import Optional
@@ -22,9 +23,48 @@ _ENVIRONMENT = dict(os.environ)
 
 def argv(command: Command) -> list[str]:
     """Return the words to execute here: with ``sudo -n`` in front where root is needed."""
-    if command.sudo and os.geteuid() != 0:
+    if _through_sudo(command):
         return ['sudo', '-n', '--', *command.argv]
     return list(command.argv)
+
+
+def start(
+    command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
+) -> subprocess.Popen[bytes]:
+    """
+    Start a command here, its standard output a pipe, and don't wait for it.
+
+    It gets a session of its own, so that a Ctrl-C in the terminal reaches the launch alone and
+    an undo isn't shot down by the signal that caused it. With sudo it gets a process group
+    instead, which Ctrl-C doesn't reach either: sudo keeps its ticket by the terminal, and in a
+    session without one it would ask for the password again.
+
+    :raises FileNotFoundError: there is no such program.
+    """
+    words = argv(command)
+    if not _through_sudo(command):
+        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
+                                stderr=stderr, start_new_session=True)
+    if sys.version_info >= (3, 11):
+        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
+                                stderr=stderr, process_group=0)
+    return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
+                            stderr=stderr, preexec_fn=os.setpgrp)
+
+
+def _through_sudo(command: Command) -> bool:
+    return command.sudo and os.geteuid() != 0
+
+
+def refresh_ticket(*, timeout: float = 10.0) -> bool:
+    """
+    Put off the moment at which sudo wants the password again; False if it wants it now.
+
+    Where sudo asks nobody for one, there is nothing to put off.
+    """
+    if os.geteuid() == 0:
+        return True
+    return run(Command(('true',), sudo=True), timeout=timeout, check=False).returncode == 0
 
 
 def require(programs: Sequence[str], *, package_of: Optional[dict[str, str]] = None) -> None:
@@ -56,10 +96,7 @@ def run(
     on_output: Optional[Callable[[str], None]] = None,
 ) -> Result:
     """
-    Run a command here and wait for it.
-
-    It gets a session of its own, so that a Ctrl-C in the terminal reaches the launch alone and
-    an undo isn't shot down by the signal that caused it.
+    Run a command here and wait for it; Ctrl-C doesn't reach it (see ``start``).
 
     :param timeout: seconds, then the command's whole process group is killed.
     :param check: raise CommandError for an exit status other than zero.
@@ -74,10 +111,9 @@ def run(
     path = _ENVIRONMENT.get('PATH', os.defpath)
     environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
-        child = subprocess.Popen(
-            words, env=environment, start_new_session=True,
-            stdin=subprocess.PIPE if command.input else subprocess.DEVNULL,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        child = start(
+            command, environment=environment, stderr=subprocess.PIPE,
+            stdin=subprocess.PIPE if command.input else subprocess.DEVNULL)
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
@@ -118,7 +154,7 @@ def run(
             cancelled = cancel is not None and cancel.is_set()
             if left > 0 and not cancelled:
                 continue
-            _end(child)
+            end(child, sudo=_through_sudo(command))
             what = command.what or words[0]
             if cancelled:
                 raise Cancelled(what) from None
@@ -137,17 +173,37 @@ def run(
     return result
 
 
-def _end(child: subprocess.Popen[bytes]) -> None:
+def end(child: subprocess.Popen[bytes], *, sudo: bool) -> None:
+    """
+    Terminate, then kill what ``start`` started, with all that it started itself.
+
+    :param sudo: it was started through sudo. What runs there is root's, and a signal to its
+        group would reach sudo alone, which passes on SIGTERM to the first process only.
+    """
     for number in (signal.SIGTERM, signal.SIGKILL):
         try:
-            os.killpg(child.pid, number)
+            if sudo:
+                _signal_as_root(child.pid, number)
+            else:
+                os.killpg(child.pid, number)
         except ProcessLookupError:
             return
-        except PermissionError:
-            # sudo relays a SIGTERM to what it runs
-            child.send_signal(number)
         try:
             child.wait(2.0)
             return
         except subprocess.TimeoutExpired:
             continue
+
+
+def _signal_as_root(group: int, number: signal.Signals) -> None:
+    command = Command.script(f'kill -s {number.name[3:]} -- -{group}', sudo=True)
+    killer = start(command, environment=_ENVIRONMENT, stdin=subprocess.DEVNULL,
+                   stderr=subprocess.DEVNULL)
+    try:
+        killer.communicate(timeout=10.0)
+    except subprocess.TimeoutExpired:
+        killer.kill()
+        killer.wait()
+    if killer.returncode != 0:
+        # the ticket is over, or there is nobody left
+        os.killpg(group, number)

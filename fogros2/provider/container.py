@@ -99,11 +99,9 @@ class ContainerProvider(Provider):
         """Look for the engine, the rights, TUN, and what the root without an image needs."""
         options = Options.parse(spec.options)
         engine = container_engine.select(options.engine, options.image or None)
-        if engine.sudo and os.geteuid() != 0:
-            result = process.run(Command(('sudo', '-n', 'true')), timeout=10.0, check=False)
-            if result.returncode != 0:
-                raise PrerequisiteError(f'{engine.name} takes root on this computer',
-                                        'run `sudo -v` first, or allow it without a password')
+        if engine.sudo and not process.refresh_ticket():
+            raise PrerequisiteError(f'{engine.name} takes root on this computer',
+                                    'run `sudo -v` first, or allow it without a password')
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')

@@ -53,10 +53,9 @@ class LocalShell:
     def open(self, command: Command) -> Stream:
         """Start a program and return its streams; it ends with the stream."""
         try:
-            child = subprocess.Popen(
-                process.argv(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL, env={**os.environ, **command.environment},
-                start_new_session=True)
+            child = process.start(
+                command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                environment={**os.environ, **command.environment})
         except FileNotFoundError as error:
             raise PrerequisiteError(f'{error.filename} not found on this computer') from error
         stream = LocalStream(child)
