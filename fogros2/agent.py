@@ -17,8 +17,9 @@ it: the VPN's, and the one that ends the machine.
 ``{"id": 1, "ok": true, ...}`` or ``{"id": 1, "ok": false, "error", "hint", "kind"}``:
 
 ``configure``  any key of ``CONFIG``; re-arms lifetime and, with ``heartbeat``, the watch over it.
-               Another ``launch`` than before: its nodes stop first; refused (kind ``busy``) while
-               the earlier one still sends heartbeats, unless ``force`` is true.
+               Another ``launch`` than before: its nodes stop first, and what was kept for it goes;
+               refused (kind ``busy``) while the earlier one sets the machine up or sends
+               heartbeats, unless ``force`` is true.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s)
 ``launch``     start the process that will run the nodes, ahead of time
 ``start``      ``nodes``: list of NodeSpec; an id that is known already is left alone
@@ -27,7 +28,8 @@ it: the VPN's, and the one that ends the machine.
 ``status``     see ``Agent.do_status``; ``ping`` says nothing at less cost
 ``log``        ``from`` seq, ``follow``: replies ``first`` and ``next`` (seqs that exist), then
                sends the events' lines; ``lost`` counts events that rotation took away
-``release``    stop the nodes, disarm the heartbeat, reply when done; ``exit`` true: leave then
+``release``    stop the nodes, take down what was kept, disarm the heartbeat, reply when done;
+               ``exit`` true: leave then
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
@@ -446,6 +448,8 @@ class Agent:
         self.launch: Optional[CloudLaunch] = None
         self.after_launch: list[Callable[[], None]] = []
         self.stopping = self.ending = self.done = False
+        #: Whether another launch than the one that made the machine has it.
+        self.adopted = False
         self.heart: Optional[socket.socket] = None
         self.since = time.time()
         self.mark = f'{os.getpid()}-{time.time_ns()}'
@@ -542,6 +546,8 @@ class Agent:
             # the user could have written it: nothing that root would do
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self.watchdog.configured(self.clock(), heartbeat=bool(self.config['heartbeat']))
+            if not self.config['launch'] and self.config['on_exit'] == 'keep':
+                self.watchdog.disarm()  # it was released: it waits for no launch
 
     def save(self) -> None:
         """Keep the pid for people and the configuration for an agent that starts anew."""
@@ -854,7 +860,7 @@ class Agent:
         if self.ending:
             raise Refused('this machine is ending', 'launch again', 'ending')
         taken_over = new.get('launch', self.config['launch']) != self.config['launch']
-        age = self.heartbeat_age()
+        age = self.sign_of_life()
         if taken_over and age is not None and not request.get('force'):
             raise Refused(
                 f"this machine belongs to launch '{self.config['launch']}', whose last sign of "
@@ -865,6 +871,7 @@ class Agent:
 
         def apply() -> Json:
             if taken_over:
+                self.adopted = True
                 self.nodes.clear()
                 new.setdefault('heartbeat', None)
             self.config.update(new)
@@ -880,9 +887,17 @@ class Agent:
                 return {'error': str(error), 'hint': error.hint}
             return {'machine': self.config['machine'], 'next': self.log.next}
 
-        if self.stopping or (self.launch and (taken_over or (stale and not running))):
+        left = taken_over and (self.launch is not None or bool(self.kept))
+        if self.stopping or left or (self.launch and stale and not running):
             reply = self.reply_later(client, request)
-            self.stop_nodes(lambda: reply(apply()))
+
+            def stopped() -> None:
+                if taken_over:
+                    # the former launch's VPN has the port that the next one's needs
+                    self.take_down(lambda: reply(apply()))
+                else:
+                    reply(apply())
+            self.stop_nodes(stopped)
             return None
         return apply()
 
@@ -989,7 +1004,7 @@ class Agent:
         self.config['on_exit'] = checked({
             'on_exit': request.get('on_exit', self.config['on_exit'])})['on_exit']
         self.watchdog.disarm()
-        self.config['heartbeat'] = None
+        self.config.update(heartbeat=None, launch='')
         self.open_heart()
         self.save()
         reply = self.reply_later(client, request)
@@ -997,9 +1012,12 @@ class Agent:
         self.ending = self.ending or leave
 
         def stopped() -> None:
-            reply({})
             if leave:
+                reply({})
                 self.take_down(self._leave_for_good)
+            else:
+                # kept, the VPN's interface would be made again as soon as the robot deletes it
+                self.take_down(lambda: reply({}))
         self.stop_nodes(stopped)
 
     # -- the nodes ----------------------------------------------------------------------------
@@ -1265,6 +1283,13 @@ class Agent:
 
         self.spawn(kept.alive, looked, timeout=10.0)
 
+    def sign_of_life(self) -> Optional[float]:
+        """Return seconds since a launch that has the machine spoke, None while none has it."""
+        spoke = self.watchdog.beat_at
+        if spoke is None:
+            spoke = self.watchdog.boot_from
+        return None if spoke is None else self.clock() - spoke
+
     def heartbeat_age(self) -> Optional[float]:
         """Return seconds since the launch's last sign of life, None while nobody watches."""
         beat = self.watchdog.beat_at
@@ -1306,7 +1331,9 @@ class Agent:
         reason = self.watchdog.due(now)
         if reason is None:
             return
-        stay = reason == 'robot gone' and self.config['on_exit'] == 'keep'
+        # 'no launch came' ends a machine whose first launch died; an adopted one was kept before
+        gone = reason == 'robot gone' or (reason == 'no launch came' and self.adopted)
+        stay = gone and self.config['on_exit'] == 'keep'
         ends = 'end the machine' if self.config['end_command'] else 'leave'
         action = 'stop the nodes' if stay else ends
         say(f'{reason}: {action}')

@@ -754,6 +754,49 @@ def test_a_computer_that_is_not_ours_stays_on_and_gets_clean(rig):
     assert mark.exists() and not rig.directory.exists()
 
 
+def test_a_kept_machine_outlives_a_launch_that_dies_while_it_sets_it_up(rig):
+    rig.serve(launch='first', on_exit='keep', boot_timeout=60.0, end_command=ends(rig))
+    client = rig.client()
+    client.request('release', on_exit='keep')
+    client.request('configure', launch='second', boot_timeout=0.5)
+    assert rig.wait('watchdog', reason='no launch came')['action'] == 'stop the nodes'
+    client.request('status')
+    assert not (rig.folder / 'ended').exists()
+
+
+def test_a_kept_machine_that_nobody_has_outlives_its_agent(rig):
+    agent = rig.serve(on_exit='keep', lifetime=2.0, end_command=ends(rig))
+    rig.client().request('release', on_exit='keep')
+    agent.kill()
+    agent.wait(10)
+    rig.serve(on_exit='keep', boot_timeout=0.3, lifetime=2.0, end_command=ends(rig))
+    assert rig.wait('watchdog')['reason'] == 'lifetime'
+
+
+def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
+    rig.serve(boot_timeout=60.0)
+    client = rig.client()
+    with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
+        client.request('configure', launch='def456')
+    client.request('release', on_exit='keep')
+    client.request('configure', launch='def456')
+
+
+@pytest.mark.parametrize('how', [
+    {'command': 'release', 'on_exit': 'keep'},
+    {'command': 'configure', 'launch': 'another', 'force': True}])
+def test_what_was_kept_goes_with_the_launch_that_asked_for_it(rig, how):
+    thing = rig.folder / 'thing'
+    rig.serve(on_exit='keep')
+    client = rig.client()
+    client.request('keep', what='vpn', interval=0.05, alive=['test', '-e', str(thing)],
+                   repair=[['touch', str(thing)]], down=[['rm', '-f', str(thing)]])
+    wait_until(thing.exists, timeout=10, what='the repair')
+    client.request(**how)
+    assert not thing.exists()
+    assert client.request('status')['kept'] == []
+
+
 def test_an_end_command_that_fails_is_told(rig):
     rig.serve(boot_timeout=0.2, end_command=['false'])
     rig.client()
@@ -870,7 +913,7 @@ def test_nodes_do_not_outlive_a_killed_agent(rig):
 def test_an_agent_that_died_is_replaced_with_its_watch_and_its_log(rig, free_udp_port):
     first = rig.serve(robot_timeout=3.0, end_command=ends(rig))
     client = rig.client()
-    client.request('configure', launch='def456', heartbeat={
+    client.request('configure', launch='def456', force=True, heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
     client.request('start', nodes=[rig.node('n', SLEEP)])
     node = rig.wait('started', node='n')['pid']
