@@ -205,7 +205,10 @@ def plan(
     elif mode != 'apt' and not no_embedded:
         todo = _embedded(facts, wheels)
     elif mode == 'embedded':
-        raise PrerequisiteError(f"{machine} can't take the embedded default: {no_embedded}")
+        raise PrerequisiteError(
+            f"{machine} can't take the embedded default: {no_embedded}",
+            'make room there' if 'are free' in no_embedded else
+            "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
         todo = _apt(facts, wheels)
     else:

@@ -28,7 +28,9 @@ from fogros2.agent_client import agent_source, AgentClient, Heartbeat
 from fogros2.dds import DdsVendor
 from fogros2.errors import (
     AgentAbsent,
+    AgentError,
     Cancelled,
+    CommandError,
     ConfigurationError,
     ConnectError,
     FogError,
@@ -538,6 +540,7 @@ class _Deployment:
         #: Whether the computer is the provider's to make and to end, not somebody's own.
         self.owned = owned(spec)
         self.reused = False
+        self.released = False
         self.failed = True
 
     def run(self) -> RunningMachine:
@@ -715,14 +718,22 @@ class _Deployment:
         with step(self.launch.report, self.name, 'VPN') as detail:
             robot = self.launch._robot_vpn()
             undo.callback(
-                self.launch.attempt, self.name, 'VPN', lambda: self._leave_vpn(shell, interface))
+                self.launch.attempt, self.name, 'VPN',
+                lambda: self._leave_vpn(shell, agent, interface))
             public_key = self._on(shell, [robot.vpn.keys(interface)]).strip()
             member = VpnMember(
                 Peer(self.name, public_key, interface.address,
                      f'{machine.vpn_host}:{interface.port}'),
                 interface, lambda commands: self._on(shell, commands),
                 lambda: self._keep_vpn(agent, member))
-            member.up(robot)
+            try:
+                member.up(robot)
+            except CommandError as error:
+                if 'Address already in use' in error.result.stderr:
+                    raise VpnError(
+                        f"UDP port {interface.port} of '{self.name}' is in use already",
+                        'launch again: each launch takes another port') from error
+                raise
             robot.add(member)
             self._keep_vpn(agent, member)
             detail.append(interface.address)
@@ -736,10 +747,12 @@ class _Deployment:
             alive=list(robot.vpn.alive(member.interface).argv), repair=member.repair(robot),
             down=[list(c.argv) for c in robot.vpn.down(member.interface)])
 
-    def _leave_vpn(self, shell: Shell, interface: VpnInterface) -> None:
+    def _leave_vpn(self, shell: Shell, agent: AgentClient, interface: VpnInterface) -> None:
         robot = self.launch._robot_vpn()
         robot.remove(self.name)
         if self._survives():
+            # or the agent would take the interface for a broken one
+            self.launch.attempt(self.name, 'nodes', lambda: self._release(agent))
             self._on(shell, robot.vpn.down(interface), cancel=False)
 
     def _on(self, shell: Shell, commands: Iterable[Command], *, cancel: bool = True) -> str:
@@ -823,26 +836,41 @@ class _Deployment:
                 reach, timeout=self.timeouts.agent, cancel=self.launch.cancel,
                 what=f"the agent of '{self.name}'")
             undo.callback(agent.close)
+            undo.callback(self.launch.attempt, self.name, 'guard', lambda: self._release(agent))
             rearming = _Rearming(agent, self.launch.id, self.spec.robot_timeout / 4)
             self.rearming = undo.enter_context(contextlib.closing(rearming))
             return agent
 
     def _remove_agent(self, shell: Shell, directory: str) -> None:
         if self._survives():
-            self._on(shell, [Command(('rm', '-rf', '--', directory), sudo=True,
-                                     what='remove the agent')], cancel=False)
+            # one that was released has left; one that was never reached hasn't
+            self._on(shell, [Command.script(
+                f'running() {{ [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }}\n'
+                f'if read -r pid 2>/dev/null <{directory}/agent.pid && running; then\n'
+                f'  kill -s TERM $pid; n=0\n'
+                f'  while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done\n'
+                f'fi\n'
+                f'rm -rf -- {directory}', sudo=True, what='remove the agent')], cancel=False)
 
     def _start_agent(
         self, agent: AgentClient, interface: VpnInterface, ros: bootstrap.RosInstall,
         dds: Mapping[str, str], undo: contextlib.ExitStack,
     ) -> Heartbeat:
         robot = self.launch._robot_vpn().interface
-        agent.request(
-            'configure', timeout=self.timeouts.agent,
-            heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
-                       'peer': robot.address},
-            environment={**ros.environment, **dds, **self.spec.environment},
-            setup=list(ros.setup), ros_command=list(ros.command))
+        try:
+            agent.request(
+                'configure', timeout=self.timeouts.agent,
+                heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
+                           'peer': robot.address},
+                environment={**ros.environment, **dds, **self.spec.environment},
+                setup=list(ros.setup), ros_command=list(ros.command))
+        except AgentError as error:
+            if 'in use' in str(error):
+                raise VpnError(
+                    f"UDP port {plan.HEARTBEAT_PORT} of '{self.name}' is in use already",
+                    f"end what listens there: ss -lunp 'sport = :{plan.HEARTBEAT_PORT}'"
+                ) from error
+            raise
         heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, self.launch.id)
         undo.callback(heartbeat.close)
         try:
@@ -862,13 +890,17 @@ class _Deployment:
 
     def _undo_nodes(self, agent: AgentClient, undo: contextlib.ExitStack) -> None:
         """Push what comes first on the way down: the nodes end."""
-        def release() -> None:
-            if self._survives():
-                # answers when the nodes are gone, which takes as long as they may
-                agent.request('release', timeout=self.timeouts.delete,
-                              on_exit=self.spec.on_exit, exit=not self.provider.agent_program)
+        undo.callback(self.launch.attempt, self.name, 'nodes', lambda: self._release(agent))
 
-        undo.callback(self.launch.attempt, self.name, 'nodes', release)
+    def _release(self, agent: AgentClient) -> None:
+        """Have the agent of a computer that stays end the nodes and let go of it; once."""
+        if not self._survives() or self.released:
+            return
+        self.released = True
+        with contextlib.suppress(AgentAbsent):
+            # answers when the nodes are gone, which takes as long as they may
+            agent.request('release', timeout=self.timeouts.delete,
+                          on_exit=self.spec.on_exit, exit=not self.provider.agent_program)
 
     def _survives(self) -> bool:
         """Whether the computer stays when the launch ends, so that it has to be tidied up."""
