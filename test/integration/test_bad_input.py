@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What can't work, through ``ros2 launch``.
+
+Each time there is one line of error that says what is wrong and what to do, an exit status other
+than zero, and nothing is left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from importlib import metadata
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+
+import pytest
+
+from fogros2.provider import container_root
+from fogros2.store import Store
+from fogros2.testing.bare_computer import bare_computer
+from fogros2.testing.launched import launching
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+NAME = f'bad-{uuid.uuid4().hex[:6]}'
+
+LAUNCH = """\
+from fogros2 import plan
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, SSHInstance
+
+
+def generate_launch_description():
+    machine = {machine}
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package={package!r}, executable={executable!r}),
+    ])
+"""
+
+
+def embedded():
+    try:
+        metadata.distribution('ros2-embedded')
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    """Give the robot a home of its own: no known hosts, no keys."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    monkeypatch.delenv('SSH_AUTH_SOCK', raising=False)
+
+
+@pytest.fixture(scope='module')
+def small(tmp_path_factory):
+    """Return a folder whose namesake on the computer is on a disk of a megabyte."""
+    return tmp_path_factory.mktemp('small')
+
+
+@pytest.fixture(scope='module')
+def computer(cloud_network, tmp_path_factory, small):
+    """Run a computer that has the robot's environment, reached by SSH."""
+    with bare_computer(f'fogt-{NAME}', tmp_path_factory.mktemp('computer'), cloud_network,
+                       mounts=container_root.environment_mounts(None),
+                       options=['--tmpfs', f'{small}:size=1m,mode=1777']) as running:
+        yield running
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return what writes a launch file of one node on one machine."""
+    def make(machine, package='fogros2_examples', executable='talker'):
+        path = tmp_path / 'bad.launch.py'
+        path.write_text(LAUNCH.format(machine=machine, package=package, executable=executable))
+        return path
+    return make
+
+
+@pytest.fixture
+def refused(write):
+    """Return what launches such a file, which has to fail well, and what it said."""
+    def launch(machine, *, environment=None, within=20.0, wrap=(), **node):
+        begin = time.monotonic()
+        done = subprocess.run(
+            [*wrap, 'ros2', 'launch', str(write(machine, **node))], text=True, timeout=60,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env={**os.environ, **(environment or {})})
+        assert time.monotonic() - begin < within, done.stdout
+        return one_error(done.returncode, done.stdout)
+    return launch
+
+
+def one_error(returncode, text):
+    """Return the line of error, and all that was said."""
+    assert returncode not in (0, None), text
+    assert 'Traceback' not in text
+    errors = [line for line in text.splitlines() if '[ERROR]' in line]
+    assert len(errors) == 1, text
+    return errors[0], text
+
+
+def container(network, **more):
+    words = {'name': NAME, 'network': network, **more}
+    return f"ContainerInstance({', '.join(f'{k}={v!r}' for k, v in words.items())})"
+
+
+def ssh(computer, **more):
+    words = {'user': computer.user, 'key': str(computer.key), 'host_key': computer.host_key,
+             'name': NAME, **more}
+    words = {k: v for k, v in words.items() if v is not None}
+    host = words.pop('host', computer.address)
+    return f"SSHInstance({host!r}, {', '.join(f'{k}={v!r}' for k, v in words.items())})"
+
+
+def nothing_was_made(text):
+    return f'{NAME}: machine' not in text
+
+
+# -- what the launch file says ------------------------------------------------------------------
+
+def test_an_unknown_attribute(refused, cloud_network):
+    error, text = refused(container(cloud_network, lifetme='1h'))
+    assert "ContainerInstance has no attribute 'lifetme'" in text
+    assert "did you mean 'lifetime'?" in text
+
+
+@pytest.mark.parametrize('name', ['two words', '$(reboot)', '../../up', 'Ümlaut', 'x' * 41, ''])
+def test_a_name_that_is_none(refused, cloud_network, name):
+    error, text = refused(container(cloud_network, name=name))
+    assert f'{name!r} is no name for a machine' in text
+    assert 'such as slam-1' in text
+
+
+def test_an_unknown_package(refused, cloud_network):
+    error, text = refused(container(cloud_network), package='fogros2_exmples')
+    assert "no package is called 'fogros2_exmples'" in error
+    assert "did you mean 'fogros2_examples'?" in error
+    assert nothing_was_made(text)
+
+
+def test_an_unknown_executable(refused, cloud_network):
+    error, text = refused(container(cloud_network), executable='talkr')
+    assert "package 'fogros2_examples' has no executable 'talkr'" in error
+    assert "did you mean 'talker'?" in error
+    assert nothing_was_made(text)
+
+
+def test_a_workspace_that_is_none(refused, cloud_network, tmp_path):
+    error, text = refused(container(cloud_network, ros_workspace=str(tmp_path / 'nowhere')))
+    assert f'{tmp_path}/nowhere is no folder' in error
+    assert nothing_was_made(text)
+    (tmp_path / 'empty').mkdir()
+    error, text = refused(container(cloud_network, ros_workspace=str(tmp_path / 'empty')))
+    assert f'{tmp_path}/empty is no colcon workspace' in error
+    assert 'colcon build' in error
+    assert nothing_was_made(text)
+
+
+def test_two_machines_of_one_name(refused, cloud_network, write):
+    error, text = refused(
+        f'{container(cloud_network)}\n'
+        f'    other = {container(cloud_network, memory="2g")}\n'
+        f'    from launch import LaunchDescription\n'
+        f'    return LaunchDescription([CloudNode(machine=m, package="fogros2_examples", '
+        f'executable="talker") for m in (machine, other)])')
+    assert f"two machines of this launch are called '{NAME}'" in error
+    assert nothing_was_made(text)
+
+
+def test_a_computer_that_no_launch_switches_off(refused, computer):
+    error, text = refused(ssh(computer, on_exit='stop'))
+    assert f"'{NAME}' is a computer that exists already" in error and "'keep'" in error
+    assert nothing_was_made(text)
+
+
+# -- what the environment says ------------------------------------------------------------------
+
+@pytest.mark.parametrize('variables, what, hint', [
+    ({'RMW_IMPLEMENTATION': 'rmw_connextdds'}, 'rmw_connextdds', 'rmw_cyclonedds_cpp'),
+    ({'ROS_DOMAIN_ID': '300'}, 'ROS_DOMAIN_ID', '0 to '),
+    ({'ROS_DOMAIN_ID': 'seven'}, 'ROS_DOMAIN_ID', '0 to '),
+], ids=lambda value: next(iter(value.values())) if isinstance(value, dict) else '')
+def test_an_environment_that_no_node_can_have(refused, cloud_network, variables, what, hint):
+    error, text = refused(container(cloud_network), environment=variables)
+    assert what in error and hint in error
+    assert nothing_was_made(text)
+
+
+# -- what this computer lacks -------------------------------------------------------------------
+
+def without(path, script='mount --bind /dev/null "$hidden"'):
+    """Return words that run a command in a mount namespace in which ``path`` isn't usable."""
+    return ['unshare', '-m', 'sh', '-ec', f'hidden={path}; {script}; exec "$@"', 'sh']
+
+
+needs_namespaces = pytest.mark.skipif(
+    os.geteuid() != 0 or subprocess.run(['unshare', '-m', 'true'],
+                                        capture_output=True).returncode != 0,
+    reason='needs root, and mount namespaces')
+
+
+@needs_namespaces
+def test_no_tun(refused, cloud_network):
+    error, text = refused(container(cloud_network), wrap=without(
+        '/dev/net', 'mount -t tmpfs none "$hidden"'))
+    assert '/dev/net/tun is missing on this computer' in error and 'modprobe tun' in error
+    assert nothing_was_made(text)
+
+
+@needs_namespaces
+def test_a_root_that_cannot_be_overlaid(refused, cloud_network):
+    # what decides is the file system on which the engine would keep the layers
+    error, text = refused(container(cloud_network), wrap=without(
+        '/var/lib/containers',
+        'mkdir -p "$hidden"; mount -t overlay -o ro,lowerdir=/usr:/etc none "$hidden"'))
+    assert "this computer's root can't be overlaid" in error
+    assert "image='...'" in error
+    assert nothing_was_made(text)
+
+
+@needs_namespaces
+def test_no_root_and_no_sudo(write, cloud_network):
+    # nobody has no home and no password, and may not use sudo
+    nobody = ['setpriv', '--reuid=nobody', '--regid=nogroup', '--clear-groups']
+    if subprocess.run([*nobody, sys.executable, '-c', ''], capture_output=True).returncode:
+        pytest.skip('needs an interpreter that other users may run')
+    with tempfile.TemporaryDirectory(prefix='fogt') as own:
+        shutil.chown(own, 'nobody')
+        file = shutil.copy(write(container(cloud_network)), own)
+        done = subprocess.run(
+            [*nobody, 'ros2', 'launch', file], text=True, timeout=60, cwd=own,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env={**os.environ, 'HOME': own, 'ROS_LOG_DIR': own, 'FOGROS2_STATE_HOME': own})
+    error, text = one_error(done.returncode, done.stdout)
+    assert 'a VPN interface takes root' in error and 'sudo' in error
+    assert nothing_was_made(text)
+
+
+@pytest.mark.parametrize('program', ['wg', 'rsync'])
+@needs_namespaces
+def test_a_missing_program(refused, cloud_network, program):
+    error, text = refused(container(cloud_network), wrap=without(
+        f'$(readlink -f $(command -v {program}))'))
+    assert f'{program} not found on this computer' in error and 'apt-get install' in error
+    assert nothing_was_made(text)
+
+
+# -- computers that exist already ---------------------------------------------------------------
+
+def test_an_unreachable_host(refused, computer):
+    error, text = refused(ssh(computer, host='198.51.100.254'))
+    assert '198.51.100.254 port 22 does not answer' in error and 'is it on' in error
+
+
+def test_a_host_that_nobody_knows(refused, computer):
+    error, _ = refused(ssh(computer, host='planner.invalid'))
+    assert "there is no host called 'planner.invalid'" in error and 'check host=' in error
+
+
+def test_a_port_without_an_ssh_server(refused, computer):
+    error, _ = refused(ssh(computer, port=2222))
+    assert 'refuses connections to port 2222' in error and 'does its SSH server run' in error
+
+
+def test_another_host_key(refused, computer):
+    other = (computer.key.parent / 'id.pub').read_text().split()[:2]
+    error, text = refused(ssh(computer, host_key=' '.join(other)))
+    assert 'another host key than the pinned one' in error
+    assert computer.host_key in error
+    assert f'{NAME}: guard' not in text
+
+
+def test_an_unknown_host_key(refused, computer):
+    error, text = refused(ssh(computer, host_key=None))
+    assert f"the host key of '{NAME}' ({computer.address}) is unknown" in error
+    assert f'known_hosts: {computer.address} {computer.host_key}' in error
+    assert f'{NAME}: guard' not in text
+
+
+def test_a_refused_key(refused, computer, tmp_path):
+    key = tmp_path / 'other'
+    subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(key)], check=True)
+    error, _ = refused(ssh(computer, key=str(key)))
+    assert f'({computer.user}@{computer.address}) does not accept {key}' in error
+    assert 'authorized_keys' in error
+
+
+def test_a_computer_without_rsync(refused, computer):
+    # not by apt-get either: there is no way out of here
+    computer.run('mv /usr/bin/rsync /usr/bin/rsync.away; mv /usr/bin/apt-get /usr/bin/apt.away')
+    try:
+        error, _ = refused(ssh(computer))
+    finally:
+        computer.run('mv /usr/bin/rsync.away /usr/bin/rsync; '
+                     'mv /usr/bin/apt.away /usr/bin/apt-get')
+    assert f"machine '{NAME}' lacks rsync" in error
+    assert 'apt-get install rsync' in error
+
+
+def test_a_full_disk_where_the_workspace_goes(refused, computer, small):
+    prefix = small / 'install' / 'large'
+    index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (small / 'install' / '.colcon_install_layout').write_text('isolated\n')
+    (small / 'src').mkdir()
+    (index / 'large').write_text('')
+    (prefix / 'share' / 'data').write_bytes(os.urandom(4 << 20))
+    error, _ = refused(ssh(computer, ros_workspace=str(small)))
+    assert f"the disk of '{NAME}' is full: {small} did not fit" in error
+    assert 'make room there' in error
+
+
+@pytest.mark.skipif(not embedded(), reason='this robot has ROS 2, and no embedded default to send')
+def test_a_home_too_small_for_what_is_missing(refused, cloud_network, tmp_path):
+    with bare_computer(f'fogt-small-{NAME}', tmp_path / 'computer', cloud_network,
+                       options=['--tmpfs', '/home/fog:size=1m,mode=1777']) as computer:
+        error, _ = refused(ssh(computer, bootstrap='embedded'))
+    assert 'are free in /home/fog, 300 are needed' in error
+    assert 'make room there' in error
+
+
+@contextlib.contextmanager
+def occupied(computer, port):
+    """Have somebody on the computer listen on a UDP port."""
+    code = (f'import signal, socket; s = socket.socket(type=socket.SOCK_DGRAM); '
+            f's.bind(("", {port})); open("/tmp/busy", "w").close(); signal.pause()')
+    computer.run(f"rm -f /tmp/busy; python3 -c '{code}' >/dev/null 2>&1 & echo $! >/tmp/pid; "
+                 'until [ -e /tmp/busy ]; do :; done')
+    try:
+        yield
+    finally:
+        computer.run('kill $(cat /tmp/pid)')
+
+
+def test_a_busy_heartbeat_port(refused, computer):
+    with occupied(computer, 7399):
+        error, _ = refused(ssh(computer))
+    assert 'UDP port 7399' in error and 'in use already' in error and 'ss -lunp' in error
+
+
+def test_a_busy_vpn_port(refused, computer):
+    with occupied(computer, 51999):
+        error, _ = refused(
+            f'{ssh(computer)}\n    plan.machine_port = lambda launch_id: 51999')
+    assert 'UDP port 51999' in error and 'in use already' in error and 'launch again' in error
+
+
+# -- what is there already ----------------------------------------------------------------------
+
+def test_a_damaged_record(refused, cloud_network):
+    folder = Store().machine(NAME).path
+    folder.mkdir(parents=True)
+    (folder / 'record.json').write_text('{"name": ')
+    try:
+        error, text = refused(container(cloud_network))
+        assert f'{folder}/record.json is damaged' in error
+        assert f'ros2 fog delete {NAME}' in error
+        deleted = subprocess.run(['ros2', 'fog', 'delete', NAME, '--yes'], capture_output=True,
+                                 text=True, timeout=60)
+        assert deleted.returncode == 0, deleted.stderr
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(folder)
+
+
+def test_a_name_that_another_launch_has(refused, cloud_network, write):
+    with launching() as start:
+        first = start(str(write(container(cloud_network))))
+        first.wait_for('process started')
+        error, text = refused(container(cloud_network))
+        assert f"has the machine '{NAME}'" in error
+        assert 'give the machine another name=, or end that launch' in error
+        assert first.child.poll() is None and first.errors == []
+        first.interrupt()
+        assert first.ended() == 0, first.text
+
+
+def test_a_name_that_a_stranger_has(refused, cloud_network, tmp_path):
+    """Somebody else's container is in the way: neither taken over nor removed."""
+    with bare_computer(f'fogros2-{NAME}', tmp_path / 'computer', cloud_network) as stranger:
+        error, _ = refused(container(cloud_network))
+        assert f"'{NAME}'" in error and 'already' in error
+        stranger.run('true')

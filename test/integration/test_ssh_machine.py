@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A computer that exists already, from a bare one to one that runs nodes, and back."""
+
+from __future__ import annotations
+
+from importlib import metadata
+import json
+import os
+import shutil
+import sys
+import textwrap
+import uuid
+
+import pytest
+
+from fogros2.provider import container_root
+from fogros2.testing.bare_computer import bare_computer
+from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+
+def embedded():
+    try:
+        metadata.distribution('ros2-embedded')
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+@pytest.fixture(scope='module')
+def computer(cloud_network, tmp_path_factory):
+    """Run a computer with Python alone; where the robot has ROS 2, it has that as well."""
+    mounts = [] if embedded() else container_root.environment_mounts(None)
+    with bare_computer(f'fogt-ssh-{RUN}', tmp_path_factory.mktemp('computer'), cloud_network,
+                       mounts=mounts) as running:
+        yield running
+
+
+@pytest.fixture(scope='module')
+def cache(tmp_path_factory):
+    """Return where the wheels are, so that they are packed by these tests and for them."""
+    path = tmp_path_factory.mktemp('cache')
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def home(cache, tmp_path, monkeypatch):
+    """Give the robot a home of its own: no known hosts, no keys."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(cache))
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    monkeypatch.delenv('SSH_AUTH_SOCK', raising=False)
+    return tmp_path
+
+
+@pytest.fixture
+def launch():
+    with launching() as start:
+        yield start
+
+
+def example(computer, **arguments):
+    given = {'host': computer.address, 'user': computer.user, 'key': computer.key,
+             'name': f'ssh-{RUN}', 'bootstrap': 'embedded', 'count': 2, **arguments}
+    return ['fogros2_examples', 'talker.ssh.launch.py',
+            *(f'{name}:={value}' for name, value in given.items())]
+
+
+def nothing_runs(computer):
+    """Return what is still there of a launch: nothing, and the computer is on."""
+    found = [name for name in computer.run('ls /sys/class/net').stdout.split()
+             if name.startswith('fog')]
+    found += computer.run('ls /run/fogros2').stdout.split()
+    found += computer.run(
+        'for p in /proc/[0-9]*; do '
+        'tr "\\0" " " <$p/cmdline 2>/dev/null | grep -E "agent.py|talker|wireguard-go|ros2 " '
+        '| grep -v "^sh " || :; done').stdout.splitlines()
+    return found
+
+
+def sent_since(computer, marker):
+    return computer.run(
+        f'find /home/{computer.user}/.local -type f -newer {marker} 2>/dev/null || :'
+    ).stdout.splitlines()
+
+
+def test_a_bare_computer_gets_what_it_lacks_once(computer, launch, home):
+    first = launch(*example(computer, host_key=computer.host_key))
+    assert first.ended() == 0, first.text
+    assert f'I heard: [Hello World from {computer.name}' in first.text
+    assert ('embedded default installed' in first.text) == embedded()
+    assert 'WARNING' not in first.text and first.errors == []
+    assert nothing_runs(computer) == []
+
+    # known_hosts says who it is as well as host_key=, and nothing is sent again
+    computer.run('touch /tmp/marker')
+    known = home / '.ssh' / 'known_hosts'
+    known.parent.mkdir(mode=0o700)
+    known.write_text(f'{computer.address} {computer.host_key}\n')
+    second = launch(*example(computer))
+    assert second.ended() == 0, second.text
+    assert 'I heard' in second.text
+    assert '(there already)' in second.text
+    assert sent_since(computer, '/tmp/marker') == []
+    assert nothing_runs(computer) == []
+
+
+def test_a_killed_launch_is_cleared_up_by_its_agent(computer, launch, tmp_path):
+    path = tmp_path / 'killed.launch.py'
+    path.write_text(textwrap.dedent(f"""
+        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+
+
+        def generate_launch_description():
+            machine = SSHInstance(
+                '{computer.address}', '{computer.user}', key='{computer.key}',
+                host_key='{computer.host_key}', name='killed-{RUN}', robot_timeout=3)
+            return FogROSLaunchDescription([
+                CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
+            ])
+        """))
+    killed = launch(str(path))
+    killed.wait_for('process started')
+    running = ' '.join(nothing_runs(computer))
+    assert 'agent.py' in running and 'talker' in running and f'killed-{RUN}' in running
+    killed.kill()
+    # the agent's own folder stays with its log, root's and the user's alone
+    wait_until(lambda: nothing_runs(computer) in ([], [f'killed-{RUN}']), timeout=30,
+               what='the agent to end everything')
+    deleted = ros2('fog', 'delete', f'killed-{RUN}', '--yes')
+    assert deleted.returncode == 0, deleted.stderr
+    assert ros2('fog', 'gc').returncode == 0
+    assert nothing_runs(computer) == []
+
+
+NODE = """\
+#!/usr/bin/env python3
+from {package}.text import TEXT
+import rclpy
+from rclpy.node import Node
+
+rclpy.init()
+node = Node('{package}')
+node.declare_parameter('speed', 0.0)
+node.declare_parameter('colour', '')
+speed, colour = (node.get_parameter(name).value for name in ('speed', 'colour'))
+print(f'found {{TEXT}}, speed {{speed}}, {{colour}}, in {{__file__}}', flush=True)
+node.destroy_node()
+rclpy.shutdown()
+"""
+
+
+def colcon_workspace(root, package):
+    """Lay a Python package out as ``colcon build`` does: sources, and an isolated install."""
+    prefix = root / 'install' / package
+    version = f'python{sys.version_info.major}.{sys.version_info.minor}'
+    module = prefix / 'lib' / version / 'site-packages' / package
+    manifest = (f'<package format="3"><name>{package}</name><export>'
+                f'<build_type>ament_python</build_type></export></package>\n')
+    for path, text in {
+        root / 'install' / '.colcon_install_layout': 'isolated\n',
+        root / 'install' / 'local_setup.sh': '',
+        root / 'src' / package / 'package.xml': manifest,
+        root / 'build' / package / 'left.here': 'x' * 100_000,
+        root / '.git' / 'HEAD': 'ref: refs/heads/main\n',
+        prefix / 'share' / package / 'package.xml': manifest,
+        prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / package: '',
+        prefix / 'share' / package / 'large': 'y' * 300_000,
+        module / '__init__.py': '',
+        module / 'text.py': "TEXT = 'the first text'\n",
+        prefix / 'lib' / package / 'node': NODE.format(package=package),
+    }.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (prefix / 'lib' / package / 'node').chmod(0o755)
+    paths = {'COLCON_PREFIX_PATH': root / 'install', 'AMENT_PREFIX_PATH': prefix,
+             'PYTHONPATH': module.parent}
+    return {name: os.pathsep.join(filter(None, (str(path), os.environ.get(name))))
+            for name, path in paths.items()}
+
+
+def listed():
+    return [entry['name'] for entry in json.loads(ros2('fog', 'list', '--json').stdout)]
+
+
+def test_a_workspace_travels_and_a_kept_computer_gets_only_what_changed(
+        computer, launch, tmp_path):
+    package, name = f'fogt_{RUN}', f'kept-{RUN}'
+    root = tmp_path / 'a workspace'
+    variables = {**os.environ, **colcon_workspace(root, package)}
+    parameters = tmp_path / 'parameters.yaml'
+    parameters.write_text(f'{package}:\n  ros__parameters:\n    speed: 2.5\n')
+    path = tmp_path / 'kept.launch.py'
+    path.write_text(textwrap.dedent(f"""
+        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+        from launch.actions import DeclareLaunchArgument, Shutdown
+        from launch.substitutions import LaunchConfiguration
+
+
+        def generate_launch_description():
+            machine = SSHInstance(
+                '{computer.address}', '{computer.user}', key='{computer.key}',
+                host_key='{computer.host_key}', name='{name}',
+                on_exit=LaunchConfiguration('on_exit'))
+            return FogROSLaunchDescription([
+                DeclareLaunchArgument('on_exit'),
+                CloudNode(machine=machine, package='{package}', executable='node',
+                          parameters=['{parameters}', {{'colour': 'blue'}}], output='screen',
+                          on_exit=Shutdown()),
+            ])
+        """))
+    first = launch(str(path), 'on_exit:=keep', environment=variables)
+    assert first.ended() == 0, first.text
+    program = root / 'install' / package / 'lib' / package / 'node'
+    assert f'found the first text, speed 2.5, blue, in {program}' in first.text
+    there = computer.run(f"cd '{root}' && find . -type f").stdout.split()
+    assert f'./install/{package}/share/{package}/large' in there
+    assert not [path for path in there if '.git' in path or 'build' in path]
+    assert name in listed()
+
+    (module,) = root.glob(f'install/{package}/lib/*/site-packages/{package}/text.py')
+    module.write_text("TEXT = 'the second text'\n")
+    second = launch(str(path), 'on_exit:=delete', environment=variables)
+    assert second.ended() == 0, second.text
+    assert 'found the second text, speed 2.5, blue' in second.text
+    assert 'kept from before' in second.text
+    assert 'workspace' in second.text and '(1 files, ' in second.text
+    assert nothing_runs(computer) == []
+    assert name not in listed()
