@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Theora for comparison, through FFmpeg's program: what the paper's ``theora`` transport does.
+Theora for comparison: FFmpeg's program with libtheora encodes, PyAV decodes.
 
-``encode`` takes images on ``camera`` and publishes pages of an Ogg stream, ``decode`` takes those
-and publishes ``decoded``. Theora hands its pictures on one at a time, with the page's header.
+``encode`` takes images on ``camera`` and publishes the packets of an Ogg stream, as ROS's
+``theora`` transport does; ``decode`` takes those and publishes ``decoded``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import String
 
 
 class Pipe:
@@ -27,7 +26,7 @@ class Pipe:
 
     def __init__(self, words: list[str], heard: Any) -> None:
         self.process = subprocess.Popen(
-            ['ffmpeg', '-v', 'error', '-fflags', 'nobuffer', '-flags', 'low_delay', *words],
+            ['ffmpeg', '-v', 'error', '-probesize', '32', '-analyzeduration', '0', *words],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
         threading.Thread(target=heard, args=(self.process.stdout,), daemon=True).start()
 
@@ -43,7 +42,7 @@ class Pipe:
 
 
 class Encode(Node):
-    """Images to Ogg pages, one a picture."""
+    """Images to packets, one a picture."""
 
     def __init__(self) -> None:
         super().__init__('theora_encode')
@@ -65,64 +64,68 @@ class Encode(Node):
         self.pipe.write(image.data.tobytes())
 
     def pages(self, stream: Any) -> None:
-        """Publish each page."""
+        """Publish the packets of each page: Theora's three headers, then one a picture."""
         while True:
             head = read(stream, 27)
             if head is None:
                 return
             lengths = read(stream, head[26])
             assert lengths is not None
-            body = read(stream, sum(lengths))
-            assert body is not None
-            message = CompressedImage(format='theora', data=array.array(
-                'B', head + lengths + body))
-            if body and not body[0] & 0x80 and self.headers:
-                message.header = self.headers.popleft()
-            self.publisher.publish(message)
+            packet = b''
+            for length in lengths:
+                part = read(stream, length)
+                assert part is not None
+                packet += part
+                if length < 255:
+                    self.publish(packet)
+                    packet = b''
+
+    def publish(self, packet: bytes) -> None:
+        """Publish a packet, under its picture's header unless it is one of Theora's."""
+        message = CompressedImage(format='theora', data=array.array('B', packet))
+        # an empty packet repeats the picture before
+        if not packet or not packet[0] & 0x80:
+            message.header = self.headers.popleft()
+        self.publisher.publish(message)
 
 
 class Decode(Node):
-    """Ogg pages to images."""
+    """Packets to images."""
 
     def __init__(self) -> None:
         super().__init__('theora_decode')
-        self.headers: deque[Any] = deque()
-        self.size: Optional[tuple[int, int]] = None
-        self.pipe = Pipe(
-            ['-probesize', '32', '-analyzeduration', '0', '-f', 'ogg', '-i', '-',
-             '-f', 'image2pipe', '-c:v', 'ppm', '-flush_packets', '1', '-vsync', '0', '-'],
-            self.pictures)
+        self.pipe: Optional[Pipe] = None
+        self.setup: list[bytes] = []
+        self.codec: Any = None
+        self.last: Any = None
         self.publisher = self.create_publisher(Image, 'decoded', 2)
         self.create_subscription(CompressedImage, 'camera/stream', self.take, 8)
-        self.unused = String
 
-    def take(self, page: Any) -> None:
-        """Hand a page to FFmpeg."""
-        if page.header.frame_id:
-            self.headers.append(page.header)
-        self.pipe.write(page.data.tobytes())
+    def take(self, message: Any) -> None:
+        """Decode a packet and publish its picture."""
+        import av
 
-    def pictures(self, stream: Any) -> None:
-        """Publish each picture, which comes as PPM."""
-        import numpy
-
-        while True:
-            fields = []
-            while len(fields) < 4:
-                word = token(stream)
-                if word is None:
-                    return
-                fields.append(word)
-            width, height = int(fields[1]), int(fields[2])
-            data = read(stream, width * height * 3)
-            if data is None:
-                return
-            if not self.headers:
-                continue
-            pixels = numpy.frombuffer(data, numpy.uint8).reshape(height, width, 3)[:, :, ::-1]
+        packet = message.data.tobytes()
+        if packet and packet[0] & 0x80:
+            self.setup.append(packet)
+            if len(self.setup) == 3:
+                self.codec = av.CodecContext.create('theora', 'r')
+                # frame threads would hold a picture back
+                self.codec.thread_count = 1
+                # Theora's headers, each with its length, as FFmpeg keeps them
+                self.codec.extradata = b''.join(
+                    len(part).to_bytes(2, 'big') + part for part in self.setup)
+            return
+        if self.codec is None:
+            return
+        if packet:
+            for frame in self.codec.decode(av.Packet(packet)):
+                self.last = frame.to_ndarray(format='bgr24')
+        if self.last is not None:
+            height, width = self.last.shape[:2]
             self.publisher.publish(Image(
-                header=self.headers.popleft(), width=width, height=height, step=3 * width,
-                encoding='bgr8', data=array.array('B', pixels.tobytes())))
+                header=message.header, width=width, height=height, step=3 * width,
+                encoding='bgr8', data=array.array('B', self.last.tobytes())))
 
 
 def read(stream: Any, size: int) -> Optional[bytes]:
@@ -134,20 +137,6 @@ def read(stream: Any, size: int) -> Optional[bytes]:
             return None
         data += more
     return data
-
-
-def token(stream: Any) -> Optional[bytes]:
-    """Return a word of a PPM header."""
-    word = b''
-    while True:
-        byte = stream.read(1)
-        if not byte:
-            return None
-        if byte.isspace():
-            if word:
-                return word
-            continue
-        word += byte
 
 
 def main() -> None:

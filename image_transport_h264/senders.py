@@ -228,9 +228,10 @@ class VideoSender(Sender):
                 self._last_key = left
             self._control.sent(
                 packet.tag.sequence, len(packet.data) + sum(map(len, again)), left)
-        self._publish(image.header, packet)
+        # the pieces first: with one lost, the packet is whole a datagram later, and not a packet
         for piece in again:
             self._pieces.publish(UInt8MultiArray(data=message.octets(piece)))
+        self._publish(image.header, packet)
 
     def _publish(self, header: Header, packet: Packet) -> None:
         self._video.publish(message.compressed(header, packet))
