@@ -10,9 +10,11 @@ in a thread of its caller. Every undo is pushed before its step runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 import contextlib
 import dataclasses
+import functools
+import json
 import os
 from pathlib import Path
 import secrets
@@ -33,6 +35,7 @@ from fogros2.errors import (
     CommandError,
     ConfigurationError,
     ConnectError,
+    DeadlineExceeded,
     FogError,
     MachineNotFound,
     NameTaken,
@@ -79,6 +82,8 @@ ROBOT_PROGRAMS = {
     'ssh-keygen': 'openssh-client',
 }
 AGENT_FOLDER = '/run/fogros2'
+#: Seconds that one attempt to log in may take: a cancel isn't seen before its end.
+LOGIN_ATTEMPT = 10.0
 #: Seconds between two uses of sudo's ticket, which lives for some minutes after each.
 TICKET_REFRESH = 30.0
 
@@ -268,13 +273,18 @@ class Launch:
         with self._lock:
             if self._robot is None:
                 folder = self.store.launch(self.id)
-                self._undo.callback(shutil.rmtree, folder, ignore_errors=True)
+                self._undo.callback(self._remove_folder, folder)
                 # by this, `ros2 fog gc` tells the folder of a launch that was killed
                 pid = os.getpid()
                 write_private(folder / 'process.json', model.to_json(
                     {'pid': pid, 'pid_start': process_start(pid)}).encode())
                 self._robot = RobotVpn(self, folder)
             return self._robot
+
+    def _remove_folder(self, folder: Path) -> None:
+        """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
+        if self._robot is None or self._robot.down:
+            shutil.rmtree(folder, ignore_errors=True)
 
     @property
     def ending(self) -> bool:
@@ -341,13 +351,16 @@ class Launch:
 class RobotVpn:
     """The robot's VPN interface, one per launch, and the machines that it leads to."""
 
+    #: Whether nothing of it is on this computer.
+    down = True
+    _told_of_sudo = False
+
     def __init__(self, launch: Launch, folder: Path) -> None:
         self._launch = launch
         self._lock = threading.Lock()
         self._up = False
         self._members: dict[str, VpnMember] = {}
         self._public_key = ''
-        self._asks = False
         self._stop = threading.Event()
         self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
             domain=launch.domain)
@@ -364,6 +377,7 @@ class RobotVpn:
                 launch = self._launch
                 with step(launch.report, '', 'VPN interface') as detail:
                     launch._undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
+                    self.down = False
                     self._public_key = launch.robot([self.vpn.keys(self.interface)]).strip()
                     launch.robot(self.vpn.up(self.interface, []))
                     detail.append(f'{self.interface.name} {self.interface.address}')
@@ -408,25 +422,25 @@ class RobotVpn:
             with self._lock:
                 if self._stop.is_set():
                     return
-                alive = process.run(self.vpn.alive(self.interface), check=False,
-                                    timeout=self._launch.timeouts.vpn)
-                if alive.returncode == 0:
-                    continue
                 try:
+                    alive = process.run(self.vpn.alive(self.interface), check=False,
+                                        timeout=self._launch.timeouts.vpn)
+                    if alive.returncode == 0:
+                        continue
                     with step(self._launch.report, '', 'VPN repair', fatal=False):
                         self._launch.robot(
                             self.vpn.repair(self.interface, self._sorted()), cancel=False)
                 except FogError:
-                    pass  # reported by the step; the next round tries again
+                    pass  # a repair's is reported by its step; the next round tries again
 
     def _refresh_ticket(self) -> None:
         """Keep sudo from wanting a password before all is taken down; say so once if it does."""
         if process.refresh_ticket():
-            self._asks = False
-        elif not self._asks:
-            self._asks = True
+            self._told_of_sudo = False
+        elif not self._told_of_sudo:
+            self._told_of_sudo = True
             self._launch.report(StepFailed(
-                '', 'root', 0.0, 'sudo wants a password again, so taking this launch down will '
+                '', 'sudo ticket', 0.0, 'sudo wants a password again, so taking this launch down will '
                 'leave its containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; '
                 'else `sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
 
@@ -435,6 +449,7 @@ class RobotVpn:
         with self._lock:
             self._up = False
             self._launch.robot(self.vpn.down(self.interface), cancel=False)
+            self.down = True
 
 
 class VpnMember:
@@ -540,8 +555,12 @@ class _Deployment:
         #: Whether the computer is the provider's to make and to end, not somebody's own.
         self.owned = owned(spec)
         self.reused = False
+        self.asked = False
         self.released = False
+        self.rearming: Optional[_Rearming] = None
         self.failed = True
+        #: Set when the launch's is, or when a step failed: those beside it needn't go on.
+        self.cancel = _Either(launch.cancel)
 
     def run(self) -> RunningMachine:
         """Take the steps; on any failure undo those taken."""
@@ -559,21 +578,31 @@ class _Deployment:
                 joining = pool.submit(self._join_vpn, machine, shell, agent, interface, undo)
                 syncing = pool.submit(self._sync, shell, ros)
                 configuring = pool.submit(self._configure_dds, shell, interface)
+                self._all_of(joining, syncing, configuring)
                 public_key = joining.result().peer.public_key
-                syncing.result()
                 dds = configuring.result()
             with step(self.launch.report, self.name, 'agent') as detail:
                 heartbeat = self._start_agent(agent, interface, ros, dds, undo)
                 detail.append(f'VPN round trip {(heartbeat.round_trip or 0) * 1e3:.2f} ms')
             self._save(public_key=public_key)
+            # once more, to come first on the way down
             self._undo_nodes(agent, undo)
             self.failed = False
             return RunningMachine(
                 self.launch, self.spec, machine, shell, agent, heartbeat, interface,
                 undo.pop_all())
 
+    def _all_of(self, *tasks: Future[Any]) -> None:
+        """Wait for steps that run side by side; the first that fails ends the others."""
+        for task in wait(tasks, return_when=FIRST_EXCEPTION).done:
+            if task.exception() is not None:
+                self.cancel.set()
+                task.result()
+
     def _save(self, **changes: Any) -> None:
-        self.record = self.folder.save(dataclasses.replace(self.record, **changes))
+        # known here even where it can't be written down, as the way down needs it
+        self.record = dataclasses.replace(self.record, **changes)
+        self.folder.save(self.record)
 
     # -- steps 1 to 3: create, wait, pin --------------------------------------------------------
 
@@ -586,7 +615,7 @@ class _Deployment:
             else:
                 self._create_new(undo)
             machine = wait_until(
-                self._reachable, timeout=self.timeouts.boot, cancel=self.launch.cancel,
+                self._reachable, timeout=self.timeouts.boot, cancel=self.cancel,
                 what=f"the machine '{self.name}' to run", longest=self._poll_longest())
             self._save(shell=machine.shell)
             detail.append(machine.shell.host if machine.shell else machine.id[:20])
@@ -611,6 +640,7 @@ class _Deployment:
                 with contextlib.suppress(MachineNotFound):
                     machine = self.provider.describe(before.machine_id)
                     if machine.state is not MachineState.DELETED:
+                        self._check_alike(before.spec, machine)
                         self.record = dataclasses.replace(before, spec=self.spec)
                         return machine
         try:
@@ -624,6 +654,19 @@ class _Deployment:
                 f"{whose} has a machine '{self.name}' that this launch has no key for",
                 f'give the machine another name=, or: ros2 fog delete {self.name}')
         return None
+
+    def _check_alike(self, before: MachineSpec, machine: Machine) -> None:
+        """Refuse to take a machine for another one than it was asked to be."""
+        then, now = (json.loads(model.to_json(s.options)) for s in (before, self.spec))
+        other = sorted(key for key in {*then, *now} if then.get(key) != now.get(key))
+        if other:
+            raise NameTaken(
+                f"the machine '{self.name}' of an earlier launch has another {', '.join(other)}",
+                f'give the machine another name=, or: ros2 fog delete {self.name}')
+        if self.spec.on_exit == 'stop' and machine.tags.get(TAG_ON_EXIT, 'stop') != 'stop':
+            raise ConfigurationError(
+                f"the machine '{self.name}' was not made to be stopped and started",
+                f"keep it with on_exit='keep', or: ros2 fog delete {self.name}")
 
     def _adopt(self, machine: Machine, undo: contextlib.ExitStack) -> None:
         self.reused = True
@@ -648,6 +691,7 @@ class _Deployment:
             TAG_EXPIRES: str(int(time.time() + self.spec.lifetime)),
             TAG_ON_EXIT: self.spec.on_exit,
         }
+        self.asked = True
         machine_id = self.provider.create(self.spec, CreateRequest(
             token=token, authorized_key=public_key, tags=tags,
             vpn_port=plan.machine_port(self.launch.id), agent_config=config))
@@ -685,10 +729,28 @@ class _Deployment:
             self._save(shell=endpoint)
             shell = shells.connect(endpoint, name=self.name, timeout=self.timeouts.ssh)
             undo.callback(shell.close)
-            wait_until(
-                _answers(shell, self.timeouts.ssh), timeout=self.timeouts.ssh,
-                cancel=self.launch.cancel, what=f"'{self.name}' to let us in", longest=0.5)
+            self._log_in(shell)
             return shell
+
+    def _log_in(self, shell: Shell) -> None:
+        """Wait until the machine's SSH server lets us in; else say what it answered last."""
+        last: Optional[FogError] = None
+
+        def probe() -> bool:
+            nonlocal last
+            try:
+                shell.run(Command(('true',), what='connect'), cancel=self.cancel,
+                          timeout=min(LOGIN_ATTEMPT, self.timeouts.ssh))
+                return True
+            except (ConnectError, DeadlineExceeded) as error:
+                last = error
+                return False
+
+        try:
+            wait_until(probe, timeout=self.timeouts.ssh, cancel=self.cancel, longest=0.5,
+                       what=f"'{self.name}' to let us in")
+        except DeadlineExceeded as error:
+            raise last or error from error
 
     # -- step 4: ROS on the machine -------------------------------------------------------------
 
@@ -696,7 +758,7 @@ class _Deployment:
         with step(self.launch.report, self.name, 'ROS 2') as detail:
             ros, note = bootstrap.ensure(
                 shell, self.launch.underlay(self.spec.workspace), self.spec,
-                timeout=self.timeouts.install, cancel=self.launch.cancel)
+                timeout=self.timeouts.install, cancel=self.cancel)
             detail.append(note)
             return ros
 
@@ -720,6 +782,8 @@ class _Deployment:
             undo.callback(
                 self.launch.attempt, self.name, 'VPN',
                 lambda: self._leave_vpn(shell, agent, interface))
+            undo.callback(
+                self.launch.attempt, self.name, 'VPN', lambda: robot.remove(self.name))
             public_key = self._on(shell, [robot.vpn.keys(interface)]).strip()
             member = VpnMember(
                 Peer(self.name, public_key, interface.address,
@@ -748,19 +812,17 @@ class _Deployment:
             down=[list(c.argv) for c in robot.vpn.down(member.interface)])
 
     def _leave_vpn(self, shell: Shell, agent: AgentClient, interface: VpnInterface) -> None:
-        robot = self.launch._robot_vpn()
-        robot.remove(self.name)
         if self._survives():
             # or the agent would take the interface for a broken one
             self.launch.attempt(self.name, 'nodes', lambda: self._release(agent))
-            self._on(shell, robot.vpn.down(interface), cancel=False)
+            self._on(shell, self.launch._robot_vpn().vpn.down(interface), cancel=False)
 
     def _on(self, shell: Shell, commands: Iterable[Command], *, cancel: bool = True) -> str:
         output = ''
         for command in commands:
             output = shell.run(
                 command, timeout=self.timeouts.vpn,
-                cancel=self.launch.cancel if cancel else None).stdout
+                cancel=self.cancel if cancel else None).stdout
         return output
 
     # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
@@ -771,7 +833,7 @@ class _Deployment:
         with step(self.launch.report, self.name, 'workspace') as detail:
             note = workspace.transfer(
                 shell, Path(self.spec.workspace), ros, timeouts=self.timeouts,
-                cancel=self.launch.cancel,
+                cancel=self.cancel,
                 on_progress=lambda done, total: self.launch.report(
                     Progress(self.name, 'workspace', done, total)))
             detail.append(note)
@@ -803,43 +865,61 @@ class _Deployment:
         # from here on we speak to it all the time, first to re-arm it, then by heartbeats
         config['boot_timeout'] = self.spec.robot_timeout
         with step(self.launch.report, self.name, 'guard'):
+            agent = None
             if not program:
                 program = f'{directory}/agent.py'
-                owner = config['user']
-                undo.callback(self.launch.attempt, self.name, 'guard',
-                              lambda: self._remove_agent(shell, directory))
-                self._on(shell, [Command.script(
-                    f'install -d -m 755 {AGENT_FOLDER}; '
-                    f'install -d -m 700 -o {owner} {directory}', sudo=True,
-                    what="make the agent's folder")])
-                shell.put(agent_source().read_bytes(), program, mode=0o700)
-                shell.put(model.to_json(config).encode(), f'{directory}/config.json', mode=0o600)
-                self._on(shell, [Command(
-                    ('python3', '-IS', program, 'serve', '--detach', '--config',
-                     f'{directory}/config.json'), sudo=True, what='start the agent')])
+                remove = functools.partial(self._remove_agent, shell, directory)
+                if self._on(shell, [Command.script(
+                        f'[ ! -S {directory}/agent.sock ] || echo there', sudo=True,
+                        what='look for an agent')]).strip():
+                    # of a launch that died, or of another robot, whose it stays
+                    agent = self._reach_agent(shell, directory, program, config)
+                undo.callback(self.launch.attempt, self.name, 'guard', remove)
+                if agent is None:
+                    self._install_agent(shell, directory, program, config)
             self._save(agent=directory, agent_program=program)
-            def reach() -> Optional[AgentClient]:
-                # no cancel: it is needed on the way down as well, and requests have deadlines
-                agent = AgentClient(shell, directory, agent_path=program)
-                try:
-                    # the record said that the launch before is gone: its agent may not know yet
-                    agent.request(
-                        'configure', timeout=self.timeouts.agent, force=self.reused, **config)
-                except FogError as error:
-                    agent.close()
-                    if isinstance(error, AgentAbsent):
-                        return None  # the machine's SSH server may be there before its agent
-                    raise
-                return agent
-
-            agent = wait_until(
-                reach, timeout=self.timeouts.agent, cancel=self.launch.cancel,
+            agent = agent or wait_until(
+                lambda: self._reach_agent(shell, directory, program, config),
+                timeout=self.timeouts.agent, cancel=self.cancel,
                 what=f"the agent of '{self.name}'")
             undo.callback(agent.close)
             undo.callback(self.launch.attempt, self.name, 'guard', lambda: self._release(agent))
-            rearming = _Rearming(agent, self.launch.id, self.spec.robot_timeout / 4)
-            self.rearming = undo.enter_context(contextlib.closing(rearming))
+            self.rearming = _Rearming(agent, self.launch.id, self.spec.robot_timeout / 4)
+            undo.callback(self.rearming.close)
             return agent
+
+    def _install_agent(
+        self, shell: Shell, directory: str, program: str, config: Mapping[str, Any],
+    ) -> None:
+        self._on(shell, [Command.script(
+            f'install -d -m 755 {AGENT_FOLDER}; '
+            f'install -d -m 700 -o {config["user"]} {directory}', sudo=True,
+            what="make the agent's folder")])
+        shell.put(agent_source().read_bytes(), program, mode=0o700)
+        shell.put(model.to_json(config).encode(), f'{directory}/config.json', mode=0o600)
+        self._on(shell, [Command(
+            ('python3', '-IS', program, 'serve', '--detach', '--config',
+             f'{directory}/config.json'), sudo=True, what='start the agent')])
+
+    def _reach_agent(
+        self, shell: Shell, directory: str, program: str, config: Mapping[str, Any],
+    ) -> Optional[AgentClient]:
+        """
+        Return a connection to the machine's agent, ours from now on; None while there is none.
+
+        :raises AgentError: another launch has it.
+        """
+        # no cancel: it is needed on the way down as well, and requests have deadlines
+        agent = AgentClient(shell, directory, agent_path=program)
+        try:
+            # the record said that the launch before is gone: its agent may not know yet
+            agent.request('configure', timeout=self.timeouts.agent, force=self.reused, **config)
+        except FogError as error:
+            agent.close()
+            if isinstance(error, AgentAbsent):
+                return None  # the machine's SSH server may be there before its agent
+            raise
+        return agent
 
     def _remove_agent(self, shell: Shell, directory: str) -> None:
         if self._survives():
@@ -876,14 +956,15 @@ class _Deployment:
         try:
             wait_until(
                 lambda: heartbeat.round_trip is not None, timeout=self.timeouts.vpn,
-                cancel=self.launch.cancel, what='an answer through the VPN', longest=0.05)
+                cancel=self.cancel, what='an answer through the VPN', longest=0.05)
         except FogError as error:
             if isinstance(error, Cancelled):
                 raise
             raise VpnError(
                 f"nothing comes back from '{self.name}' through the VPN",
                 f'is UDP port {interface.port} open on the way there?') from error
-        self.rearming.close()
+        if self.rearming is not None:
+            self.rearming.close()
         return heartbeat
 
     # -- the way down ---------------------------------------------------------------------------
@@ -897,9 +978,11 @@ class _Deployment:
         if not self._survives() or self.released:
             return
         self.released = True
+        if self.rearming is not None:
+            self.rearming.close()
         with contextlib.suppress(AgentAbsent):
-            # answers when the nodes are gone, which takes as long as they may
-            agent.request('release', timeout=self.timeouts.delete,
+            # answers when the nodes are gone; out of reach, its watch gets there by itself
+            agent.request('release', timeout=self.timeouts.command,
                           on_exit=self.spec.on_exit, exit=not self.provider.agent_program)
 
     def _survives(self) -> bool:
@@ -913,16 +996,44 @@ class _Deployment:
         mode = self.spec.on_exit
         if self.failed and not self.reused:
             mode = 'delete'
-        machine_id = self.record.machine_id
         with step(self.launch.report, self.name, mode if self.owned else 'let go'):
             if mode == 'delete':
-                if machine_id is not None:
+                for machine_id in self._made():
                     self.provider.destroy(machine_id)
                 self.folder.delete()
                 return
-            if mode == 'stop' and machine_id is not None:
-                self.provider.stop(machine_id)
+            if mode == 'stop' and self.record.machine_id is not None:
+                self.provider.stop(self.record.machine_id)
             self._save(launch='', pid=0, pid_start=0, robot_vpn=None)
+
+
+    def _made(self) -> list[str]:
+        """Return the id of the machine; a creation that failed half-way is found by its tags."""
+        if self.record.machine_id is not None:
+            return [self.record.machine_id]
+        if not self.asked:
+            return []
+        try:
+            return [machine.id for machine in self.provider.find(
+                {TAG_NAME: self.name, TAG_LAUNCH: self.launch.id})]
+        except Unsupported:
+            return []
+
+
+class _Either(threading.Event):
+    """An event that counts as set when another one is set, too."""
+
+    def __init__(self, other: threading.Event) -> None:
+        super().__init__()
+        self._other = other
+
+    def is_set(self) -> bool:
+        """Return whether one of the two is set."""
+        return super().is_set() or self._other.is_set()
+
+    def wait(self, timeout: Optional[float] = None) -> bool:
+        """Wait for the other one, a Ctrl-C; that this one was set is seen after ``timeout``."""
+        return self._other.wait(timeout) or self.is_set()
 
 
 class _Rearming:
@@ -987,18 +1098,6 @@ def check_sudo() -> None:
     if not process.refresh_ticket():
         raise PrerequisiteError('a VPN interface takes root, and sudo wants a password',
                                 'run `sudo -v` first, then launch again')
-
-
-def _answers(shell: Shell, timeout: float) -> Callable[[], Optional[bool]]:
-    """Return a probe that is true once the machine's SSH server lets us in."""
-    def probe() -> Optional[bool]:
-        try:
-            shell.run(Command(('true',), what='connect'), timeout=timeout)
-            return True
-        except ConnectError:
-            return None
-
-    return probe
 
 
 def _json(node: NodeSpec) -> dict[str, Any]:

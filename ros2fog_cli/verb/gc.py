@@ -43,6 +43,12 @@ class GcVerb(VerbExtension):
                 record = entry.record
                 lost = not reason and record is not None and record.launch \
                     and not record.launch_alive and not record.damage and entry.asked
+                if not entry.asked and record is not None and record.launch \
+                        and not record.launch_alive:
+                    failed = 1
+                    note('machine', entry.name, 'its launch is gone',
+                         f"the provider '{entry.provider}' can't be asked")
+                    continue
                 if not reason and not lost:
                     continue
                 what = 'leftovers of' if lost or entry.gone else 'machine'

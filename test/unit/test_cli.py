@@ -325,6 +325,17 @@ def test_gc_clears_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == 'nothing to clear\n'
 
 
+def test_gc_is_not_done_where_a_provider_can_not_be_asked(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record('a', provider='nosdk', **dead())
+    record('busy', provider='nosdk', **alive())
+    assert run('gc') == 1
+    assert capsys.readouterr().out == \
+        "could not clear machine a: the provider 'nosdk' can't be asked\n"
+    assert Store().machine('a').exists()
+
+
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
     store = Store()
     for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None)):

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.deploy where sudo begins to want a password in the middle of a launch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import threading
+
+import pytest
+
+from fogros2 import process
+from fogros2.deploy import Launch, RobotVpn
+from fogros2.model import Command, VpnInterface
+from fogros2.report import Event, StepFailed
+from fogros2.store import Store
+from fogros2.vpn.wireguard import WireGuard
+from ros2fog_cli.api import endings
+
+
+@pytest.fixture
+def events() -> list[Event]:
+    return []
+
+
+@pytest.fixture
+def launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: list[Event]) -> Launch:
+    def choose(self: RobotVpn, launch: Launch, folder: Path) -> None:
+        self._launch, self._lock, self._members = launch, threading.Lock(), {}
+        self._up, self._stop, self.vpn = False, threading.Event(), WireGuard()
+        self.interface = VpnInterface(
+            f'fog{launch.id}', '127.0.0.1', '127.0.0.1/32', 0, str(folder / 'vpn.key'))
+
+    monkeypatch.setattr(RobotVpn, '__init__', choose)
+    monkeypatch.setattr(WireGuard, 'keys', lambda self, interface: Command(('true',)))
+    monkeypatch.setattr(WireGuard, 'up', lambda self, interface, peers: iter(()))
+    return Launch(store=Store(tmp_path), environment={}, report=events.append)
+
+
+@pytest.mark.parametrize('refused', [False, True])
+def test_the_folder_by_which_gc_finds_the_interface_stays_as_long(
+        launch: Launch, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
+    down = Command(('false' if refused else 'true',), what='take it down')
+    monkeypatch.setattr(WireGuard, 'down', lambda self, interface: iter([down]))
+    launch._robot_vpn().ensure()
+    folder = launch.store.launch(launch.id)
+    assert len(launch.down()) == refused
+    assert folder.exists() == refused
+    # what gc sees when this process has gone
+    monkeypatch.setattr(endings, 'process_start', lambda pid: None)
+    assert [found.launch for found in endings.leftovers(launch.store)] == [launch.id] * refused
+
+
+def test_it_is_said_once_each_time(
+        launch: Launch, monkeypatch: pytest.MonkeyPatch, events: list[Event]) -> None:
+    robot = launch._robot_vpn()
+    for granted in (True, False, False, True, False):
+        monkeypatch.setattr(process, 'refresh_ticket', lambda granted=granted: granted)
+        robot._refresh_ticket()
+    assert [event.fatal for event in events if isinstance(event, StepFailed)] == [False, False]
