@@ -158,7 +158,7 @@ checksum() { sha256sum | cut -c 1-16; }
 sources_hash() {
     find setup.py setup.cfg package.xml resource launch fogros2 fogros2_examples ros2fog_cli \
         image_transport_h264 ros2_embedded -name __pycache__ -prune -o -name '*.egg-info' -prune \
-        -o -name '*.pyc' -o -type f -print0 2>/dev/null | sort -z | xargs -0 sha256sum | checksum
+        -o -name .cache -prune -o -name '*.pyc' -o -type f -print0 2>/dev/null | sort -z | xargs -0 sha256sum | checksum
 }
 needs_hash() { { cat setup.py ros2_embedded/setup.py tools/setup.sh; echo "$1"; } | checksum; }
 
