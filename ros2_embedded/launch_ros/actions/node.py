@@ -2,6 +2,7 @@
 """The action that executes a ROS node."""
 from __future__ import annotations
 
+import atexit
 import os
 import pathlib
 from tempfile import NamedTemporaryFile
@@ -218,6 +219,8 @@ class Node(ExecuteProcess):
                 name: list(value) if isinstance(value, tuple) else value
                 for name, value in params.items()}
             yaml.dump({node: {'ros__parameters': values}}, file, default_flow_style=False)
+        # not sooner: a node that is started again reads it again
+        atexit.register(pathlib.Path(file.name).unlink, missing_ok=True)
         return file.name
 
     def _get_parameter_rule(self, param: Parameter, context: LaunchContext) -> str:
