@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.deploy's ways out, against a provider and a shell that remember."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+
+import pytest
+
+from fogros2 import deploy, process
+from fogros2.deploy import _Deployment, Launch, RobotVpn
+from fogros2.errors import (
+    AgentError,
+    Cancelled,
+    ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    NameTaken,
+    ProviderError,
+    StoreError,
+    VpnError,
+)
+from fogros2.model import (
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Peer,
+    Result,
+    VpnInterface,
+)
+from fogros2.store import MachineDirectory, Store
+from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
+from fogros2.waiting import Timeouts, wait_until
+
+SPEC = MachineSpec('planner', 'fake')
+ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', guarded=True)
+
+
+@pytest.fixture
+def provider(monkeypatch):
+    fake = FakeProvider()
+    monkeypatch.setattr(deploy, 'provider', lambda name: fake)
+    return fake
+
+
+@pytest.fixture
+def launch(tmp_path, monkeypatch):
+    def choose(self, launch, folder):
+        self._launch, self._lock, self.interface = launch, threading.Lock(), ROBOT
+        self._members, self._up, self._stop = {}, False, threading.Event()
+
+    monkeypatch.setattr(RobotVpn, '__init__', choose)
+    monkeypatch.setattr(RobotVpn, 'ensure', lambda self: Peer('robot', '', ROBOT.address))
+    return Launch(store=Store(tmp_path), environment={})
+
+
+def test_a_machine_is_ended_though_its_id_could_not_be_written_down(
+        launch, provider, monkeypatch):
+    save = MachineDirectory.save
+
+    def full(self, record):
+        if record.machine_id is not None:
+            raise StoreError('record.json can not be written: No space left on device')
+        save(self, record)
+
+    monkeypatch.setattr(MachineDirectory, 'save', full)
+    with pytest.raises(StoreError):
+        launch.up(SPEC)
+    assert list(provider.find({})) == []
+
+
+def test_a_machine_is_ended_whose_creation_failed_half_way(launch, provider, monkeypatch):
+    create = provider.create
+
+    def cut(spec, request):
+        create(spec, request)
+        raise ProviderError('the answer was lost')
+
+    monkeypatch.setattr(provider, 'create', cut)
+    with pytest.raises(ProviderError):
+        launch.up(SPEC)
+    assert list(provider.find({})) == []
+
+
+def kept(store, provider, **changes):
+    """Leave a machine behind, as a launch does that keeps it."""
+    spec = MachineSpec('planner', 'fake', on_exit='keep', options={'size': 1})
+    launch = Launch(store=store, environment={})
+    with store.machine('planner').lock():
+        deployment = _Deployment(launch, spec)
+        deployment._claim('token')
+        machine = Machine('fake-1', 'planner', 'fake', MachineState.PENDING, tags={
+            'fogros2-on-exit': 'keep'})
+        provider._machines['fake-1'], provider._waits['fake-1'] = machine, 0
+        deployment._save(machine_id='fake-1', launch='', pid=0, pid_start=0)
+    return spec
+
+
+@pytest.mark.parametrize(('changes', 'error', 'text'), [
+    ({'options': {'size': 2}}, NameTaken, 'another size'),
+    ({'options': {}}, NameTaken, 'another size'),
+    ({'on_exit': 'stop'}, ConfigurationError, 'not made to be stopped')])
+def test_a_kept_machine_is_not_taken_for_another(launch, provider, changes, error, text):
+    spec = kept(launch.store, provider)
+    asked = {'options': spec.options, 'on_exit': 'delete', **changes}
+    with pytest.raises(error, match=text):
+        launch.up(MachineSpec('planner', 'fake', **asked))
+    assert [machine.id for machine in provider.find({})] == ['fake-1']
+    assert launch.store.machine('planner').load().machine_id == 'fake-1'
+
+
+def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
+    syncing = threading.Event()
+
+    def join(self, *arguments):
+        assert syncing.wait(10)
+        raise VpnError('no way there')
+
+    def sync(self, *arguments):
+        syncing.set()
+        wait_until(lambda: False, timeout=60, cancel=self.cancel, what='the workspace')
+
+    stand_in = {'_create': None, '_connect': None, '_interface': None, '_arm': None,
+                '_prepare_host': None, '_configure_dds': {}}
+    for name, value in stand_in.items():
+        monkeypatch.setattr(_Deployment, name, lambda self, *_, value=value: value)
+    monkeypatch.setattr(_Deployment, '_join_vpn', join)
+    monkeypatch.setattr(_Deployment, '_sync', sync)
+    begin = time.monotonic()
+    with pytest.raises(VpnError, match='no way there'):
+        launch.up(SPEC)
+    assert time.monotonic() - begin < 20
+    assert not launch.cancel.is_set(), 'other machines of the launch go on'
+
+
+class BusyAgent(FakeStream):
+    """The agent of another launch, which has the machine."""
+
+    def write(self, data):
+        for line in data.splitlines():
+            number = json.loads(line)['id']
+            reply = {'id': number, 'ok': False, 'kind': 'busy', 'hint': '',
+                     'error': "this machine belongs to launch 'abc'"}
+            self.say(json.dumps(reply).encode() + b'\n')
+
+
+def test_a_computer_that_another_robot_uses_by_the_same_name_is_left_alone(
+        launch, provider, monkeypatch):
+    shell = FakeShell(
+        handlers={'sh': lambda command: Result(0, 'there\n', '')},
+        streams=[BusyAgent()])
+    machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False,
+                      shell=Endpoint('fake', user='fog'))
+    monkeypatch.setattr(_Deployment, '_create', lambda self, undo: machine)
+    monkeypatch.setattr(_Deployment, '_connect', lambda self, machine, undo: shell)
+    with pytest.raises(AgentError, match="belongs to launch 'abc'"):
+        launch.up(MachineSpec('planner', 'ssh'))
+    assert shell.files == {}
+    assert not [command for command in shell.commands if command.argv[0] != 'sh']
+    assert not [command for command in shell.commands if 'install' in command.argv[-1]]
+
+
+@pytest.fixture
+def mute():
+    """Return the port of a server that takes connections and never says a word."""
+    with socket.create_server(('127.0.0.1', 0), backlog=16) as server:
+        yield server.getsockname()[1]
+
+
+def reach(launch, port):
+    deployment = _Deployment(launch, MachineSpec('planner', 'ssh'))
+    machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False, shell=Endpoint(
+        'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
+    with deploy.contextlib.ExitStack() as undo:
+        deployment._connect(machine, undo)
+
+
+def test_a_login_that_nobody_answers_can_be_cancelled(launch, provider, monkeypatch, mute):
+    monkeypatch.setattr(deploy, 'LOGIN_ATTEMPT', 0.5)
+    timer = threading.Timer(0.2, launch.cancel.set)
+    timer.start()
+    begin = time.monotonic()
+    with pytest.raises(Cancelled):
+        reach(launch, mute)
+    assert time.monotonic() - begin < 15
+    timer.join()
+
+
+def test_a_login_that_is_refused_to_the_end_says_so(launch, provider, mute):
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        port = server.getsockname()[1]
+    launch.timeouts = Timeouts(ssh=0.3)
+    with pytest.raises(ConnectError, match='refuses connections'):
+        reach(launch, port)
+
+
+def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
+    seen = []
+
+    def run(command, **arguments):
+        seen.append(command)
+        if len(seen) == 1:
+            raise DeadlineExceeded('it took longer than 30 s')
+        robot._stop.set()
+        raise FogError('enough')
+
+    robot = launch._robot_vpn()
+    robot.vpn = deploy.plugin_system.load('fogros2.vpn', 'wireguard')()
+    monkeypatch.setattr(process, 'run', run)
+    monkeypatch.setattr(robot._stop, 'wait', lambda timeout: robot._stop.is_set())
+    robot._keep()
+    assert len(seen) == 2
