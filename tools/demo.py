@@ -26,7 +26,7 @@ from typing import Optional
 
 LAUNCH_FILE = ('fogros2_examples', 'talker.container.launch.py')
 HEARD = re.compile(r'I heard: \[.* from (\S+) \(([0-9a-fA-F.:]+)\): \d+\]')
-STEP = re.compile(r'\[fogros2\]: (\S+): (.+?) ([0-9.]+) s(?: \((.*)\))?$')
+STEP = re.compile(r'\[fogros2\]: (\S+): (.+?)(?: failed after)? ([0-9.]+) s(?:: .*| \((.*)\))?$')
 COLOUR = re.compile(r'\x1b\[[0-9;]*m')
 
 
