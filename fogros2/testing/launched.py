@@ -76,8 +76,15 @@ class Launched:
         self.child.send_signal(signal.SIGINT)
 
     def ended(self, timeout: float = 60.0) -> int:
-        """Wait for its end and return the exit status."""
-        code = self.child.wait(timeout)
+        """
+        Wait for its end and return the exit status.
+
+        :raises AssertionError: it goes on.
+        """
+        try:
+            code = self.child.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f'the launch goes on:\n{self.text}') from None
         self._reader.join(5.0)
         return code
 

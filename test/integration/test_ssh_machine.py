@@ -7,7 +7,6 @@ from importlib import metadata
 import json
 import os
 import shutil
-import sys
 import textwrap
 import uuid
 
@@ -15,6 +14,7 @@ import pytest
 
 from fogros2.provider import container_root
 from fogros2.testing.bare_computer import bare_computer
+from fogros2.testing.colcon_workspace import colcon_workspace
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
@@ -143,7 +143,6 @@ def test_a_killed_launch_is_cleared_up_by_its_agent(computer, launch, tmp_path):
 
 
 NODE = """\
-#!/usr/bin/env python3
 from {package}.text import TEXT
 import rclpy
 from rclpy.node import Node
@@ -159,35 +158,6 @@ rclpy.shutdown()
 """
 
 
-def colcon_workspace(root, package):
-    """Lay a Python package out as ``colcon build`` does: sources, and an isolated install."""
-    prefix = root / 'install' / package
-    version = f'python{sys.version_info.major}.{sys.version_info.minor}'
-    module = prefix / 'lib' / version / 'site-packages' / package
-    manifest = (f'<package format="3"><name>{package}</name><export>'
-                f'<build_type>ament_python</build_type></export></package>\n')
-    for path, text in {
-        root / 'install' / '.colcon_install_layout': 'isolated\n',
-        root / 'install' / 'local_setup.sh': '',
-        root / 'src' / package / 'package.xml': manifest,
-        root / 'build' / package / 'left.here': 'x' * 100_000,
-        root / '.git' / 'HEAD': 'ref: refs/heads/main\n',
-        prefix / 'share' / package / 'package.xml': manifest,
-        prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / package: '',
-        prefix / 'share' / package / 'large': 'y' * 300_000,
-        module / '__init__.py': '',
-        module / 'text.py': "TEXT = 'the first text'\n",
-        prefix / 'lib' / package / 'node': NODE.format(package=package),
-    }.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    (prefix / 'lib' / package / 'node').chmod(0o755)
-    paths = {'COLCON_PREFIX_PATH': root / 'install', 'AMENT_PREFIX_PATH': prefix,
-             'PYTHONPATH': module.parent}
-    return {name: os.pathsep.join(filter(None, (str(path), os.environ.get(name))))
-            for name, path in paths.items()}
-
-
 def listed():
     return [entry['name'] for entry in json.loads(ros2('fog', 'list', '--json').stdout)]
 
@@ -196,7 +166,9 @@ def test_a_workspace_travels_and_a_kept_computer_gets_only_what_changed(
         computer, launch, tmp_path):
     package, name = f'fogt_{RUN}', f'kept-{RUN}'
     root = tmp_path / 'a workspace'
-    variables = {**os.environ, **colcon_workspace(root, package)}
+    variables = {**os.environ, **colcon_workspace(
+        root, package, programs={'node': NODE.format(package=package)},
+        module="TEXT = 'the first text'\n")}
     parameters = tmp_path / 'parameters.yaml'
     parameters.write_text(f'{package}:\n  ros__parameters:\n    speed: 2.5\n')
     path = tmp_path / 'kept.launch.py'

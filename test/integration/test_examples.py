@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The example launch files, and one launch with most of what a launch file can ask for."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import uuid
+
+from ament_index_python.packages import get_package_share_directory
+import pytest
+
+from fogros2.testing.colcon_workspace import colcon_workspace
+from fogros2.testing.launched import launching, ros2
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+
+@pytest.fixture(autouse=True)
+def logs(tmp_path, monkeypatch):
+    """Keep what launch logs out of the user's home."""
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+
+
+@pytest.fixture
+def launch():
+    with launching() as start:
+        yield start
+
+
+def example(name):
+    return Path(get_package_share_directory('fogros2_examples'), 'launch', name)
+
+
+def clean(launch):
+    """Return whether it said nothing that would worry anybody."""
+    return launch.errors == [] and 'WARNING' not in launch.text and 'Traceback' not in launch.text
+
+
+def test_the_pair_here(launch):
+    run = launch('fogros2_examples', 'talker.local.launch.py', 'count:=2')
+    assert run.ended() == 0, run.text
+    assert run.text.count('I heard: [Hello World') >= 2
+    assert clean(run), run.text
+
+
+def test_the_demo(launch, engine):
+    name = f'demo-{RUN}'
+    run = launch('fogros2_examples', 'talker.container.launch.py', f'name:={name}', 'count:=2')
+    assert run.ended() == 0, run.text
+    assert run.text.count(f'I heard: [Hello World from {name} ') >= 2
+    assert clean(run), run.text
+    (total,) = re.findall(r'steps\n(?:.*\n)*?  .*agent +([0-9.]+)', run.text)
+    assert float(total) < 30
+
+
+def test_three_hosts_hear_each_other(launch, cloud_network, tmp_path):
+    # its names are fixed, and this computer may have such machines
+    text = example('two_clouds.launch.py').read_text()
+    for name in ('speaker', 'hearer'):
+        assert f"ContainerInstance(name='{name}')" in text
+        text = text.replace(
+            f"ContainerInstance(name='{name}')",
+            f"ContainerInstance(name='{name}-{RUN}', network='{cloud_network}')")
+    path = tmp_path / 'two_clouds.launch.py'
+    path.write_text(text)
+    run = launch(str(path))
+    said = f'I heard: [Hello World from speaker-{RUN} '
+    run.wait_for(f'[listener]: {said}')
+    run.wait_for(f'[robot_listener]: {said}')
+    assert clean(run), run.text
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert run.errors == [], run.text
+
+
+@pytest.mark.parametrize('option', ['-s', '-p'])
+@pytest.mark.parametrize('name', ['talker.container.launch.py', 'talker.ssh.launch.py',
+                                  'two_clouds.launch.py'])
+def test_looking_at_a_launch_file_makes_nothing(name, option, state_home):
+    shown = ros2('launch', str(example(name)), option, timeout=20)
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    if option == '-s' and name != 'two_clouds.launch.py':
+        assert "'count':" in shown.stdout
+    assert list(state_home.iterdir()) == []
+
+
+#: A managed node that says what it is told to do.
+MANAGED = """
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+
+class Managed(LifecycleNode):
+    def on_configure(self, state):
+        print('managed: configured', flush=True)
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state):
+        print('managed: activated', flush=True)
+        return super().on_activate(state)
+
+
+rclpy.init()
+node = Managed('managed')
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+"""
+
+#: A process that fails as soon as it has run, the third time for good.
+FAILING = """
+import os
+import sys
+
+count = len(open('/tmp/runs').read()) if os.path.exists('/tmp/runs') else 0
+open('/tmp/runs', 'a').write('x')
+print(f'failing: run {count}', flush=True)
+sys.exit(7 if count < 2 else 0)
+"""
+
+LAUNCH = """
+from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch.actions import EmitEvent, LogInfo, RegisterEventHandler
+from launch.event_handlers import OnProcessExit, OnProcessIO
+from launch_ros.actions import LifecycleNode, Node, PushROSNamespace
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState
+from launch.events import matches_action
+from lifecycle_msgs.msg import Transition
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name={name!r}, network={network!r}, ros_workspace={workspace!r})
+    hearer = CloudNode(
+        machine=machine, package='fogros2_examples', executable='listener', name='once',
+        parameters=[{{'count': 1}}])
+    second = CloudNode(
+        machine=machine, package='fogros2_examples', executable='listener', name='second',
+        parameters=[{{'count': 1}}])
+    managed = LifecycleNode(
+        package={package!r}, executable='managed', name='managed', namespace='', output='screen')
+
+    def transition(number):
+        return EmitEvent(event=ChangeState(
+            lifecycle_node_matcher=matches_action(managed), transition_id=number))
+
+    def ended(event, context):
+        return LogInfo(msg=f'once ended with {{event.returncode}} as {{event.process_name}}')
+
+    def respawned(event):
+        if b'run 2' in event.text:
+            return LogInfo(msg='respawned twice')
+
+    failing = Node(package={package!r}, executable='failing', respawn=True, respawn_delay=0.1,
+                   respawn_max_retries=2, output='screen')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
+        hearer,
+        CloudGroup(machine=machine, actions=[managed, failing]),
+        RegisterEventHandler(OnProcessExit(target_action=hearer, on_exit=ended)),
+        RegisterEventHandler(OnProcessExit(target_action=hearer, on_exit=[second])),
+        RegisterEventHandler(OnProcessExit(
+            target_action=second, on_exit=[LogInfo(msg='second ended')])),
+        RegisterEventHandler(OnProcessIO(target_action=failing, on_stdout=respawned)),
+        RegisterEventHandler(OnProcessExit(
+            target_action=hearer, on_exit=[transition(Transition.TRANSITION_CONFIGURE)])),
+        RegisterEventHandler(OnStateTransition(
+            target_lifecycle_node=managed, goal_state='inactive',
+            entities=[transition(Transition.TRANSITION_ACTIVATE)])),
+        RegisterEventHandler(OnStateTransition(
+            target_lifecycle_node=managed, goal_state='active',
+            entities=[LogInfo(msg='managed is active')])),
+    ])
+"""
+
+
+def test_a_launch_with_everything_beside_another(launch, cloud_network, tmp_path):
+    package, name = f'fogt_{RUN}', f'all-{RUN}'
+    root = tmp_path / 'workspace'
+    variables = {**os.environ, **colcon_workspace(
+        root, package, programs={'managed': MANAGED, 'failing': FAILING})}
+    path = tmp_path / 'all.launch.py'
+    path.write_text(LAUNCH.format(
+        name=name, network=cloud_network, workspace=str(root), package=package))
+    run = launch(str(path), environment=variables)
+    run.wait_for('once ended with 0 as listener-')
+    run.wait_for('second ended')
+    run.wait_for('respawned twice')
+    run.wait_for(f'[{name}.failing-', times=3)
+    run.wait_for('managed: configured')
+    run.wait_for('managed is active')
+    assert len([line for line in run.errors if 'exit code 7' in line]) == 2, run.text
+
+    # another launch on the same robot comes, is heard, and goes
+    other = launch('fogros2_examples', 'talker.container.launch.py',
+                   f'name:=other-{RUN}', 'count:=1')
+    assert other.ended() == 0, other.text
+    assert clean(other), other.text
+    assert run.child.poll() is None and len(run.errors) == 2, run.text
+
+    # another terminal joins
+    heard = subprocess.run(
+        ['sh', '-ec', f'eval "$(ros2 fog env {name})"; '
+         'exec ros2 topic echo --once /chatter std_msgs/msg/String'],
+        text=True, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
+    assert heard.returncode == 0, heard.stderr
+    assert f'data: Hello World from {name} ' in heard.stdout.replace("'", '')
+
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert len(run.errors) == 2 and 'Traceback' not in run.text, run.text
