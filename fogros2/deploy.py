@@ -440,9 +440,10 @@ class RobotVpn:
         elif not self._told_of_sudo:
             self._told_of_sudo = True
             self._launch.report(StepFailed(
-                '', 'sudo ticket', 0.0, 'sudo wants a password again, so taking this launch down will '
-                'leave its containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; '
-                'else `sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
+                '', 'sudo ticket', 0.0,
+                'sudo wants a password again, so taking this launch down will leave its '
+                'containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; else '
+                '`sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
 
     def _take_down(self) -> None:
         self._stop.set()
