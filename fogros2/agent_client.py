@@ -260,7 +260,7 @@ class AgentClient:
             self._heard = time.monotonic()
             try:
                 message = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 continue  # what a login script there says
             if not isinstance(message, dict):
                 continue
@@ -454,5 +454,5 @@ class Heartbeat:
                 if peer == self._target and answer['launch'] == self._launch_id:
                     self._round_trip = now - float(answer['t'])
                     self._answered_at = now
-            except (KeyError, TypeError, ValueError):
+            except (KeyError, TypeError, ValueError, RecursionError):
                 continue

@@ -32,6 +32,11 @@ _NOTICES = {
     'connection back': (logging.INFO, 'the connection is back'),
     'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
 }
+#: What events about a process say at the least; a machine may be hijacked and say anything.
+_SAID: dict[str, dict[str, type]] = {
+    'started': {'pid': int}, 'output': {'text': str}, 'exited': {'returncode': int},
+    'refused': {'error': str},
+}
 #: Exit status of processes whose end nobody saw.
 _UNSEEN = -9
 
@@ -198,6 +203,9 @@ class Session:
             return  # the launch's event loop is closed: nobody is left to tell
 
     def _on_event(self, event: dict[str, Any]) -> None:
+        if not _makes_sense(event):
+            self._logger.warning(f'{self.spec.name}: its agent says what makes no sense')
+            return
         run = self._runs.get(event.get('node', ''))
         if run is not None:
             run.on_event(event)
@@ -218,6 +226,18 @@ class Session:
                 continue
             run.on_event({'event': 'exited', 'returncode': returncode} if run.started else {
                 'event': 'refused', 'error': 'the launch on the machine ended'})
+
+
+def _makes_sense(event: dict[str, Any]) -> bool:
+    said = _SAID.get(event['event'], {}) if isinstance(event['event'], str) else None
+    return (
+        said is not None and isinstance(event.get('node', ''), str)
+        and isinstance(event.get('state', ''), str)
+        and isinstance(event.get('seconds', 0.0), (int, float))
+        and isinstance(event.get('returncode', 0), int)
+        and isinstance(event.get('cmd', []), list)
+        and all(isinstance(word, str) for word in event.get('cmd', []))
+        and all(isinstance(event.get(key), kind) for key, kind in said.items()))
 
 
 class _Told(dict[str, Any]):

@@ -8,6 +8,8 @@ import contextlib
 import json
 import os
 from pathlib import Path
+import re
+import stat
 import threading
 from typing import Any, ClassVar, Optional
 
@@ -67,6 +69,11 @@ for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/w
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
+
+#: What a host key's file may hold at the most, and how it has to look.
+_KEY_BYTES = 4096
+_HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
+_READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
 
 #: Ended in order, killed, and terminated.
 _GOOD_ENDS = (0, 137, 143)
@@ -289,12 +296,13 @@ class ContainerProvider(Provider):
             log = engine.call('logs', identity, what='reading the host key', check=False).stdout
             text = _after(log, container_entry.HOST_KEY_MARK)
         elif os.geteuid() == 0:
-            text = path.read_text() if path.exists() else ''
+            text = read_plain(path)
         else:
-            text = process.run(Command(('cat', str(path)), sudo=True), timeout=10.0,
-                               check=False).stdout
+            text = process.run(
+                Command(('sh', '-c', _READ_PLAIN, 'sh', str(path)), sudo=True), timeout=10.0,
+                check=False).stdout
         key = ' '.join(text.split()[:2])
-        if not key:
+        if not _HOST_KEY.fullmatch(key):
             return None
         with self._lock:
             self._host_keys[identity] = key
@@ -310,6 +318,22 @@ class ContainerProvider(Provider):
             or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
+
+
+def read_plain(path: Path) -> str:
+    """
+    Return the beginning of a file in a machine's root, '' where there is none.
+
+    The machine can lay a link to a file of this computer in its place, or a pipe that never ends.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return ''
+    with os.fdopen(handle, 'rb') as file:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            return ''
+        return file.read(_KEY_BYTES).decode(errors='replace')
 
 
 def _after(log: str, mark: str) -> str:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _DRAIN = 2.0
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 16
+#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
+MAX_LINE = 32 << 20
 
 
 class SSHShell:
@@ -261,7 +263,12 @@ class SSHStream:
     def readline(self) -> bytes:
         """Return its next line of output with the newline, b'' at the end."""
         parts = [self._buffer]
+        size = len(self._buffer)
         while b'\n' not in parts[-1]:
+            if size > MAX_LINE:
+                self.close()
+                self._buffer = b''
+                return b''
             try:
                 data = self._channel.recv(1 << 16)
             except OSError:
@@ -271,6 +278,7 @@ class SSHStream:
                 return b''.join(parts)
             self._discard_errors()
             parts.append(data)
+            size += len(data)
         line, _, self._buffer = b''.join(parts).partition(b'\n')
         return line + b'\n'
 

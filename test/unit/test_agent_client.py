@@ -98,7 +98,8 @@ def until(probe: Callable[[], Any]) -> None:
 
 def test_a_reply_goes_to_its_request(make):
     def answer(request):
-        return [b'motd of a login script\n', b'[1]\n', {'id': 999, 'ok': True},
+        return [b'motd of a login script\n', b'[1]\n', b'[' * 100_000 + b'\n',
+                {'id': 999, 'ok': True},
                 {'id': request['id'], 'ok': True, 'echo': request}]
     client = make(ScriptedStream(answer))
     assert client.request('status', x=1)['echo'] == {'id': 1, 'command': 'status', 'x': 1}
@@ -349,7 +350,7 @@ def test_heartbeats_go_out_and_come_back():
             beat = json.loads(data)
             assert (beat['launch'], beat['n']) == ('abc', number)
         assert heartbeat.round_trip is None and heartbeat.age is None
-        for nonsense in (b'', b'x', b'[]', b'{"launch": "other", "t": 0}'):
+        for nonsense in (b'', b'x', b'[]', b'[' * 2000, b'{"launch": "other", "t": 0}'):
             machine.sendto(nonsense, robot)
         machine.sendto(data, robot)
         until(lambda: heartbeat.round_trip is not None)

@@ -341,3 +341,25 @@ def test_the_ssh_server_takes_our_key_alone():
         assert line in config
     assert any(line.startswith('SetEnv') and '"A=b c"' in line for line in config)
     assert text(data, 'opt/fogros2/authorized_keys') == 'ssh-ed25519 AAAA me\n'
+
+
+def test_a_machine_cannot_lead_the_robot_elsewhere_by_its_host_key(tmp_path, monkeypatch):
+    monkeypatch.setattr(container_machine, 'ROOTS', tmp_path)
+    monkeypatch.setattr(os, 'geteuid', lambda: 0)
+    entry = {'Id': 'c' * 64, 'Config': {'Labels': {
+        container_machine.ATTEMPT: 'token', container_machine.DIRECTORY: 'x'}}}
+    path = container_machine.host_key_file('token')
+    path.parent.mkdir(parents=True)
+    provider, engine = container.ContainerProvider(), container_engine.named('podman')
+    secret = tmp_path / 'secret'
+    secret.write_text('ssh-ed25519 c2VjcmV0')
+    path.symlink_to(secret)
+    assert provider._host_key(engine, entry) is None
+    path.unlink()
+    os.mkfifo(path)
+    assert provider._host_key(engine, entry) is None
+    path.unlink()
+    path.write_text('root:*:19000: daemon:*:19000:')
+    assert provider._host_key(engine, entry) is None
+    path.write_text('ssh-ed25519 AAAA+/= fogros2\n')
+    assert provider._host_key(engine, entry) == 'ssh-ed25519 AAAA+/='
