@@ -156,6 +156,10 @@ class ObeyAgent(Action):
         except RefusedNode as error:
             self._refuse(node, str(error), error.hint)
             return
+        except OSError as error:
+            self._refuse(node, f'what travelled with {node.name} can not be written there: '
+                               f'{error.strerror or error}')
+            return
         self._by_action[id(node.process)] = node
         context.emit_event_sync(IncludeLaunchDescription(LaunchDescription([
             node.process, OpaqueFunction(function=self._executed, args=(node,))])))

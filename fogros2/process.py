@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import errno
 import os
 import shutil
 import signal
@@ -104,7 +105,7 @@ def run(
     :raises CommandError: it failed and ``check`` is set.
     :raises DeadlineExceeded: it ran out of time.
     :raises Cancelled: ``cancel`` was set while it ran.
-    :raises PrerequisiteError: there is no such program.
+    :raises PrerequisiteError: there is no such program, or it can't be started.
     """
     words = argv(command)
     begin = time.monotonic()
@@ -118,6 +119,11 @@ def run(
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
             f'sudo apt-get install {words[0]}') from error
+    except OSError as error:
+        raise PrerequisiteError(
+            f"{words[0]} can't be started on this computer: {error.strerror}",
+            'are there processes and memory left?' if isinstance(error, BlockingIOError)
+            or error.errno == errno.ENOMEM else '') from error
     output: dict[str, bytes] = {'stdout': b'', 'stderr': b''}
 
     def read(name: str) -> None:

@@ -148,13 +148,19 @@ class MachineDirectory:
         Hold the machine's name on this robot, for as long as a launch or a verb works on it.
 
         :raises NameTaken: somebody else holds it.
+        :raises StoreError: the disk is full, or the folder isn't ours.
         """
         # beside the folder, not in it: deleting the folder must not free the name half-way
         path = self.path.with_name(f'.{self.name}.lock')
         _make_folder(path.parent)
         with contextlib.ExitStack() as undo:
             while True:
-                handle = undo.enter_context(open(path, 'a'))
+                try:
+                    handle = undo.enter_context(open(path, 'a'))
+                except OSError as error:
+                    raise StoreError(
+                        f"{path} can't be written: {error.strerror}",
+                        'FOGROS2_STATE_HOME names another folder for it') from error
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -162,8 +168,9 @@ class MachineDirectory:
                         f"another launch on this robot has the machine '{self.name}'",
                         'give the machine another name=, or end that launch') from None
                 # who held it before may have removed the file that we opened meanwhile
-                if path.exists() and os.path.samestat(os.fstat(handle.fileno()), path.stat()):
-                    break
+                with contextlib.suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(handle.fileno()), path.stat()):
+                        break
             undo.callback(path.unlink, missing_ok=True)
             yield
 

@@ -151,3 +151,15 @@ def test_it_runs_as_a_launch_file_of_its_own_and_ends_with_its_agent(tmp_path):
         assert lines.readline() == b''
     assert child.wait(30) == 0
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith('files-')] == []
+
+
+def test_a_full_disk_refuses_the_node_and_nothing_else(prefix, obey, monkeypatch):
+    def full(key, text):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(obey, '_write', full)
+    told = []
+    monkeypatch.setattr(obey, '_report', lambda event, node, **data: told.append((event, data)))
+    obey._start(None, {'id': '1', 'name': 'n', 'arguments': ['true'], 'files': {'k': 'text'}})
+    (event, data), = told
+    assert event == 'refused' and 'No space left' in data['error']

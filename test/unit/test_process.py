@@ -12,7 +12,7 @@ import uuid
 import pytest
 
 from fogros2 import process
-from fogros2.errors import DeadlineExceeded
+from fogros2.errors import DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command
 from fogros2.waiting import wait_until
 
@@ -71,3 +71,12 @@ def words(entry: Path) -> bytes:
 
 def test_the_ticket_is_asked_for_without_a_question(as_user: None) -> None:
     assert process.refresh_ticket()
+
+
+def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):
+    def none_left(*arguments, **options):
+        raise BlockingIOError(11, 'Resource temporarily unavailable')
+
+    monkeypatch.setattr(process.subprocess, 'Popen', none_left)
+    with pytest.raises(PrerequisiteError, match='processes and memory'):
+        process.run(Command(('true',)), timeout=5.0)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of fogros2.store: on real files, with real processes."""
 
+import errno
 import os
 import stat
 import subprocess
@@ -76,6 +77,16 @@ def test_a_name_is_held_by_one_at_a_time(store):
     with store.machine('planner').lock():
         pass
     assert list(store.machine('planner').path.parent.iterdir()) == []
+
+
+def test_a_name_that_cannot_be_held_is_a_clear_error(store, monkeypatch):
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    monkeypatch.setattr('builtins.open', full)
+    with pytest.raises(StoreError, match='No space left'):
+        with store.machine('planner').lock():
+            pass
 
 
 def test_a_killed_holder_frees_the_name(store):
