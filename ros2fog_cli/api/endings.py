@@ -19,8 +19,9 @@ from fogros2.agent_client import AgentClient
 from fogros2.errors import (
     AgentError,
     ConfigurationError,
-    ConnectError,
+    DeadlineExceeded,
     NameTaken,
+    ShellError,
 )
 from fogros2.model import Command, MachineState, VpnInterface
 from fogros2.report import Reporter
@@ -108,6 +109,9 @@ def _leave(record: Record, *, force: bool) -> None:
             client = AgentClient(shell, record.agent, agent_path=record.agent_program,
                                  python=record.python)
             try:
+                launch = client.request('status')['launch']
+                if launch and launch != record.launch:
+                    return  # ours is gone, and another robot has the computer since
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
             except AgentError:
                 pass  # it left by itself
@@ -120,7 +124,7 @@ def _leave(record: Record, *, force: bool) -> None:
         if record.agent:
             shell.run(Command(('rm', '-rf', '--', record.agent), sudo=True,
                               what='remove the agent'), timeout=timeouts.command)
-    except ConnectError:
+    except (ShellError, DeadlineExceeded):
         if not force:
             raise
     finally:

@@ -22,6 +22,7 @@ from fogros2.errors import MachineNotFound, PrerequisiteError, ProviderError, Un
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.testing.fakes import FakeShell, FakeStream
 from ros2fog_cli.api import endings, machines, table
 from ros2fog_cli.api.machines import Entry
 
@@ -334,6 +335,26 @@ def test_gc_is_not_done_where_a_provider_can_not_be_asked(
     assert capsys.readouterr().out == \
         "could not clear machine a: the provider 'nosdk' can't be asked\n"
     assert Store().machine('a').exists()
+
+
+def test_a_computer_that_another_robot_has_by_now_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Agent(FakeStream):
+        def write(self, data: bytes) -> None:
+            for line in data.splitlines():
+                asked.append(json.loads(line)['command'])
+                self.say(json.dumps({'id': json.loads(line)['id'], 'ok': True,
+                                     'launch': 'theirs'}).encode() + b'\n')
+
+    asked: list[str] = []
+    shell = FakeShell(streams=[Agent()])
+    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    made = machine('lab', provider='untagged', owned=False)
+    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
+           agent_program='/run/fogros2/lab/agent.py', **dead())
+    assert run('delete', 'lab', '--yes') == 0
+    assert asked == ['status'] and shell.commands == []
 
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
