@@ -21,7 +21,7 @@ lint:
 
 ## bench  every benchmark; figures go to benchmarks/results
 bench:
-	@tools/setup.sh demo
+	@tools/setup.sh bench
 	@set -e; for script in benchmarks/*.py; do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
 

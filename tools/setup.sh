@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Makes this computer ready for `make demo`, `make test` or `make lint`, and says what it does.
 #
-#   tools/setup.sh demo|test|lint
+#   tools/setup.sh demo|test|lint|bench
 #
 # Touches two things: system packages, through apt and only those that are missing, and a virtual
 # environment in this folder (.venv; .venv-ros on top of ROS 2 Jazzy where that is installed).
@@ -93,7 +93,7 @@ if [ "$target" != lint ] || [ -n "$packages" ]; then
             fail "These system packages are missing, and installing them takes root:" "$packages" \
                  "As root: apt-get update && apt-get install --no-install-recommends $packages" \
                  "Then run 'make $target' again, as yourself."
-        elif [ "$target" = demo ]; then
+        elif [ "$target" != test ]; then
             fail "A container machine and a VPN interface take root: sudo or a root shell." \
                  "As a user with sudo, run this in a terminal, or after 'sudo -v'."
         else
@@ -132,6 +132,8 @@ install_packages() {
 
 mkdir -p .cache
 log=$PWD/.cache/setup.log
+# two of us at once would install into one environment
+if have flock; then exec 9>.cache/setup.lock; flock 9; fi
 : >"$log"
 if [ -n "$packages" ]; then
     if ! have apt-get; then
@@ -158,7 +160,8 @@ checksum() { sha256sum | cut -c 1-16; }
 sources_hash() {
     find setup.py setup.cfg package.xml resource launch fogros2 fogros2_examples ros2fog_cli \
         image_transport_h264 ros2_embedded -name __pycache__ -prune -o -name '*.egg-info' -prune \
-        -o -name .cache -prune -o -name '*.pyc' -o -type f -print0 2>/dev/null | sort -z | xargs -0 sha256sum | checksum
+        -o -name .cache -prune -o -name '*.pyc' -o -type f -print0 2>/dev/null \
+        | sort -z | xargs -0 sha256sum | checksum
 }
 needs_hash() { { cat setup.py ros2_embedded/setup.py tools/setup.sh; echo "$1"; } | checksum; }
 
@@ -179,6 +182,20 @@ pip_in() {
     fail "pip could not install what is needed." "Its whole output: $log"
 }
 
+# What goes in beside the package itself; each includes the one before.
+case $target in
+    demo) extras=none ;;
+    bench) extras=test,bench ;;
+    *) extras=test ;;
+esac
+# Whether an environment that has the extras $1 has those that are wanted.
+enough() {
+    case "$1 $extras" in
+        'none none'|'test none'|'test,bench '*|'test test') return 0 ;;
+        *) return 1 ;;
+    esac
+}
+
 # prepare FOLDER PYTHON OPTIONS WHAT: $5... are pip's words for what goes in
 prepare() {
     folder=$1 interpreter=$2 options=$3 what=$4
@@ -186,27 +203,35 @@ prepare() {
     needs=$(needs_hash "$interpreter $what")
     sources=$(sources_hash)
     stamp=$folder/.fogros2-stamp
-    old_needs= old_sources=
-    [ ! -f "$stamp" ] || read -r old_needs old_sources <"$stamp"
-    if [ "$old_needs $old_sources" = "$needs $sources" ] && "$folder/bin/python" -c ''; then
+    old_needs= old_sources= old_extras=
+    [ ! -f "$stamp" ] || read -r old_needs old_sources old_extras <"$stamp" || :
+    if [ "$old_needs $old_sources" = "$needs $sources" ] && enough "$old_extras" \
+            && "$folder/bin/python" -c ''; then
         return 0
     fi
     rm -f "$stamp"
     copy_sources
-    if [ "$old_needs" != "$needs" ] || ! "$folder/bin/python" -c '' 2>/dev/null; then
-        say "Making the virtual environment ${folder#"$PWD"/} ($what, $("$interpreter" -V 2>&1))"
-        [ -x "$folder/bin/python" ] && "$folder/bin/python" -c '' 2>/dev/null \
-            || "$interpreter" -m venv --clear $options "$folder"
+    if enough "$old_extras"; then now=$old_extras; else now=$extras; fi
+    if [ "$old_needs" != "$needs" ] || [ "$old_extras" != "$now" ] \
+            || ! "$folder/bin/python" -c '' 2>/dev/null; then
+        extras=$now
+        if [ -x "$folder/bin/python" ] && "$folder/bin/python" -c '' 2>/dev/null; then
+            say "Adding what 'make $target' needs to ${folder#"$PWD"/}"
+        else
+            say "Making the virtual environment ${folder#"$PWD"/} ($what," \
+                "$("$interpreter" -V 2>&1))"
+            "$interpreter" -m venv --clear $options "$folder"
+        fi
         pip_in "$folder" install 'setuptools>=70.1' wheel
-        pip_in "$folder" install --no-build-isolation "$@"
+        [ "$now" = none ] && with= || with="[$now]"
+        pip_in "$folder" install --no-build-isolation "$@$with"
     else
         say "Sources changed: installing them into ${folder#"$PWD"/} again"
     fi
     # whatever pip believes to be there already
-    for word; do set -- "$@" "${word%\[*\]}"; shift; done
     pip_in "$folder" install --no-deps --no-build-isolation --force-reinstall "$@"
     rm -rf .cache/source
-    echo "$needs $sources" >"$stamp"
+    echo "$needs $sources $now" >"$stamp"
 }
 
 ros=$(ros_setup)
@@ -215,7 +240,7 @@ if [ -z "$ros" ] || [ "$target" != demo ]; then
     (
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME
         prepare "$VENV" "$python" '' 'embedded default' \
-            .cache/source/ros2_embedded '.cache/source[test]'
+            .cache/source/ros2_embedded .cache/source
     )
 fi
 if [ -n "$ros" ] && [ "$target" != lint ]; then
@@ -224,7 +249,7 @@ if [ -n "$ros" ] && [ "$target" != lint ]; then
         interpreter=/usr/bin/python3
         "$interpreter" -c 'import rclpy' 2>/dev/null || interpreter=$(command -v python3)
         prepare "$VENV_ROS" "$interpreter" --system-site-packages "ROS 2 $ROS_DISTRO" \
-            '.cache/source[test]'
+            .cache/source
         # ROS's own ros2 has /usr/bin/python3 in its first line, which wouldn't see ours
         printf '#!%s\nimport sys\nfrom ros2cli.cli import main\nsys.exit(main())\n' \
             "$VENV_ROS/bin/python" >"$VENV_ROS/bin/ros2"
