@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.machines import CloudInstance, ContainerInstance, SSHInstance
     from fogros2.errors import FogError
+    from fogros2.image_transport.streams import StreamTopic
 
 __all__ = [
     'CloudGroup',
@@ -26,6 +27,7 @@ __all__ = [
     'FogError',
     'FogROSLaunchDescription',
     'SSHInstance',
+    'StreamTopic',
 ]
 
 _MODULES = {
@@ -36,6 +38,7 @@ _MODULES = {
     'FogError': 'fogros2.errors',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
     'SSHInstance': 'fogros2.actions.machines',
+    'StreamTopic': 'fogros2.image_transport.streams',
 }
 
 

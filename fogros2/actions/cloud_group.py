@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Optional, Union
+from collections.abc import Iterable, Sequence
+from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
+from fogros2.actions import streaming
+from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess, send
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from fogros2.image_transport.streams import Entry
 
 
 class CloudGroup(GroupAction):
@@ -27,11 +32,12 @@ class CloudGroup(GroupAction):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param actions: the content.
+    :param stream_topics: image topics that cross the VPN encoded, as at CloudNode.
     """
 
     def __init__(
         self, machine: Union[CloudInstance, str],
-        actions: Iterable[Action], **kwargs: Any,
+        actions: Iterable[Action], *, stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(list(actions), **kwargs)
         if not isinstance(machine, (CloudInstance, str)):
@@ -39,16 +45,22 @@ class CloudGroup(GroupAction):
                 f'machine={machine!r} is no machine',
                 'pass one such as ContainerInstance(), or the name of one')
         self.machine = machine
+        self.stream_topics = list(stream_topics)
+        self._streams: Sequence[Entry] = ()
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action: yields the content, its processes turned into remote ones."""
         if context.is_shutdown:
             return None
         Coordinator.of(context).know(self.machine)
+        self._streams = streaming.resolve(
+            context, self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
+        streaming.check(self._streams)
         return wrap(super().execute(context), self._send)
 
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
-        if isinstance(entity, ExecuteLocal) and not isinstance(entity, RemoteProcess):
+        if isinstance(entity, ExecuteLocal) and not isinstance(
+                entity, (RemoteProcess, RobotCarrier)):
             # before the action's own execution, which may make a ROS node in this process
             Coordinator.of(context).engage()
-            send(entity, self.machine)
+            send(entity, self.machine, self._streams)

@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Optional, Union
+from typing import Any, TYPE_CHECKING, Union
 
-from launch import LaunchContext, LaunchDescriptionEntity
+from launch import LaunchContext
 from launch_ros.actions import Node
 
-from fogros2.actions.coordinator import Coordinator
+from fogros2.actions import streaming
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess
 from fogros2.errors import ConfigurationError
-from fogros2.model import Stream
+
+if TYPE_CHECKING:
+    from fogros2.image_transport.streams import Entry
 
 
 class CloudNode(Node, RemoteProcess):
@@ -24,13 +26,13 @@ class CloudNode(Node, RemoteProcess):
     OnProcessExit and the like work with it as with a Node, wherever in the launch it stands.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
-    :param stream_topics: ``(topic, transport)`` pairs: topics that the robot publishes and the
-        node reads, encoded on their way.
+    :param stream_topics: image topics that cross the VPN encoded: ``(topic, transport)`` pairs for
+        those that the robot publishes and the machine reads, or StreamTopic.
     """
 
     def __init__(
         self, machine: Union[CloudInstance, str],
-        stream_topics: Sequence[tuple[str, str]] = (), **kwargs: Any,
+        stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(machine, (CloudInstance, str)):
@@ -40,26 +42,11 @@ class CloudNode(Node, RemoteProcess):
         self._fogros2_machine = machine
         self.stream_topics = list(stream_topics)
 
-    def streams(self, machine: str) -> list[Stream]:
-        """
-        Return the streams asked for, from the robot to ``machine``.
-
-        :raises ConfigurationError: no image transport is called so.
-        """
-        if not self.stream_topics:
-            return []
-        # the reader of entry points is slow to import, and needed for this alone
-        from fogros2 import plugin_system
-        streams = []
-        for topic, transport in self.stream_topics:
-            plugin_system.load('fogros2.image_transport', transport)
-            streams.append(Stream(topic, transport, target=machine))
-        return streams
-
-    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action: the process starts as soon as the machine is up."""
-        if context.is_shutdown:
-            return None
-        coordinator = Coordinator.of(context)
-        self.streams(coordinator.session(self._fogros2_machine).spec.name)
-        return super().execute(context)
+    def prepare(self, context: LaunchContext) -> None:
+        """Resolve the action, its streams too, whose relative names are in its namespace."""
+        super().prepare(context)
+        namespace = self.expanded_node_namespace
+        if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
+            namespace = '/'
+        self._fogros2_streams = streaming.resolve(context, self.stream_topics, namespace)
+        streaming.check(self._fogros2_streams)

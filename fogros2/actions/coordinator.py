@@ -11,7 +11,7 @@ cause, it is kept alive until all processes have ended and everything is taken d
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import difflib
 import threading
@@ -29,7 +29,7 @@ from launch.event_handlers import OnShutdown
 from launch.events.process import ShutdownProcess
 import launch.logging
 
-from fogros2.actions import private, signals
+from fogros2.actions import private, signals, streaming
 from fogros2.actions.console import Console
 from fogros2.actions.session import Session
 from fogros2.errors import Cancelled, ConfigurationError, FogError
@@ -37,6 +37,8 @@ from fogros2.errors import Cancelled, ConfigurationError, FogError
 if TYPE_CHECKING:
     from fogros2.actions.machines import CloudInstance
     from fogros2.deploy import Launch
+    from fogros2.image_transport.streams import Entry
+    from fogros2.model import NodeSpec
 
 #: Name under which ``context.locals`` has the coordinator.
 _LOCAL = 'fogros2'
@@ -100,6 +102,8 @@ class Coordinator:
         self._new: list[Session] = []
         self._begun = True
         self._late: set[str] = set()
+        self._streams = streaming.Streams()
+        self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
         self._down: Optional[asyncio.Task[None]] = None
         self._restore_signals: Callable[[], None] = _nothing
         self._logger = launch.logging.get_logger('fogros2')
@@ -179,6 +183,37 @@ class Coordinator:
         session.add(machine)
         return session
 
+    def stream_everywhere(self, entries: Sequence[Entry], namespace: str) -> None:
+        """
+        Stream topics between the robot and every machine of the launch.
+
+        :param entries: resolved when a machine's process executes.
+        :param namespace: the one that relative names are in.
+        :raises ConfigurationError: an unknown transport, or no topic.
+        """
+        streaming.check(entries)
+        if entries:
+            self._stream_everywhere.append((entries, namespace))
+
+    def stream(
+        self, entries: Iterable[Entry], session: Session,
+    ) -> list[tuple[Optional[str], NodeSpec]]:
+        """
+        Stream topics between the robot and a machine, besides what all machines stream.
+
+        :return: the nodes it takes that aren't there yet, with their machine, None for the robot.
+        :raises ConfigurationError: an unknown transport, or streams that contradict each other.
+        """
+        wanted: list[Entry] = []
+        for everywhere, namespace in self._stream_everywhere:
+            wanted += streaming.resolve(self._context, everywhere, namespace)
+        wanted += entries
+        if not wanted:
+            return []
+        new = self._streams.add(wanted, session.spec.name)
+        session.rename(self._streams.remappings(session.spec.name))
+        return new
+
     def begin(self) -> None:
         """Go on once launch has executed all that is there to execute now."""
         if self._begun:
@@ -213,7 +248,7 @@ class Coordinator:
         # what the launch sets for the robot isn't the launch file's change, and doesn't travel
         self.base_environment.update(environment)
         for action in self._processes():
-            details, ended = action.process_details, action.get_asyncio_future()
+            details, ended = action.process_details, private.completed(action)
             if details is None or ended is None or ended.done():
                 continue
             if details['env'].items() >= environment.items():
@@ -288,6 +323,8 @@ class Coordinator:
         self._cancel.set()
         if self.gate is not None and not self.gate.done():
             self.gate.set_result(False)
+        for session in self._sessions.values():
+            session.give_up()
         if self._launch is None:
             return
         self._down = context.asyncio_loop.create_task(self._take_down())
@@ -297,7 +334,7 @@ class Coordinator:
     async def _take_down(self) -> None:
         # the VPN's interface must not go from under a node that runs
         sessions = self._sessions.values()
-        futures = [action.get_asyncio_future() for action in self._processes()]
+        futures = [private.completed(action) for action in self._processes()]
         await _all_done({*futures, *(session.deployment for session in sessions)})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 import functools
-from typing import get_args, Optional, Union
+from typing import get_args, Optional, TYPE_CHECKING, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
@@ -22,13 +22,16 @@ from launch.actions import (
     UnsetLaunchConfiguration,
 )
 
-from fogros2.actions import private
+from fogros2.actions import private, streaming
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.remote import RemoteProcess
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 from fogros2.model import RobotNodes
+
+if TYPE_CHECKING:
+    from fogros2.image_transport.streams import Entry
 
 #: What only sets something for what comes after it.
 _SETTINGS = (
@@ -44,17 +47,21 @@ class FogROSLaunchDescription(LaunchDescription):
     :param robot_nodes: 'after_cloud' starts the processes and timers of the robot when the
         machines are up and their nodes run; 'immediately' starts them at once. Everything is
         executed in its order either way: only the start of a process waits.
+    :param stream_topics: image topics that cross the VPN encoded, as at CloudNode, between the
+        robot and every machine of the launch.
     """
 
     def __init__(
         self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
         deprecated_reason: Optional[str] = None, robot_nodes: RobotNodes = 'after_cloud',
+        stream_topics: Sequence[Entry] = (),
     ) -> None:
         super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(
                 f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')
         self.robot_nodes = robot_nodes
+        self.stream_topics = list(stream_topics)
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Visit the content; its robot processes wait for the cloud."""
@@ -62,9 +69,13 @@ class FogROSLaunchDescription(LaunchDescription):
         if context.is_shutdown or entities is None:
             return entities
         coordinator = Coordinator.of(context)
+        coordinator.stream_everywhere(
+            self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
         cloudy = False
         for entity, certain in cloud_entities(self.entities):
             coordinator.know(entity.machine)
+            # what comes late, from a timer, is refused before a machine is made all the same
+            streaming.check(getattr(entity, 'stream_topics', ()))
             cloudy = cloudy or certain
         if cloudy:
             # the first cloud process may come late, from a timer; the nodes here, launch's own
@@ -111,7 +122,7 @@ def _hold(
             if await coordinator.hold() and not context.is_shutdown:
                 await start(context)
                 return
-            future = entity.get_asyncio_future()
+            future = private.completed(entity)
             if future is not None and not future.done():
                 future.set_result(None)
 

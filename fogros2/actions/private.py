@@ -15,6 +15,7 @@ The names are those of Jazzy (launch 3.4) and the same in its embedded default;
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine
 import dataclasses
 from typing import Any, Optional
@@ -60,6 +61,12 @@ def prefix_output(action: ExecuteLocal, machine: str) -> None:
 
 def _private(action: ExecuteLocal, name: str) -> Any:
     return getattr(action, f'_ExecuteLocal__{name}')
+
+
+def completed(action: ExecuteLocal) -> Optional[asyncio.Future[Any]]:
+    """Return what is done once the process has ended, None before the action's execution."""
+    future: Optional[asyncio.Future[Any]] = _private(action, 'completed_future')
+    return future
 
 
 def execute_process(action: ExecuteLocal) -> Waiting:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 import signal
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -13,7 +14,7 @@ from launch.event_handlers import OnProcessIO
 from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
 import launch.logging
 
-from fogros2.actions import node_spec, private
+from fogros2.actions import carriers, node_spec, private
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
 from fogros2.errors import ConfigurationError
@@ -21,6 +22,7 @@ from fogros2.model import NodeSpec
 
 if TYPE_CHECKING:
     from fogros2.actions.session import Session
+    from fogros2.image_transport.streams import Entry
 
 #: Seconds beyond a process's own time-outs that its machine has to report the end of it.
 GRACE = 10.0
@@ -36,6 +38,7 @@ class RemoteProcess(ExecuteLocal):
     """
 
     _fogros2_machine: Union[CloudInstance, str]
+    _fogros2_streams: Sequence[Entry] = ()
     _fogros2_session: Session
     _fogros2_node: NodeSpec
 
@@ -59,13 +62,27 @@ class RemoteProcess(ExecuteLocal):
         if context.is_shutdown:
             return None
         entities = super().execute(context)
-        future = self.get_asyncio_future()
+        future = private.completed(self)
         assert future is not None
         run = RemoteRun(self, context, self._fogros2_session, self._fogros2_node, future)
         private.set_transport(self, run)
         context.register_event_handler(OnProcessIO(target_action=self, on_stdin=run.on_stdin))
         self._fogros2_session.submit(run)
-        return entities
+        return [*(entities or ()), *self._carriers(context)]
+
+    def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
+        """Return the processes that carry the streams asked for here and nowhere before."""
+        if isinstance(self, carriers.Carrier):
+            return []
+        session = self._fogros2_session
+        found: list[ExecuteLocal] = []
+        for machine, spec in Coordinator.of(context).stream(self._fogros2_streams, session):
+            if machine is None:
+                found.append(carriers.RobotCarrier(spec, session.came_up))
+            else:
+                found.append(carriers.Carrier(spec))
+                send(found[-1], self._fogros2_machine)
+        return found
 
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
         """Do nothing: the session starts the process and hands over what happens to it."""
@@ -213,12 +230,15 @@ class RemoteRun:
         self._logger.error('a process on a machine takes no input from launch')
 
 
-def send(action: ExecuteLocal, machine: Union[CloudInstance, str]) -> None:
+def send(
+    action: ExecuteLocal, machine: Union[CloudInstance, str], streams: Sequence[Entry] = (),
+) -> None:
     """
     Turn an action that hasn't been executed yet into one whose process is on ``machine``.
 
     The object stays the same one, so handlers that have it as their target go on to match.
 
+    :param streams: topics to stream between the robot and the machine, resolved.
     :raises ConfigurationError: it is of a kind that can't be sent.
     """
     try:
@@ -229,6 +249,7 @@ def send(action: ExecuteLocal, machine: Union[CloudInstance, str]) -> None:
             'take it out of the CloudGroup') from error
     assert isinstance(action, RemoteProcess)
     action._fogros2_machine = machine
+    action._fogros2_streams = streams
 
 
 _remote_classes: dict[type[ExecuteLocal], type[RemoteProcess]] = {}

@@ -11,6 +11,7 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 
 import launch.logging
 
+from fogros2.actions import streaming
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec, NodeSpec
 
@@ -74,6 +75,10 @@ class Session:
         self.instances: list[CloudInstance] = []
         self.running: Optional[RunningMachine] = None
         self.deployment: Optional[asyncio.Task[None]] = None
+        #: True when the machine is up, False when it never will be.
+        self.came_up: asyncio.Future[bool] = loop.create_future()
+        #: Topics that its nodes know by other names, for the sake of streams.
+        self.names: dict[str, str] = {}
         self._loop = loop
         self._in_thread = in_thread
         self._fail = fail
@@ -105,6 +110,23 @@ class Session:
             self.instances.append(instance)
             if self.running is not None:
                 instance.is_up(self.running)
+
+    def rename(self, names: dict[str, str]) -> None:
+        """Have nodes that start from now on know topics by other names."""
+        new = [name for name in names if name not in self.names]
+        self.names = dict(names)
+        early = [run.node.name for run in self._runs.values()
+                 if run not in self._waiting and '--ros-args' in run.node.arguments]
+        if new and early:
+            self._logger.warning(
+                f"{self.spec.name}: {', '.join(early)} started before {', '.join(new)} became a "
+                'stream and take it unencoded; use a FogROSLaunchDescription, or stream it where '
+                'the first node of the machine stands')
+
+    def give_up(self) -> None:
+        """Take it that the machine won't come up any more, if it isn't up."""
+        if not self.came_up.done():
+            self.came_up.set_result(False)
 
     # -- processes ------------------------------------------------------------------------------
 
@@ -140,6 +162,8 @@ class Session:
     def up(self, running: RunningMachine) -> None:
         """Take it that the machine is up: what waited for it starts."""
         self.running = running
+        if not self.came_up.done():
+            self.came_up.set_result(True)
         for instance in self.instances:
             instance.is_up(running)
         self._request(self._subscribe)
@@ -169,7 +193,9 @@ class Session:
             return
         try:
             async with self._order:
-                await self._in_thread(self.running.start, [run.node for run in runs])
+                await self._in_thread(
+                    self.running.start,
+                    [streaming.remapped(run.node, self.names) for run in runs])
         except FogError:
             for run in runs:
                 run.end()

@@ -5,8 +5,7 @@ from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-from fogros2.image_transport.streams import StreamTopic
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
 
 
 def generate_launch_description():

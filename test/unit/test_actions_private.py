@@ -29,6 +29,23 @@ def test_options():
     assert private.transport(action) is None
 
 
+def test_completed():
+    loop = asyncio.new_event_loop()
+    context = LaunchContext()
+    context._set_asyncio_loop(loop)
+    action = ExecuteProcess(cmd=['true'])
+    assert private.completed(action) is None
+    private.replace(action, private.EXECUTE_PROCESS, _do_nothing)
+    action.execute(context)
+    assert private.completed(action) is action.get_asyncio_future() is not None
+    loop.run_until_complete(asyncio.gather(*asyncio.all_tasks(loop)))
+    loop.close()
+
+
+async def _do_nothing(context: LaunchContext) -> None:
+    """Start no process."""
+
+
 def test_output_format():
     action = ExecuteProcess(cmd=['true'])
     private.prefix_output(action, 'planner')

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What launch files say of streams, gathered over a launch; and nodes' remappings for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+from typing import Any, Optional, TYPE_CHECKING
+
+from fogros2.actions import words
+from fogros2.errors import ConfigurationError
+from fogros2.model import NodeSpec, Stream, Text
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+
+    from fogros2.image_transport.streams import Entry, StreamTopic
+
+_RULE = ('-r', '--remap')
+_NAMESPACE = '__ns:='
+
+# the transports and the reader of entry points are slow to import, so that functions which a
+# launch without streams never calls do it
+
+
+def check(entries: Iterable[Entry]) -> None:
+    """
+    Hold entries against what there is, as far as they are plain texts already.
+
+    :raises ConfigurationError: see :func:`fogros2.image_transport.streams.stream`.
+    """
+    for entry in entries:
+        from fogros2.image_transport.streams import stream, StreamTopic
+        parts = (entry.topic, entry.transport) if isinstance(entry, StreamTopic) else entry
+        if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
+            stream(_named(entry, '/'), 'machine')
+
+
+def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) -> list[Entry]:
+    """
+    Return entries with their substitutions performed and their topics' names in full.
+
+    :param namespace: the one that relative names are in.
+    """
+    found: list[Entry] = []
+    for entry in entries:
+        from fogros2.image_transport.streams import StreamTopic
+        if isinstance(entry, tuple):
+            entry = tuple(words.resolve(context, part) for part in entry)
+        elif isinstance(entry, StreamTopic):
+            entry = StreamTopic(
+                words.resolve(context, entry.topic), words.resolve(context, entry.transport),
+                entry.direction, **{
+                    key: _parameter(context, value) for key, value in entry.parameters.items()})
+        found.append(_named(entry, namespace))
+    return found
+
+
+class Streams:
+    """The streams of a launch, and which of their nodes were handed out already."""
+
+    def __init__(self) -> None:
+        self._streams: list[Stream] = []
+        self._handed_out: set[str] = set()
+
+    def add(self, entries: Iterable[Entry], machine: str) -> list[tuple[Optional[str], NodeSpec]]:
+        """
+        Add streams between the robot and ``machine``.
+
+        :return: the nodes that they need and no earlier stream did, each with the machine that
+            it runs on, None for the robot.
+        :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or two hosts would
+            publish one topic, or one topic reach a host in two ways. Nothing was added then.
+        """
+        from fogros2.image_transport import streams
+        several = list(self._streams)
+        for entry in entries:
+            one = streams.stream(entry, machine)
+            if one not in several:
+                for other in several:
+                    _compare(one, other)
+                several.append(one)
+        needed = streams.nodes(several)
+        self._streams = several
+        new = [(machine, spec) for machine, specs in needed.items() for spec in specs
+               if spec.id not in self._handed_out]
+        self._handed_out |= {spec.id for _, spec in new}
+        return new
+
+    def remappings(self, machine: str) -> dict[str, str]:
+        """Return how the topics of the streams are renamed for nodes on a machine."""
+        if not self._streams:
+            return {}
+        from fogros2.image_transport.topics import remappings
+        return remappings(self._streams, machine)
+
+
+def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
+    """
+    Return a process that knows topics by their new names, whatever it calls them itself.
+
+    A program that takes no ROS arguments is returned as it is.
+
+    :param names: new names by the full old ones.
+    """
+    arguments = node.arguments
+    if not names or '--ros-args' not in arguments:
+        return node
+    from fogros2.image_transport.topics import rewrite
+    places: list[int] = []
+    namespace = '/'
+    ours = False
+    for index, word in enumerate(arguments):
+        if word in ('--ros-args', '--'):
+            ours = word == '--ros-args'
+        elif ours and isinstance(word, str) and ':=' in word and index and (
+                arguments[index - 1] in _RULE):
+            if word.startswith(_NAMESPACE):
+                namespace = word[len(_NAMESPACE):]
+            elif not word.startswith('__') and ':__' not in word.partition(':=')[0]:
+                places.append(index)
+    pairs: list[tuple[str, str]] = []
+    for index in places:
+        rule = arguments[index]
+        assert isinstance(rule, str)
+        old, _, new = rule.partition(':=')
+        pairs.append((old, new))
+    rules = [f'{old}:={new}' for old, new in rewrite(pairs, names, namespace)]
+    rewritten: list[Text] = list(arguments)
+    for index, rule in zip(places, rules):
+        rewritten[index] = rule
+    more = [word for rule in rules[len(places):] for word in ('-r', rule)]
+    return dataclasses.replace(
+        node, arguments=(*rewritten, *(('--ros-args', *more) if more else ())))
+
+
+def _compare(one: Stream, other: Stream) -> None:
+    if one.topic != other.topic:
+        return
+    if one.source != other.source:
+        raise ConfigurationError(
+            f'{one.topic} is streamed both from {_host(other.source)} and from '
+            f'{_host(one.source)}',
+            'a topic comes from one host: stream it where its publisher is, or rename one of them')
+    if one.target == other.target and (
+            one.transport != other.transport or one.options != other.options):
+        raise ConfigurationError(
+            f'{one.topic} is streamed to {_host(one.target)} twice, in different ways',
+            'use one transport with one set of parameters')
+
+
+def _host(machine: Optional[str]) -> str:
+    return 'the robot' if machine is None else f"'{machine}'"
+
+
+def _named(entry: Any, namespace: str) -> Any:
+    """Return an entry whose topic has its full name; what is no entry as it is."""
+    from fogros2.image_transport.streams import StreamTopic
+    from fogros2.image_transport.topics import absolute
+    if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], str) and entry[0]:
+        return (absolute(entry[0], namespace), entry[1])
+    if isinstance(entry, StreamTopic) and isinstance(entry.topic, str) and entry.topic:
+        return _with_topic(entry, absolute(entry.topic, namespace))
+    return entry
+
+
+def _with_topic(entry: StreamTopic, topic: str) -> StreamTopic:
+    from fogros2.image_transport.streams import StreamTopic
+    return StreamTopic(topic, entry.transport, entry.direction, **entry.parameters)
+
+
+def _parameter(context: LaunchContext, value: Any) -> Any:
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    text = words.resolve(context, value)
+    if not isinstance(text, str):
+        return text
+    # a substitution makes a text of every value; as in a parameter file, YAML tells its type
+    import yaml
+    typed = yaml.safe_load(text)
+    return typed if isinstance(typed, (bool, int, float)) else text

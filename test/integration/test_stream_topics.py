@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images between a robot and a machine by ``stream_topics``, as a launch file has it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import re
+import shutil
+import sys
+import uuid
+
+import pytest
+
+from fogros2.testing.launched import launching
+
+pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left', 'engine'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+    pytest.mark.skipif(shutil.which('sshd') is None, reason='needs sshd (openssh-server)'),
+]
+
+#: Other runs of this test may be under way on the same computer.
+NAME = f'stream-{uuid.uuid4().hex[:6]}'
+
+#: The user calls the topic otherwise at the node, in a group, and relative to a namespace.
+LAUNCH = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
+from launch.actions import ExecuteProcess, GroupAction, Shutdown
+from launch_ros.actions import Node, PushRosNamespace, SetRemap
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name='{name}', network='{network}', ros_workspace='')
+    return FogROSLaunchDescription([
+        GroupAction([
+            PushRosNamespace('front'),
+            SetRemap('annotated', '/seen'),
+            CloudNode(machine=machine, package='fogros2_examples', executable='image_processor',
+                      namespace='processing', remappings=[('camera', '/front/camera')],
+                      stream_topics=[('/front/camera', 'h264'),
+                                     StreamTopic('/seen', 'h264', 'to_robot')]),
+        ]),
+        Node(package='fogros2_examples', executable='camera', namespace='front'),
+        ExecuteProcess(cmd=['{python}', '{viewer}'], output='screen', on_exit=Shutdown()),
+    ])
+"""
+
+#: Sees both topics under their own names, as a viewer that knows nothing of streams does.
+VIEWER = """
+import json
+import os
+import re
+
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Image
+
+taken, seen = {}, {}
+
+
+def key(image):
+    return image.header.stamp.sec, image.header.stamp.nanosec
+
+
+def look(image):
+    taken[key(image)] = (image.header.frame_id, image.encoding, image.height, image.width,
+                         image.step, len(image.data))
+
+
+def look_back(image):
+    seen[key(image)] = (image.header.frame_id, image.encoding, image.height, image.width,
+                        image.step, len(image.data))
+    if len(seen) == 60:
+        raise SystemExit
+
+
+rclpy.init()
+node = rclpy.create_node('viewer')
+node.create_subscription(Image, '/front/camera', look, qos_profile_sensor_data)
+node.create_subscription(Image, '/seen', look_back, qos_profile_sensor_data)
+try:
+    rclpy.spin(node)
+finally:
+    both = [one for one in seen if one in taken]
+    traffic = 0
+    with open(os.environ['CYCLONEDDS_URI'].rpartition('file://')[2]) as file:
+        interface = re.search('fog[0-9a-f]{6}', file.read())[0]
+    for way in ('rx', 'tx'):
+        with open(f'/sys/class/net/{interface}/statistics/{way}_bytes') as file:
+            traffic += int(file.read())
+    print('viewer says', json.dumps({
+        'seen': len(seen), 'both': len(both), 'traffic': traffic,
+        'same': all(seen[one] == taken[one] for one in both),
+        'kinds': sorted(set(seen.values()))}), flush=True)
+"""
+
+
+def test_images_cross_encoded_both_ways(tmp_path: Path, cloud_network: str) -> None:
+    viewer = tmp_path / 'viewer.py'
+    viewer.write_text(VIEWER)
+    path = tmp_path / 'stream.launch.py'
+    path.write_text(LAUNCH.format(
+        name=NAME, network=cloud_network, python=sys.executable, viewer=viewer))
+    with launching() as launch:
+        launched = launch(str(path))
+        assert launched.ended(40.0) == 0, launched.text
+    said = re.search(r'viewer says (.*)', launched.text)
+    assert said, launched.text
+    found = json.loads(said[1])
+    assert found['kinds'] == [['camera', 'bgr8', 480, 640, 1920, 640 * 480 * 3]]
+    # of some the viewer here lost the raw one, as its QoS allows
+    assert found['same'] and found['both'] >= 50, found
+    assert not launched.errors, launched.text
+    # one raw image a direction would be 1.8 MB
+    assert 0 < found['traffic'] < found['seen'] * 200_000, found

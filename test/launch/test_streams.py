@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``stream_topics`` starts where, and what it does to remappings."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import threading
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction, RegisterEventHandler, TimerAction
+from launch.event_handlers import OnProcessExit, OnProcessStart
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node, PushROSNamespace, SetRemap
+import pytest
+
+from fogros2 import (
+    CloudGroup,
+    CloudNode,
+    ContainerInstance,
+    FogROSLaunchDescription,
+    plugin_system,
+    StreamTopic,
+)
+from fogros2.image_transport.h264 import H264
+
+BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)
+
+
+class Harmless(H264):
+    """H.264's decisions, carried out by a program that only sleeps."""
+
+    def encoder(self, stream):
+        return dataclasses.replace(
+            super().encoder(stream), package='demo', executable='talker')
+
+    def decoder(self, stream):
+        return dataclasses.replace(
+            super().decoder(stream), package='demo', executable='talker')
+
+
+@pytest.fixture(autouse=True)
+def transports(monkeypatch):
+    names, load = plugin_system.names, plugin_system.load
+    ours = 'fogros2.image_transport'
+    monkeypatch.setattr(plugin_system, 'names', lambda group: (
+        ['h264', 'raw'] if group == ours else names(group)))
+    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
+        Harmless if group == ours else load(group, name)))
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='')
+
+
+@pytest.fixture
+def mapper():
+    return ContainerInstance(name='mapper', ros_workspace='')
+
+
+def talker(machine, **kwargs):
+    return CloudNode(machine=machine, package='demo', executable='talker', exec_name='own',
+                     **kwargs)
+
+
+def own_ends(machine, node):
+    if node.name.startswith('own'):
+        machine.say('exited', node, returncode=0, respawns=False)
+
+
+def watched(fake, kind=LaunchDescription, *entities, **kwargs):
+    """Return a description that notes the starts of all processes, which machines name theirs."""
+    return kind([RegisterEventHandler(OnProcessStart(
+        on_start=lambda event, context: fake.note('starts', plain(event.process_name)))),
+        *entities], **kwargs)
+
+
+def plain(name):
+    return name.rpartition('-')[0]
+
+
+def there(fake, machine):
+    return sorted(plain(node.name) for node in fake.machines[machine].all)
+
+
+def here(fake):
+    """Return what was started on the robot: all that isn't on a machine."""
+    names = [name for name, in fake.noted('starts')]
+    for machine in fake.machines.values():
+        for node in machine.all:
+            names.remove(plain(node.name))
+    return sorted(names)
+
+
+def rules(fake, machine, name='own'):
+    node, = (node for node in fake.machines[machine].all if plain(node.name) == name)
+    words = node.arguments
+    return [word for before, word in zip(words, words[1:]) if before == '-r']
+
+
+def ends_when_all_started(fake, count):
+    """Have machines' own nodes end when ``count`` processes have started, here and there."""
+    lock = threading.Lock()
+    original = fake.note
+
+    def note(*what):
+        original(*what)
+        with lock:
+            if what[0] == 'starts' and len(fake.noted('starts')) == count:
+                for machine in fake.machines.values():
+                    for node in list(machine.all):
+                        own_ends(machine, node)
+
+    fake.note = note
+
+
+def test_both_directions(run, fake, planner):
+    """The launch ends with its own processes: those that carry its streams don't keep it."""
+    ends_when_all_started(fake, 5)
+    assert run(watched(fake, LaunchDescription, talker(
+        planner, stream_topics=[('/camera', 'h264'), BACK]))) == 0
+    assert there(fake, 'planner') == ['camera_h264_decoder', 'own', 'seen_h264_encoder']
+    assert here(fake) == ['camera_h264_encoder', 'seen_h264_decoder']
+    assert rules(fake, 'planner') == [
+        '/camera:=/fogros2/planner/camera', '/camera_info:=/fogros2/planner/camera_info',
+        '/seen:=/fogros2/planner/seen']
+    encoder, = (node for node in fake.machines['planner'].all if 'encoder' in node.name)
+    assert 'bitrate:=500000' in encoder.arguments and encoder.respawn
+    assert encoder.id.endswith('.abcdef')
+    assert 'image:=/fogros2/planner/seen' in encoder.arguments
+
+
+def test_what_the_user_remapped(run, fake, planner):
+    ends_when_all_started(fake, 3)
+    assert run(watched(fake, LaunchDescription, GroupAction([
+        PushROSNamespace('arm'), SetRemap('image', 'camera'),
+        talker(planner, remappings=[('picture', '/arm/camera'), ('a', 'b')],
+               stream_topics=[('camera', 'h264')]),
+    ]))) == 0
+    assert rules(fake, 'planner')[-5:] == [
+        'image:=/fogros2/planner/arm/camera', 'picture:=/fogros2/planner/arm/camera', 'a:=b',
+        '/arm/camera:=/fogros2/planner/arm/camera',
+        '/arm/camera_info:=/fogros2/planner/arm/camera_info']
+    # what the group says is for its nodes, not for those that carry streams
+    decoder = rules(fake, 'planner', 'arm_camera_h264_decoder')
+    assert decoder[:2] == ['__node:=arm_camera_h264_decoder',
+                           'image:=/fogros2/planner/arm/camera']
+    assert not [rule for rule in decoder if '__ns' in rule or rule.startswith('image:=camera')]
+
+
+def test_one_encoder_for_several_nodes_and_machines(run, fake, planner, mapper):
+    ends_when_all_started(fake, 6)
+    stream = [('/camera', 'h264')]
+    assert run(watched(
+        fake, FogROSLaunchDescription, talker(planner, stream_topics=stream),
+        talker(planner, stream_topics=stream), talker(mapper, stream_topics=stream))) == 0
+    assert there(fake, 'planner') == ['camera_h264_decoder', 'own', 'own']
+    assert there(fake, 'mapper') == ['camera_h264_decoder', 'own']
+    assert here(fake) == ['camera_h264_encoder']
+    assert rules(fake, 'mapper')[0] == '/camera:=/fogros2/mapper/camera'
+
+
+def test_streams_of_the_whole_launch(run, fake, planner, mapper):
+    ends_when_all_started(fake, 5)
+    assert run(watched(
+        fake, FogROSLaunchDescription,
+        DeclareLaunchArgument('x', default_value='h264'), talker(planner), talker(mapper),
+        stream_topics=[('/camera', 'h264')])) == 0
+    assert there(fake, 'planner') == there(fake, 'mapper') == ['camera_h264_decoder', 'own']
+    assert here(fake) == ['camera_h264_encoder']
+
+
+def test_streams_of_a_group(run, fake, planner):
+    """Its nodes all know the topic's new name; the robot's side of the stream stays there."""
+    ends_when_all_started(fake, 4)
+    assert run(watched(fake, FogROSLaunchDescription, CloudGroup(planner, [
+        Node(package='demo', executable='talker', exec_name='own', remappings=[('i', '/camera')]),
+        Node(package='demo', executable='talker', exec_name='own_too', namespace='arm'),
+    ], stream_topics=[('/camera', 'h264')]))) == 0
+    assert there(fake, 'planner') == ['camera_h264_decoder', 'own', 'own_too']
+    assert here(fake) == ['camera_h264_encoder']
+    assert 'i:=/fogros2/planner/camera' in rules(fake, 'planner')
+    assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_too')
+
+
+def test_a_node_without_streams_before_one_with_them(run, fake, planner):
+    """It would find the robot's topic otherwise, and take it over the VPN as it is."""
+    ends_when_all_started(fake, 4)
+    assert run(watched(
+        fake, LaunchDescription, talker(planner),
+        talker(planner, stream_topics=[('/camera', 'h264')]))) == 0
+    for node in fake.machines['planner'].all:
+        if node.name.startswith('own'):
+            assert '/camera:=/fogros2/planner/camera' in node.arguments
+
+
+def test_a_stream_that_comes_too_late_for_a_node(run, fake, planner, caplog):
+    first = talker(planner, name='first')
+    late = talker(planner, stream_topics=[('/camera', 'h264')])
+    runs_on = CloudNode(machine=planner, package='demo', executable='talker', exec_name='early')
+
+    def on_start(machine, node):
+        own_ends(machine, node)
+        if 'decoder' in node.name:
+            for other in machine.all:
+                if other.name.startswith('early'):
+                    machine.say('exited', other, returncode=0, respawns=False)
+
+    fake.on_start = on_start
+    assert run(LaunchDescription([
+        runs_on, first,
+        RegisterEventHandler(OnProcessExit(target_action=first, on_exit=[late]))])) == 0
+    assert re.search(r'planner: early-\d+ started before /camera, /camera_info became a stream',
+                     caplog.text)
+
+
+def test_the_robot_s_side_waits_for_the_machine(run, fake, planner):
+    ends_when_all_started(fake, 3)
+    fake.waits['planner'] = go = threading.Event()
+    threading.Timer(0.3, go.set).start()
+    assert run(watched(fake, LaunchDescription, talker(
+        planner, stream_topics=[('/camera', 'h264')]))) == 0
+    order = [note[0] for note in fake.notes if note[0] in ('is up', 'starts')]
+    assert order[0] == 'is up'
+
+
+def test_a_machine_that_fails_starts_nothing_here(run, fake, planner):
+    from fogros2.errors import ProviderError
+    fake.errors['planner'] = ProviderError('no room')
+    assert run(watched(fake, LaunchDescription, talker(
+        planner, stream_topics=[('/camera', 'h264')]))) == 1
+    assert not fake.noted('starts')
+
+
+@pytest.mark.parametrize('late', [False, True])
+def test_an_unknown_transport_is_refused_before_anything(run, fake, planner, late, capfd):
+    wrong = talker(planner, stream_topics=[('/camera', 'h265')])
+    assert run(FogROSLaunchDescription([
+        talker(planner), TimerAction(period=60.0, actions=[wrong]) if late else wrong])) == 1
+    said = capfd.readouterr().out
+    assert "no image transport is called 'h265' (did you mean 'h264'? there are: h264, raw)" in (
+        said)
+    assert not fake.noted('up')
+
+
+@pytest.mark.parametrize('make', [
+    lambda machine, streams: CloudGroup(machine, [talker(machine)], stream_topics=streams),
+    lambda machine, streams: FogROSLaunchDescription([talker(machine)], stream_topics=streams)])
+def test_an_unknown_transport_elsewhere(run, fake, planner, make, capfd):
+    made = make(planner, [('/camera', 'h265')])
+    assert run(made if isinstance(made, LaunchDescription) else LaunchDescription([made])) == 1
+    assert 'there are: h264, raw' in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_contradictions_are_refused_before_anything(run, fake, planner, mapper, capfd):
+    assert run(LaunchDescription([
+        talker(planner, stream_topics=[BACK]), talker(mapper, stream_topics=[BACK])])) == 1
+    assert "/seen is streamed both from 'planner' and from 'mapper'" in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+@pytest.mark.parametrize('whole', [
+    {}, {'stream_topics': [(LaunchConfiguration('topic'), 'h264')]}], ids=['node', 'launch'])
+def test_values_that_are_known_late(run, fake, planner, whole):
+    streams = [] if whole else [(LaunchConfiguration('topic'), 'h264')]
+    ends_when_all_started(fake, 3)
+    assert run(watched(
+        fake, FogROSLaunchDescription, DeclareLaunchArgument('topic', default_value='/front'),
+        talker(planner, stream_topics=streams), **whole)) == 0
+    assert here(fake) == ['front_h264_encoder']
