@@ -51,8 +51,8 @@ class Options:
         options = cls(**{
             name: str(convert(name, value, fields[name]))
             for name, value in known(given, fields, 'an SSH machine').items()})
-        if not options.host or any(c.isspace() or c in '/@' for c in options.host) \
-                or options.host.startswith('-'):
+        if any(c.isspace() or c in '/@' for c in options.host) \
+                or options.host.startswith('-') or not _is_name(options.host):
             raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",
                                      'host= takes a name or an address')
         if not options.port.isdigit() or not 0 < int(options.port) < 65536:
@@ -64,6 +64,14 @@ class Options:
         if options.key and not os.access(Path(options.key).expanduser(), os.R_OK):
             raise ConfigurationError(f"the key '{options.key}' can't be read", 'check key=')
         return options
+
+
+def _is_name(host: str) -> bool:
+    try:
+        # what a look-up does with it first: an empty label, or one too long, is no name
+        return bool(host.encode('idna'))
+    except UnicodeError:
+        return False
 
 
 class SSHProvider(Provider):

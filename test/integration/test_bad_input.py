@@ -274,6 +274,14 @@ def test_a_host_that_nobody_knows(refused, computer):
     assert "there is no host called 'planner.invalid'" in error and 'check host=' in error
 
 
+@pytest.mark.parametrize('host', ['', 'two words', 'planner..local', 'x' * 300, '-oPort=1'])
+def test_a_host_that_is_none(refused, computer, host):
+    error, text = refused(ssh(computer, host=host))
+    assert f"'{host}' can't be the host of an SSH machine" in error
+    assert 'host= takes a name or an address' in error
+    assert nothing_was_made(text)
+
+
 def test_a_port_without_an_ssh_server(refused, computer):
     error, _ = refused(ssh(computer, port=2222))
     assert 'refuses connections to port 2222' in error and 'does its SSH server run' in error
