@@ -8,6 +8,7 @@ import dataclasses
 from decimal import Decimal
 import enum
 import json
+import threading
 from typing import Any, Literal, Optional, Union
 
 OnExit = Literal['delete', 'stop', 'keep']
@@ -122,6 +123,8 @@ class CreateRequest:
     :param tags: go onto everything that the provider creates.
     :param vpn_port: UDP port to let in.
     :param agent_config: the agent's first configuration, for providers that can start it at boot.
+    :param cancel: set when the launch is ending; for a ``create`` that takes long, as for an image
+        to be downloaded: what it then raises is Cancelled.
     """
 
     token: str
@@ -129,6 +132,7 @@ class CreateRequest:
     tags: Mapping[str, str]
     vpn_port: int
     agent_config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    cancel: Optional[threading.Event] = dataclasses.field(default=None, compare=False)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -202,7 +202,8 @@ class ContainerProvider(Provider):
         what = f"creating container machine '{spec.name}' from {options.image}"
         identity = engine.call(
             'create', *words, '--user', '0:0', '--entrypoint', '/bin/sh', options.image,
-            f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0).stdout.split()[-1]
+            f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
+            cancel=request.cancel).stdout.split()[-1]
         try:
             engine.call('cp', '-', f'{identity}:/', what=what, data=archive.data())
             engine.call('start', identity, what=what)

@@ -41,7 +41,7 @@ class Engine:
         return (self.name, *self.flags, *words)
 
     def call(self, *words: str, what: str, timeout: float = 60.0, check: bool = True,
-             data: bytes = b'') -> Result:
+             data: bytes = b'', cancel: Optional[threading.Event] = None) -> Result:
         """
         Run a sub-command.
 
@@ -49,7 +49,7 @@ class Engine:
         """
         command = Command(self.argv(*words), sudo=self.sudo, input=data, what=what)
         try:
-            return process.run(command, timeout=timeout, check=check)
+            return process.run(command, timeout=timeout, check=check, cancel=cancel)
         except CommandError as error:
             raise translate(error) from error
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
@@ -10,10 +11,12 @@ from pathlib import Path
 import stat
 import subprocess
 import tarfile
+import threading
 
 import pytest
 
 from fogros2.errors import (
+    Cancelled,
     CommandError,
     ConfigurationError,
     MachineNotFound,
@@ -363,3 +366,19 @@ def test_a_machine_cannot_lead_the_robot_elsewhere_by_its_host_key(tmp_path, mon
     assert provider._host_key(engine, entry) is None
     path.write_text('ssh-ed25519 AAAA+/= fogros2\n')
     assert provider._host_key(engine, entry) == 'ssh-ed25519 AAAA+/='
+
+
+def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
+    def run(command, *, cancel=None, **more):
+        if 'create' in command.argv:
+            assert cancel is not None and cancel.is_set()
+            raise Cancelled('the download')
+        return Result(0, '', '')
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    monkeypatch.setattr(container_engine, 'select', lambda *_: container_engine.named('podman'))
+    request = dataclasses.replace(REQUEST, cancel=threading.Event())
+    request.cancel.set()
+    with pytest.raises(Cancelled):
+        container.ContainerProvider().create(
+            MachineSpec('m', 'container', {'image': 'large'}), request)
