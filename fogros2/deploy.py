@@ -695,14 +695,16 @@ class _Deployment:
         self.asked = True
         machine_id = self.provider.create(self.spec, CreateRequest(
             token=token, authorized_key=public_key, tags=tags,
-            vpn_port=plan.machine_port(self.launch.id), agent_config=config))
+            vpn_port=plan.machine_port(self.launch.id), agent_config=config,
+            cancel=self.cancel))
         self._save(machine_id=machine_id)
 
     def _claim(self, token: str) -> None:
         """Write down that this launch has the machine, before there is anything to lose."""
         pid = os.getpid()
         self._save(
-            token=token, created=self.record.created or time.time(), launch=self.launch.id,
+            token=token, created=self.record.created or time.time(), armed=time.time(),
+            launch=self.launch.id,
             pid=pid, pid_start=process_start(pid) or 0,
             robot_vpn=self.launch._robot_vpn().interface)
 

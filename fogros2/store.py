@@ -68,6 +68,7 @@ class Record:
     :param machine_id: the provider's id, None until ``create`` returned.
     :param token: uuid of the creation attempt, stored before it.
     :param created: seconds since the epoch when the creation was asked for.
+    :param armed: when its lifetime last began: a launch that reuses it begins it anew.
     :param launch: id of the launch that has the machine, '' when none has.
     :param pid: process of that launch, with ``pid_start`` (clock ticks) against reuse of ids.
     :param vpn: the machine's own VPN interface.
@@ -84,6 +85,7 @@ class Record:
     spec: MachineSpec
     token: str = ''
     created: float = 0.0
+    armed: float = 0.0
     machine_id: Optional[str] = None
     launch: str = ''
     pid: int = 0

@@ -91,11 +91,14 @@ class Entry:
     def expires(self) -> Optional[float]:
         """When its lifetime is over, in seconds since the epoch."""
         tag = self.machine.tags.get(TAG_EXPIRES, '') if self.machine is not None else ''
-        if tag.isdigit():
-            return float(tag)
-        if self.record is not None and self.record.created:
-            return self.record.created + self.record.spec.lifetime
-        return None
+        known = [float(tag)] if tag.isdigit() else []
+        record = self.record
+        if record is not None and record.armed:
+            # later than the tag, which was set at the creation, where a launch reused it
+            known.append(record.armed + record.spec.lifetime)
+        elif record is not None and record.created and not known:
+            known.append(record.created + record.spec.lifetime)
+        return max(known, default=None)
 
     @property
     def address(self) -> str:

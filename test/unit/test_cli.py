@@ -357,6 +357,15 @@ def test_a_computer_that_another_robot_has_by_now_is_left_alone(
     assert asked == ['status'] and shell.commands == []
 
 
+def test_a_machine_that_was_reused_lives_from_then_on() -> None:
+    made = machine('a', expires=NOW - 3600)
+    entry = Entry('a', 'memory', made, record('a', on_exit='keep', launch='', armed=NOW - 60))
+    assert entry.expires == NOW - 60 + entry.record.spec.lifetime
+    assert endings.why_end(entry, NOW, endings.KEEP_STOPPED) == ''
+    assert 'lifetime' in endings.why_end(
+        dataclasses.replace(entry, record=None), NOW, endings.KEEP_STOPPED)
+
+
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
     store = Store()
     for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None)):
