@@ -124,7 +124,12 @@ def ensure(
     workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
     todo = plan_alike(spec, facts, robot, under, workspace)
     if todo is None:
-        wheels = wheel_cache.collect(wheel_folder)
+        try:
+            wheels = wheel_cache.collect(wheel_folder)
+        except OSError as error:
+            raise PrerequisiteError(
+                f"what '{spec.name}' lacks can't be packed on this computer: {error}",
+                'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, workspace)
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
