@@ -32,7 +32,7 @@ class Launched:
         self.child = subprocess.Popen(
             [*_WITH_SIGINT, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
-            start_new_session=True, env=None if environment is None else dict(environment))
+            env=None if environment is None else dict(environment))
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -92,6 +92,7 @@ class Launched:
         """End it and all that it started here with SIGKILL."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.child.pid, signal.SIGKILL)
+        self.child.kill()  # it may not have come to make the group
         self.ended(10.0)
 
 
@@ -127,7 +128,8 @@ def ros2(
 
 
 #: A shell that starts something in the background has SIGINT ignored, and all that it starts.
+#: A group of its own, not a session: sudo's ticket is the terminal's, and goes for its session.
 _WITH_SIGINT: Sequence[str] = (
     sys.executable, '-c', 'import os, signal, sys; '
-    'signal.signal(signal.SIGINT, signal.default_int_handler); '
+    'os.setpgrp(); signal.signal(signal.SIGINT, signal.default_int_handler); '
     'os.execvp(sys.argv[1], sys.argv[1:])')

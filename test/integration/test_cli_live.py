@@ -22,7 +22,9 @@ pytestmark = pytest.mark.timeout(240)
 ROS2 = [sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())']
 #: A background job of a non-interactive shell ignores SIGINT, and so would its children.
 WITH_SIGINT = [
+    # a group of its own, not a session: sudo's ticket is for the terminal's
     sys.executable, '-c', 'import os, signal, sys\n'
+    'os.setpgrp()\n'
     'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
     'os.execvp(sys.argv[1], sys.argv[1:])']
 
@@ -45,8 +47,7 @@ def launched(
         child = subprocess.Popen(
             [*WITH_SIGINT, *ROS2, 'launch', 'fogros2_examples', 'talker.container.launch.py',
              f'name:={name}'], stdout=output, stderr=subprocess.STDOUT, cwd=tmp_path,
-            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path / 'ros'), 'PYTHONUNBUFFERED': '1'},
-            start_new_session=True)
+            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path / 'ros'), 'PYTHONUNBUFFERED': '1'})
     children.append(child)
     said = log.read_text
     try:

@@ -14,7 +14,8 @@ import pytest
 
 from fogros2.deploy import Launch
 from fogros2.errors import FogError, NameTaken, WorkspaceError
-from fogros2.model import MachineSpec, NodeSpec
+from fogros2.model import Command, MachineSpec, NodeSpec
+from fogros2.process import run
 from fogros2.report import StepDone, StepFailed, StepStarted
 from fogros2.store import Store
 from fogros2.waiting import wait_until
@@ -180,8 +181,7 @@ def test_a_killed_wireguard_comes_back(spec):
         machine = launch.up(spec())
         interface = launch._robot_vpn().interface.name
         before = wireguard_of(interface)
-        for pid in before:
-            os.kill(pid, 9)
+        run(Command(('sh', '-c', 'kill -9 "$@"', 'sh', *map(str, before)), sudo=True), timeout=10)
         wait_until(lambda: wireguard_of(interface) - before, timeout=20,
                    what='another wireguard-go')
         begin = time.monotonic()

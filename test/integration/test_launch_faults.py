@@ -45,6 +45,13 @@ STEPS = {
 }
 
 
+def own_group() -> None:
+    # not a session: sudo's ticket is for the terminal's
+    os.setpgrp()
+    # a shell that starts tests in the background has SIGINT ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class Launched:
     """A ``ros2 launch`` process, its output read all the time."""
 
@@ -52,9 +59,7 @@ class Launched:
         self.said: list[str] = []
         self.child = subprocess.Popen(
             ['ros2', 'launch', '--debug', str(path)], stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, start_new_session=True,
-            # a shell that starts tests in the background has SIGINT ignored
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+            stderr=subprocess.STDOUT, text=True, preexec_fn=own_group)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 

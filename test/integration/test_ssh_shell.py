@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import dataclasses
+import grp
 import os
 from pathlib import Path
 import signal
@@ -363,7 +364,18 @@ def read_until(terminal: int, text: bytes) -> bytes:
     return got
 
 
-def test_a_terminal_is_given_with_its_size_and_keys(server):
+@pytest.fixture
+def terminals(server):
+    """Skip where sshd without root can't give a terminal away: it isn't its group's already."""
+    ours, theirs = os.openpty()
+    group = os.fstat(theirs).st_gid
+    os.close(ours)
+    os.close(theirs)
+    if os.geteuid() != 0 and group != grp.getgrnam('tty').gr_gid:
+        pytest.skip("needs root, or /dev/pts mounted with tty's group as distributions do")
+
+
+def test_a_terminal_is_given_with_its_size_and_keys(server, terminals):
     ours, theirs = os.openpty()
     try:
         termios.tcsetwinsize(ours, (33, 99))
@@ -384,7 +396,7 @@ def test_a_terminal_is_given_with_its_size_and_keys(server):
         os.close(theirs)
 
 
-def test_a_login_shell_is_given(server):
+def test_a_login_shell_is_given(server, terminals):
     ours, theirs = os.openpty()
     try:
         child = subprocess.Popen(interactive(server, ''), stdin=theirs, stdout=theirs,
