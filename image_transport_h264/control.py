@@ -74,7 +74,9 @@ class Control:
                          if (governor.heard or 0) < now - SILENT and len(self._governors) > 1]:
             del self._governors[receiver]
         # each one is asked, as each one forgets what is lost
-        said = [governor.may_send(now, pixels, now - self._last_sent)
+        # after a stall images come in a burst, which says nothing of their rate
+        since = max(now - self._last_sent, 0.9 * self._interval)
+        said = [governor.may_send(now, pixels, since)
                 for governor in self._governors.values()]
         return all(said) or not self.adapt
 

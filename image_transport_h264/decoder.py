@@ -8,6 +8,7 @@ see doc/h264.md for all topics and parameters.
 
 from __future__ import annotations
 
+import functools
 from typing import Optional
 
 import rclpy
@@ -28,7 +29,8 @@ class DecoderNode(LazyNode):
         codec = str(self.declare_parameter('codec', 'h264').value)
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
         self._images = self.offer(Image, topic, IMAGE_QOS, self._listeners_changed)
-        self._receiver = make_receiver(self, codec, stream, self._images.publish)
+        self._receiver = make_receiver(
+            self, codec, stream, functools.partial(self.put_out, self._images))
         self._infos: Optional[Relay] = None
         if self.declare_parameter('camera_info', True).value:
             self._infos = Relay(self, CameraInfo, f'{stream}/{CAMERA_INFO}',
@@ -54,5 +56,8 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
+        failed = node.failed
         node.destroy_node()
         rclpy.try_shutdown()
+    if failed:
+        raise SystemExit(1)

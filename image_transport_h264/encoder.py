@@ -29,7 +29,7 @@ class EncoderNode(LazyNode):
         codec = str(self.declare_parameter('codec', 'h264').value)
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
         self._sender = make_sender(self, codec, stream, self._listeners_changed)
-        self._worker: Worker[Image] = Worker('encode', self._sender.send)
+        self._worker: Worker[Image] = Worker('encode', self._sender.send, self.fail)
         self._images = Tap(self, Image, topic, IMAGE_QOS, self._worker.put)
         # not every image has a camera that describes itself: this too only while it is wanted
         self._infos: Optional[Relay] = None
@@ -57,5 +57,8 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
+        failed = node.failed
         node.destroy_node()
         rclpy.try_shutdown()
+    if failed:
+        raise SystemExit(1)

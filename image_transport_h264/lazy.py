@@ -7,6 +7,7 @@ from collections.abc import Callable
 import threading
 from typing import Any, Optional
 
+import rclpy
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -48,6 +49,21 @@ class LazyNode(Node):
         super().__init__(name)
         self._complained: set[str] = set()
         self._complaining = threading.Lock()
+        self.failed = False
+
+    def fail(self) -> None:
+        """End the process: a node that can't do its work is to be started anew."""
+        self.failed = True
+        rclpy.try_shutdown(context=self.context)
+
+    def put_out(self, publisher: Publisher, message: Any) -> None:
+        """Publish, unless a subscriber is so slow that the middleware has no room for more."""
+        try:
+            publisher.publish(message)
+        except RuntimeError as error:  # RCLError, in rclpy's words
+            if not rclpy.ok(context=self.context):
+                return
+            self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
 
     def complain(self, cause: str, message: str) -> None:
         """Warn of a cause, the first time it comes up."""

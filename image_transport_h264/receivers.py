@@ -6,6 +6,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 import secrets
+import threading
 import time
 from typing import Optional
 
@@ -31,10 +32,11 @@ from image_transport_h264.repair import Assembler
 from image_transport_h264.worker import Worker
 
 Publish = Callable[[Image], None]
-#: A packet, and whether it came whole and not in pieces.
-Coded = tuple[Header, bytes, bool]
+Coded = tuple[Header, bytes, Optional[Tag]]
 #: Packets that may wait for the decoder; more of them means that it can't follow.
 WAITING = 8
+#: Waiting packets from which on one is acknowledged when it is decoded, and not when it comes.
+BUSY = 3
 #: Seconds after which a request for a key is repeated.
 REQUEST_INTERVAL = 0.1
 
@@ -70,7 +72,7 @@ class RawReceiver(Receiver):
     """Passes images on as they are."""
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
-        self._worker: Worker[Image] = Worker('pass', publish)
+        self._worker: Worker[Image] = Worker('pass', publish, node.fail)
         self._tap = Tap(node, Image, stream, IMAGE_QOS, self._worker.put)
 
     def want(self, wanted: bool) -> None:
@@ -87,7 +89,7 @@ class StillReceiver(Receiver):
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
         self._node, self._publish = node, publish
-        self._worker: Worker[CompressedImage] = Worker('decode', self._decode)
+        self._worker: Worker[CompressedImage] = Worker('decode', self._decode, node.fail)
         self._tap = Tap(node, CompressedImage, stream, IMAGE_QOS, self._worker.put)
 
     def want(self, wanted: bool) -> None:
@@ -122,11 +124,12 @@ class VideoReceiver(Receiver):
         self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)
         self._feedback = node.create_publisher(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', FEEDBACK_QOS)
-        self._worker: Worker[Coded] = Worker('decode', self._decode, WAITING)
+        self._worker: Worker[Coded] = Worker('decode', self._decode, node.fail, WAITING)
         self._assembler = Assembler()
         self._counted: Optional[Tag] = None
         self._acknowledged: Optional[Tag] = None
         self._lost = 0
+        self._acknowledging = threading.Lock()
         # what the network loses is repaired by pieces or a new key: waiting for it to come again
         # would hold up what has come
         self._tap = Tap(node, CompressedImage, stream, best_effort(STREAM_QOS), self._whole,
@@ -144,23 +147,38 @@ class VideoReceiver(Receiver):
         self._worker.stop()
 
     def _whole(self, coded: CompressedImage) -> None:
-        self._worker.put((coded.header, bytes(coded.data), True))
+        data = bytes(coded.data)
+        tag = peek(data)
+        if tag is not None:
+            self._count(tag)
+        self._take(coded.header, data, tag)
 
     def _piece(self, piece: UInt8MultiArray) -> None:
         whole = self._assembler.add(bytes(piece.data))
         if whole is not None:
-            self._worker.put((*message.header_and_data(whole), False))
+            header, data = message.header_and_data(whole)
+            self._take(header, data, peek(data))
+
+    def _take(self, header: Header, data: bytes, tag: Optional[Tag]) -> None:
+        # what is acknowledged at once tells of the link; if decoding is what takes long, the
+        # sender has to hear of that
+        if tag is not None and self._worker.waiting < BUSY:
+            self._acknowledge(tag)
+        self._worker.put((header, data, tag))
+
+    def _acknowledge(self, tag: Tag) -> None:
+        with self._acknowledging:
+            if self._acknowledged == tag:
+                return
+            self._acknowledged = tag
+            lost = self._lost
+        self._node.put_out(self._feedback, UInt64MultiArray(
+            data=[self._identity, tag.sequence, lost]))
 
     def _decode(self, coded: Coded) -> None:
-        header, data, whole = coded
-        tag = peek(data)
+        header, data, tag = coded
         if tag is not None:
-            if whole:
-                self._count(tag)
-            if self._acknowledged != tag:
-                self._acknowledged = tag
-                self._feedback.publish(UInt64MultiArray(
-                    data=[self._identity, tag.sequence, self._lost]))
+            self._acknowledge(tag)
         try:
             picture = self._decoder.decode(data)
         except Missing as error:
@@ -191,4 +209,4 @@ class VideoReceiver(Receiver):
         now = time.monotonic()
         if now - self._asked >= REQUEST_INTERVAL:
             self._asked = now
-            self._requests.publish(Empty())
+            self._node.put_out(self._requests, Empty())

@@ -69,12 +69,13 @@ class RawSender(Sender):
     """Passes images on as they are."""
 
     def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
+        self._node = node
         self._publisher = node.offer(Image, stream, IMAGE_QOS, changed)
         self.publishers = [self._publisher]
 
     def send(self, image: Image) -> None:
         """Publish the image."""
-        self._publisher.publish(image)
+        self._node.put_out(self._publisher, image)
 
 
 class StillSender(Sender):
@@ -97,7 +98,7 @@ class StillSender(Sender):
         except CodecError as error:
             self._node.complain(error.cause, f'image not sent: {error}')
             return
-        self._publisher.publish(CompressedImage(
+        self._node.put_out(self._publisher, CompressedImage(
             header=image.header, format=form, data=message.octets(data)))
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -114,7 +115,7 @@ class StillSender(Sender):
 PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ('bitrate', 8_000_000, 'most bits per second that the stream takes'),
     ('quality', 25.0, "libx264's constant rate factor, 0 to 51, less is better"),
-    ('preset', 'superfast', "libx264's preset"),
+    ('preset', 'auto', "libx264's preset; 'auto' goes by the size"),
     ('gop', 300, 'most pictures from one key to the next'),
     ('max_rate', 0.0, 'most pictures per second, 0 for all'),
     ('encoder', 'auto', "'auto', 'libx264' or another of FFmpeg's H.264 encoders"),
@@ -230,16 +231,16 @@ class VideoSender(Sender):
                 packet.tag.sequence, len(packet.data) + sum(map(len, again)), left)
         # the pieces first: with one lost, the packet is whole a datagram later, and not a packet
         for piece in again:
-            self._pieces.publish(UInt8MultiArray(data=message.octets(piece)))
+            self._node.put_out(self._pieces, UInt8MultiArray(data=message.octets(piece)))
         self._publish(image.header, packet)
 
     def _publish(self, header: Header, packet: Packet) -> None:
-        self._video.publish(message.compressed(header, packet))
+        self._node.put_out(self._video, message.compressed(header, packet))
         if packet.format != 'h264':
             return
         for publisher, kind, make in self._others:
             if publisher.get_subscription_count():
-                publisher.publish(make(kind, header, packet))
+                self._node.put_out(publisher, make(kind, header, packet))
 
 
 def _settings(values: dict[str, Any]) -> Settings:

@@ -16,10 +16,14 @@ class Worker(Generic[Item]):
     Hands items to ``work`` in a thread of its own.
 
     :param waiting: items that may wait; a further one pushes the oldest out.
+    :param failed: called when ``work`` has raised, which ends the thread.
     """
 
-    def __init__(self, name: str, work: Callable[[Item], None], waiting: int = 1) -> None:
-        self._work = work
+    def __init__(
+        self, name: str, work: Callable[[Item], None], failed: Callable[[], None],
+        waiting: int = 1,
+    ) -> None:
+        self._work, self._failed = work, failed
         self._items: deque[Item] = deque()
         self._waiting = waiting
         self._news = threading.Condition()
@@ -53,6 +57,15 @@ class Worker(Generic[Item]):
         self._thread.join(5.0)
 
     def _run(self) -> None:
+        stopped = False
+        try:
+            self._loop()
+            stopped = True
+        finally:
+            if not stopped:
+                self._failed()
+
+    def _loop(self) -> None:
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._items or self._stopping)
