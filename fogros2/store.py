@@ -76,7 +76,6 @@ class Record:
     :param robot_vpn: the robot's side of it.
     :param agent: the agent's folder on the machine.
     :param python: interpreter on the machine that runs the agent.
-    :param prepared: hash of what was installed and configured, for the next launch.
     :param damage: why the record can't be read, '' when it can.
     """
 
@@ -97,7 +96,6 @@ class Record:
     agent: str = ''
     agent_program: str = ''
     python: str = 'python3'
-    prepared: Mapping[str, str] = dataclasses.field(default_factory=dict)
     damage: str = ''
 
     @property

@@ -16,7 +16,6 @@ TAG_ROBOT = 'fogros2-robot'
 TAG_LAUNCH = 'fogros2-launch'
 TAG_EXPIRES = 'fogros2-expires'
 TAG_ON_EXIT = 'fogros2-on-exit'
-TAG_USER = 'fogros2-user'
 
 
 class Provider(abc.ABC):

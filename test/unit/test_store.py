@@ -28,7 +28,7 @@ def test_a_record_comes_back_as_it_was_saved(store):
     saved = record(
         shell=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
         vpn=VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k'),
-        machine_id='abc', prepared={'ros': 'x'})
+        machine_id='abc')
     directory = store.machine('planner')
     directory.save(saved)
     assert directory.load() == saved
