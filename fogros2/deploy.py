@@ -262,8 +262,8 @@ class Launch:
         on the same computer that are still coming up.
         """
         ups = list(self._ups.values())
-        if not all(up.done() for up in ups):
-            return
+        if self.ending or not all(up.done() for up in ups):
+            return  # one that is kept would be left with the process
         for machine in self.machines():
             with contextlib.suppress(FogError):  # the first start would say the same
                 machine.warm()
