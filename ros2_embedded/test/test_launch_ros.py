@@ -4,6 +4,8 @@
 import os
 from pathlib import Path
 import stat
+import subprocess
+import sys
 
 from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import GroupAction, IncludeLaunchDescription, OpaqueFunction
@@ -396,3 +398,18 @@ def test_lifecycle_events():
     assert not handler.matches(event)
     with pytest.raises(RuntimeError, match="requires a 'LifecycleNode' action"):
         OnStateTransition(target_lifecycle_node=Node(executable='x'), entities=[])
+
+
+def test_parameter_files_go_with_the_process(tmp_path):
+    code = '''
+import glob, sys
+from launch import LaunchContext
+from launch_ros.actions import Node
+node = Node(package='pkg', executable='exe', parameters=[{'a': 1}])
+node._perform_substitutions(LaunchContext())
+print(len(glob.glob(sys.argv[1] + '/launch_params_*')))
+'''
+    done = subprocess.run([sys.executable, '-c', code, str(tmp_path)], capture_output=True,
+                          text=True, timeout=60)
+    assert done.stdout.split()[-1:] == ['1'], done.stderr
+    assert not list(tmp_path.glob('launch_params_*'))
