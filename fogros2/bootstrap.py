@@ -170,10 +170,11 @@ def plan_alike(
     same = all(
         facts.environments.get(prefix, '?') == robot.environments.get(prefix)
         for prefix in under.prefixes)
-    if not same or not facts.cloud_launch or spec.bootstrap == 'apt':
+    ours = _travelling(workspace) or ((facts.cloud_launch,) if facts.cloud_launch else ())
+    if not same or not ours or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
-        'ros' if robot.has_ros else 'embedded', (under.ros2, 'launch', facts.cloud_launch),
+        'ros' if robot.has_ros else 'embedded', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
     return Preparation('none', _with_workspace(install, workspace, spec.name),
                        _tools(facts, spec.bootstrap, spec.name))
@@ -201,7 +202,7 @@ def plan(
     if facts.has_ros and (
             mode in ('auto', 'none')
             or mode == 'apt' and {'colcon', 'rosdep'} <= facts.programs):
-        todo = _ros(facts, wheels)
+        todo = _ros(facts, wheels, workspace)
     elif mode != 'apt' and wheels.embedded and wheels.key in facts.installed:
         todo = Preparation('none', _embedded_install(facts, wheels))
     elif mode == 'none':
@@ -215,7 +216,7 @@ def plan(
             'make room there' if 'are free' in no_embedded else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
-        todo = _apt(facts, wheels)
+        todo = _apt(facts, wheels, workspace)
     else:
         reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
         raise PrerequisiteError(
@@ -356,9 +357,22 @@ def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
         commands=(Command.script(script, what='install the embedded default'),))
 
 
-def _ros(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+def _travelling(workspace: Optional[workspaces.Workspace]) -> tuple[str, ...]:
+    """Return what ``ros2 launch`` takes for our launch file if the workspace brings it along."""
+    if workspace is not None and wheel_cache.OWN in workspace.packages:
+        return (wheel_cache.OWN, 'cloud.launch.py')
+    return ()
+
+
+def _ros(
+    facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+) -> Preparation:
     """Return what adds this package to a ROS that is there; plain Python, so it is unpacked."""
     prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
+    if _travelling(workspace):
+        return Preparation('none', RosInstall(
+            'ros', (f'{prefix}/bin/ros2', 'launch', *_travelling(workspace)),
+            (f'{prefix}/setup.sh',)))
     folder = _folder(facts, wheels)
     install = RosInstall(
         'ros', (f'{prefix}/bin/ros2', 'launch', f'{folder}/site/fogros2/cloud_launch.py'),
@@ -382,9 +396,11 @@ def _ros(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
         commands=(Command.script(script, what='unpack fogros2'),))
 
 
-def _apt(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+def _apt(
+    facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+) -> Preparation:
     """Return what installs ROS 2's packages, then adds this one."""
-    ours = _ros(facts, wheels)
+    ours = _ros(facts, wheels, workspace)
     commands = [_apt_install(APT_PACKAGES, f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
         commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))

@@ -62,6 +62,9 @@ print(*u.find_spec("fogros2").submodule_search_locations)' 2>/dev/null) || conti
             [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
         done
     fi
+    for w in "$e"/lib/python3*/site-packages/fogros2/cloud_launch.py; do
+        [ ! -r "$w" ] || echo "cloud_launch $w"
+    done
     s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD "$e"/share/*/package.xml \
         2>/dev/null | cksum)
     echo "environment ${s% *}-${s#* } $e"

@@ -3,13 +3,14 @@
 The robot's wheel cache: what it has installed, packed as wheels that can travel to a machine.
 
 Nothing is downloaded: an installed distribution lists its own files, and with them a wheel can be
-put together again. One installed for development is built from its sources instead.
+put together again. One installed for development is built from its sources instead. What colcon
+installs has no such list: of this package, we know what belongs to it.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 import hashlib
 from importlib import metadata
@@ -120,26 +121,44 @@ def _normal(name: str) -> str:
 
 
 def _closure() -> Iterator[metadata.Distribution]:
-    """Yield what has to travel: ours, the embedded default, pip, and all they require."""
+    """
+    Yield what has to travel: ours, the embedded default, pip, and all they require.
+
+    A robot with ROS 2 sends this package alone: a machine that takes it has ROS 2 as well.
+    """
     todo, seen = [OWN, EMBEDDED, PIP], set(_ROBOT_ONLY)
+    try:
+        metadata.distribution(EMBEDDED)
+    except metadata.PackageNotFoundError:
+        yield _own()
+        return
     while todo:
         name = todo.pop(0)
         if name in seen:
             continue
         seen.add(name)
         try:
-            distribution = metadata.distribution(name)
+            distribution = _own() if name == OWN else metadata.distribution(name)
         except metadata.PackageNotFoundError:
-            if name == OWN:
-                raise ConfigurationError(
-                    'fogros2 is not installed in this interpreter, so it has no wheel to send',
-                    'pip install it, or use `make setup`') from None
             continue  # an extra's, or another platform's
         yield distribution
         for requirement in distribution.requires or []:
             words, _, marker = requirement.partition(';')
             if 'extra' not in marker:
                 todo.append(_normal(re.split(r'[^A-Za-z0-9._-]', words.strip())[0]))
+
+
+def _own() -> metadata.Distribution:
+    try:
+        return metadata.distribution(OWN)
+    except metadata.PackageNotFoundError:
+        raise ConfigurationError(
+            'fogros2 is not installed in this interpreter, so it has no wheel to send',
+            'build it with colcon, pip install it, or use `make setup`') from None
+
+
+def _by_colcon(distribution: metadata.Distribution) -> bool:
+    return _normal(distribution.name) == OWN and distribution.read_text('WHEEL') is None
 
 
 def _sources(distribution: metadata.Distribution) -> Optional[Path]:
@@ -158,6 +177,9 @@ def _key(found: list[metadata.Distribution]) -> str:
         digest.update(f'{distribution.name} {distribution.version}\n'.encode())
         sources = _sources(distribution)
         if sources is None:
+            if _by_colcon(distribution):
+                for name, path in _installed_by_colcon(distribution, ''):
+                    digest.update(name.encode() + path.read_bytes())
             # has the hash of each file in it
             digest.update((distribution.read_text('RECORD') or '').encode())
             continue
@@ -172,26 +194,45 @@ def _wheel(distribution: metadata.Distribution, target: Path) -> str:
     sources = _sources(distribution)
     if sources is not None:
         return _build(sources, target)
+    stem = f'{distribution.name.replace("-", "_")}-{distribution.version}'
+    if _by_colcon(distribution):
+        info = f'{stem}.dist-info'
+        return _pack(target / f'{stem}-py3-none-any.whl',
+                     _installed_by_colcon(distribution, f'{stem}.data'), info, {
+            f'{info}/METADATA': distribution.read_text('PKG-INFO') or '',
+            f'{info}/WHEEL': 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n',
+            f'{info}/entry_points.txt': distribution.read_text('entry_points.txt') or '',
+        })
     if not distribution.files or distribution.read_text('WHEEL') is None:
         raise PrerequisiteError(
             f'{distribution.name} {distribution.version} was not installed by pip and has no list '
             'of its files', f'pip install --force-reinstall {distribution.name}')
-    stem = f'{distribution.name.replace("-", "_")}-{distribution.version}'
     tags = re.findall(r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)
     pythons, abis, platforms = ('.'.join(dict.fromkeys(t.split('-')[i] for t in tags))
                                 for i in range(3))
     path = target / f'{stem}-{pythons}-{abis}-{platforms}.whl'
     # the folder's own spelling wins over the one we would choose
     info = next(f.parts[0] for f in distribution.files if f.parts[0].endswith('.dist-info'))
+    return _pack(path, _contents(distribution, f'{stem}.data', info), info)
+
+
+def _pack(
+    path: Path, contents: Iterable[tuple[str, Path]], info: str, texts: Mapping[str, str] = {},
+) -> str:
+    """Write a wheel of files and texts and return its file name."""
     record = []
     with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
-        for name, source in _contents(distribution, f'{stem}.data', info):
-            data = source.read_bytes()
+        def add(name: str, data: bytes, mode: int) -> None:
             entry = zipfile.ZipInfo(name, _DATE)
-            entry.external_attr = (0o100000 | source.stat().st_mode & 0o777) << 16
+            entry.external_attr = (0o100000 | mode & 0o777) << 16
             archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
             digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b'=')
             record.append(f'{name},sha256={digest.decode()},{len(data)}')
+
+        for name, source in contents:
+            add(name, source.read_bytes(), source.stat().st_mode)
+        for name, text in texts.items():
+            add(name, text.encode(), 0o644)
         record.append(f'{info}/RECORD,,')
         archive.writestr(zipfile.ZipInfo(f'{info}/RECORD', _DATE), '\n'.join(record) + '\n')
     return path.name
@@ -201,6 +242,7 @@ def _contents(
     distribution: metadata.Distribution, data: str, info: str,
 ) -> Iterator[tuple[str, Path]]:
     """Yield the files of a wheel: name in it, place on this disk."""
+    prefix = _prefix(distribution)
     scripts = {point.name for point in distribution.entry_points
                if point.group in ('console_scripts', 'gui_scripts')}
     left_out = {f'{info}/{name}' for name in
@@ -212,12 +254,41 @@ def _contents(
         if file.parts[0] != '..':
             yield str(file), source
             continue
-        relative = source.relative_to(sys.prefix)
+        relative = source.relative_to(prefix)
         if relative.parts[0] != 'bin':
             yield f'{data}/data/{relative}', source
         elif source.name not in scripts:
             # those of entry points are made anew by whoever installs
             yield f'{data}/scripts/{source.name}', source
+
+
+def _prefix(distribution: metadata.Distribution) -> Path:
+    """Return the prefix that a distribution is installed in, as ``lib/python3/site-packages``."""
+    return Path(os.path.abspath(str(distribution.locate_file('')))).parents[2]
+
+
+def _installed_by_colcon(
+    distribution: metadata.Distribution, data: str,
+) -> Iterator[tuple[str, Path]]:
+    """Yield the files of this package where colcon has installed it: name in a wheel, place."""
+    marker = Path('share', 'ament_index', 'resource_index', 'packages')
+    prefixes = [_prefix(distribution), *map(Path, filter(
+        None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)))]
+    prefix = next((p for p in prefixes if (p / marker / OWN).is_file()), None)
+    if prefix is None:
+        raise PrerequisiteError('fogros2 is on the path, but in no ament prefix',
+                                "source the workspace's setup.bash")
+    site = Path(str(distribution.locate_file('')))
+    names = sorted((distribution.read_text('top_level.txt') or OWN).split())
+    for name in names:
+        for path in sorted((site / name).rglob('*')):
+            if path.is_file() and path.suffix != '.pyc':
+                yield str(path.relative_to(site)), path
+    for folder in (marker, *(Path(top, name) for top in ('lib', 'share') for name in names)):
+        for path in sorted((prefix / folder).rglob('*')):
+            if path.is_file() and path.suffix != '.pyc' and (
+                    folder != marker or path.name in names):
+                yield f'{data}/data/{path.relative_to(prefix)}', path
 
 
 def _build(sources: Path, target: Path) -> str:
