@@ -233,6 +233,22 @@ def test_a_key_is_sent_when_asked_for(bench: Bench) -> None:
     assert packets[-1].header.frame_id.startswith('frame ')
 
 
+def test_the_same_packets_as_others_know_them(bench: Bench) -> None:
+    """Where ffmpeg_image_transport's message is installed: the same stream, the same keys."""
+    kind = message.installed('ffmpeg_image_transport_msgs', 'FFMPEGPacket')
+    if kind is None:
+        pytest.skip('ffmpeg_image_transport_msgs is not installed')
+    bench.start('encoder', '-r', 'image:=/camera')
+    packets = bench.heard(kind, '/camera/ffmpeg')
+    bench.until(lambda: len(packets) >= 5, 'packets', meanwhile=source(bench, encoding='rgb8'))
+    first = packets[0]
+    assert (first.width, first.height, first.flags) == (WIDTH, HEIGHT, 1)
+    assert first.encoding.split(';')[0] == 'h264'
+    assert first.encoding.split(';')[-1] == 'rgb8'
+    assert [packet.pts for packet in packets] == list(range(first.pts, first.pts + len(packets)))
+    assert annexb.IDR in annexb.kinds(bytes(first.data))
+
+
 def test_after_a_loss_nothing_is_shown_until_a_key(bench: Bench) -> None:
     """The decoder asks for the key by itself, and acknowledges what comes."""
     bench.start('decoder', '-r', 'image:=/seen/camera', '-p', 'stream:=/s')

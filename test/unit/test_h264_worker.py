@@ -52,6 +52,6 @@ def test_a_thread_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_stopping_is_no_failure() -> None:
     failed = threading.Event()
-    worker = Worker('test', lambda item: None, failed.set)
+    worker: Worker[int] = Worker('test', lambda item: None, failed.set)
     worker.stop()
     assert not failed.is_set()
