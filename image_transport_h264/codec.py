@@ -476,6 +476,10 @@ def _decoder(show_damage: bool) -> VideoCodecContext:
 
 # --- pixels in and out of FFmpeg's frames -------------------------------------------------------
 
+#: PyAV before it had the option converts in one thread anyway.
+_ONE_THREAD = {'threads': 1} if 'threads' in (VideoFrame.reformat.__doc__ or '') else {}
+
+
 def _reformat(frame: VideoFrame, **options: Any) -> VideoFrame:
     """
     Convert a frame in one thread.
@@ -483,7 +487,7 @@ def _reformat(frame: VideoFrame, **options: Any) -> VideoFrame:
     swscale's slices write a few bytes past their last row (9.5, 4:2:2 of some widths): with
     several threads that row may be ready already.
     """
-    return frame.reformat(threads=1, **options)
+    return frame.reformat(**_ONE_THREAD, **options)
 
 
 def _padded(rows: Pixels, layout: Layout, even: bool) -> Pixels:
