@@ -58,13 +58,15 @@ for e in "$@"; do
         # a glob costs nothing; only a development install has it elsewhere
         for w in "$e"/lib/python3*/site-packages/fogros2; do
             [ -d "$w" ] || w=$("$e/bin/python" -c 'import importlib.util as u
-print(*u.find_spec("fogros2").submodule_search_locations)' 2>/dev/null) || continue 2
-            [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+s = u.find_spec("fogros2")
+print(*s.submodule_search_locations if s else ())' 2>/dev/null) || continue 2
+            [ -z "$w" ] || [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+        done
+    else
+        for w in "$e"/lib/python3*/site-packages/fogros2/cloud_launch.py; do
+            [ ! -r "$w" ] || echo "cloud_launch $w"
         done
     fi
-    for w in "$e"/lib/python3*/site-packages/fogros2/cloud_launch.py; do
-        [ ! -r "$w" ] || echo "cloud_launch $w"
-    done
     s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD "$e"/share/*/package.xml \
         2>/dev/null | cksum)
     echo "environment ${s% *}-${s#* } $e"
