@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from types import SimpleNamespace
 
 import pytest
@@ -48,8 +49,12 @@ def test_a_line_without_an_end_fills_no_memory(monkeypatch):
     {'event': 'launch_exited', 'returncode': []}])
 def test_an_event_that_makes_no_sense_is_left_aside(event):
     heard = []
-    session = Session(MachineSpec('planner', 'ssh'), None, in_thread=None, fail=heard.append,
-                      changed=lambda: None)
-    session._runs['n'] = SimpleNamespace(on_event=heard.append)
-    session._on_event(event)
+    loop = asyncio.new_event_loop()
+    try:
+        session = Session(MachineSpec('planner', 'ssh'), loop, in_thread=None, fail=heard.append,
+                          changed=lambda: None)
+        session._runs['n'] = SimpleNamespace(on_event=heard.append)
+        session._on_event(event)
+    finally:
+        loop.close()
     assert heard == []
