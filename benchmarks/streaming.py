@@ -175,6 +175,7 @@ class Link:
 
     def __init__(self, launch: Any, machine: Any) -> None:
         from fogros2.model import Command
+        from fogros2.waiting import wait_until
 
         self.interface = f'fog{launch.id}'
         peers = self._wg('show', self.interface, 'endpoints').split()
@@ -189,7 +190,15 @@ class Link:
             'nft add table ip fogt; nft add chain ip fogt out '
             "'{ type filter hook output priority 0; }'; "
             f'nft add rule ip fogt out udp dport {port} drop', sudo=True), timeout=20)
-        self._wg('set', self.interface, 'peer', self.key, 'endpoint', self._read()['listen'])
+        listen = self._read()['listen']
+
+        def led() -> bool:
+            # a packet under way may have led it back once more
+            if listen not in self._wg('show', self.interface, 'endpoints'):
+                self._wg('set', self.interface, 'peer', self.key, 'endpoint', listen)
+            return bool(self.change()['passed'] > 10)
+
+        wait_until(led, timeout=30.0, what='the VPN to go through the relay')
 
     def _wg(self, *words: str) -> str:
         sudo = [] if os.geteuid() == 0 else ['sudo', '-n']

@@ -477,7 +477,8 @@ def _decoder(show_damage: bool) -> VideoCodecContext:
 # --- pixels in and out of FFmpeg's frames -------------------------------------------------------
 
 #: PyAV before it had the option converts in one thread anyway.
-_ONE_THREAD: dict[str, Any] = {'threads': 1} if 'threads' in (VideoFrame.reformat.__doc__ or '') else {}
+_ONE_THREAD: dict[str, Any] = (
+    {'threads': 1} if 'threads' in (VideoFrame.reformat.__doc__ or '') else {})
 
 
 def _reformat(frame: VideoFrame, **options: Any) -> VideoFrame:
