@@ -405,10 +405,15 @@ class Timer:
 
 
 class CloudLaunch:
-    """The process that runs the nodes, and the socket to it."""
+    """
+    The process that runs the nodes, and the socket to it.
 
-    def __init__(self, pid: int, connection: socket.socket) -> None:
+    :param environment: what was configured for it when it was started.
+    """
+
+    def __init__(self, pid: int, connection: socket.socket, environment: Json) -> None:
         self.pid = pid
+        self.environment = dict(environment)
         self.socket = connection
         self.received = bytearray()
         self.out = bytearray()
@@ -938,8 +943,10 @@ class Agent:
                 'id': spec['id'], 'name': spec['name'], 'state': 'starting', 'pid': None,
                 'returncode': None, 'restarts': 0, 'grace': grace}
         if specs:
-            self._tell(launch, {
-                'command': 'start', 'nodes': specs, 'environment': self.config['environment']})
+            # not what it has from its start: the files it sourced may have added to that
+            late = {key: value for key, value in self.config['environment'].items()
+                    if launch.environment.get(key) != value}
+            self._tell(launch, {'command': 'start', 'nodes': specs, 'environment': late})
         return {'known': known}
 
     def do_stop(self, client: Client, request: Json) -> Json:
@@ -1067,7 +1074,7 @@ class Agent:
             theirs.close()
         child.returncode = 0  # the status is ours to collect: see _reap
         ours.setblocking(False)
-        launch = CloudLaunch(child.pid, ours)
+        launch = CloudLaunch(child.pid, ours, self.config['environment'])
         self.launch = launch
         self.children[child.pid] = lambda status: self._launch_exited(launch, status)
         self._select(ours, selectors.EVENT_READ, lambda mask: self._hear(launch, mask))

@@ -642,6 +642,18 @@ def test_variables_that_come_after_the_launch_process_reach_the_nodes(rig):
     assert rig.text('n') == 'yes\n'
 
 
+def test_what_setup_files_add_to_a_variable_reaches_the_nodes(rig):
+    setup = rig.folder / 'setup.bash'
+    setup.write_text('export LISTED="sourced:$LISTED"\n')
+    rig.serve(setup=[str(setup)], environment={
+        'ROS_LOG_DIR': str(rig.folder), 'LISTED': 'configured',
+        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LISTED"])\n')])
+    rig.wait('exited', node='n')
+    assert rig.text('n') == 'sourced:configured\n'
+
+
 def test_setup_files_are_sourced(rig):
     setup = rig.folder / "it's a setup.bash"
     setup.write_text('export SOURCED="from ${BASH_SOURCE[0]##*/} $#"\n')
