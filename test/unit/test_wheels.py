@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a robot sends whose FogROS2 came by colcon, which writes no list of files."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import metadata
+from pathlib import Path
+import zipfile
+
+import pytest
+
+from fogros2 import bootstrap, wheels
+from fogros2.errors import PrerequisiteError
+from fogros2.host import HostFacts, Python
+from fogros2.model import MachineSpec
+from fogros2.plan import Underlay
+from fogros2.wheels import Wheels
+from fogros2.workspace import inspect
+
+INDEX = 'share/ament_index/resource_index/packages'
+
+
+def install(root: Path) -> Path:
+    """Lay this package out as colcon's isolated install space has it; return the prefix."""
+    prefix = root / 'install' / 'fogros2'
+    site = prefix / 'lib' / 'python3.12' / 'site-packages'
+    info = site / 'fogros2-0.1.0-py3.12.egg-info'
+    for path, text in {
+        root / 'install' / '.colcon_install_layout': 'isolated\n',
+        root / 'src' / 'fogros2' / 'package.xml':
+            '<package format="3"><name>fogros2</name></package>',
+        site / 'fogros2' / '__init__.py': '',
+        site / 'fogros2' / 'cloud_launch.py': 'x = 1\n',
+        site / 'fogros2' / '__pycache__' / 'cloud_launch.cpython-312.pyc': 'no\n',
+        site / 'fogros2_examples' / 'talker.py': '',
+        site / 'other' / '__init__.py': 'not ours\n',
+        info / 'PKG-INFO': 'Metadata-Version: 2.1\nName: fogros2\nVersion: 0.1.0\n',
+        info / 'top_level.txt': 'fogros2\nfogros2_examples\n',
+        info / 'entry_points.txt': '[fogros2.dds]\nx = fogros2:y\n',
+        info / 'SOURCES.txt': 'setup.py\nfogros2/__init__.py\n',
+        prefix / INDEX / 'fogros2': '',
+        prefix / INDEX / 'fogros2_examples': '',
+        prefix / INDEX / 'other': '',
+        prefix / 'share' / 'fogros2' / 'launch' / 'cloud.launch.py': '',
+        prefix / 'lib' / 'fogros2_examples' / 'talker': '#!/usr/bin/env python3\n',
+    }.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (prefix / 'lib' / 'fogros2_examples' / 'talker').chmod(0o755)
+    return prefix
+
+
+@pytest.fixture
+def colcon(tmp_path, monkeypatch):
+    """Have this package installed by colcon, beside a ROS 2 without the embedded default."""
+    prefix = install(tmp_path / 'ws')
+    (info,) = prefix.glob('lib/*/site-packages/*.egg-info')
+
+    def distribution(name):
+        if name != 'fogros2':
+            raise metadata.PackageNotFoundError(name)
+        return metadata.PathDistribution(info)
+
+    monkeypatch.setattr(wheels.metadata, 'distribution', distribution)
+    return prefix
+
+
+def test_a_wheel_is_made_of_what_colcon_installed(colcon, tmp_path):
+    packed = wheels.collect(tmp_path / 'cache')
+    assert (packed.fogros2, packed.pip, packed.embedded) == (
+        'fogros2-0.1.0-py3-none-any.whl', '', False)
+    with zipfile.ZipFile(Path(packed.folder, packed.fogros2)) as archive:
+        assert set(archive.namelist()) == {
+            'fogros2/__init__.py', 'fogros2/cloud_launch.py', 'fogros2_examples/talker.py',
+            *(f'fogros2-0.1.0.data/data/{path}' for path in (
+                f'{INDEX}/fogros2', f'{INDEX}/fogros2_examples',
+                'share/fogros2/launch/cloud.launch.py', 'lib/fogros2_examples/talker')),
+            *(f'fogros2-0.1.0.dist-info/{name}' for name in (
+                'METADATA', 'WHEEL', 'RECORD', 'entry_points.txt'))}
+        assert b'Name: fogros2' in archive.read('fogros2-0.1.0.dist-info/METADATA')
+        talker = archive.getinfo('fogros2-0.1.0.data/data/lib/fogros2_examples/talker')
+        assert talker.external_attr >> 16 & 0o111
+
+
+def test_another_content_is_another_wheel(colcon, tmp_path):
+    first = wheels.collect(tmp_path / 'cache')
+    assert wheels.collect(tmp_path / 'cache').key == first.key
+    (module,) = colcon.glob('lib/*/site-packages/fogros2/cloud_launch.py')
+    module.write_text('x = 2\n')
+    assert wheels.collect(tmp_path / 'cache').key != first.key
+
+
+def test_a_path_without_the_set_up_script_is_told(colcon, tmp_path, monkeypatch):
+    (colcon / INDEX / 'fogros2').unlink()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    with pytest.raises(PrerequisiteError, match='in no ament prefix.*setup.bash'):
+        wheels.collect(tmp_path / 'cache')
+
+
+def test_a_workspace_with_this_package_brings_the_launch_file_along(tmp_path):
+    root = tmp_path / 'ws'
+    install(root)
+    workspace = inspect(root)
+    robot = HostFacts(
+        'ubuntu', '24.04', 'noble', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
+        (Python('/usr/bin/python3', (3, 12), True),),
+        frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
+        {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_cyclonedds_cpp',)},
+        environments={'/opt/ros/jazzy': '1-1'})
+    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {
+        'AMENT_PREFIX_PATH': f'{root}/install/fogros2:/opt/ros/jazzy'})
+    spec = MachineSpec('m', 'ssh', workspace=str(root))
+    alike = bootstrap.plan_alike(spec, robot, robot, under, workspace)
+    assert alike is not None
+    assert alike.install.command == (
+        '/opt/ros/jazzy/bin/ros2', 'launch', 'fogros2', 'cloud.launch.py')
+
+    # a machine with a ROS 2 of its own needs no wheel either
+    other = dataclasses.replace(robot, environments={})
+    packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', embedded=False)
+    todo = bootstrap.plan(spec, other, robot, under, packed, workspace)
+    assert not todo.send_wheels and todo.commands == ()
+    assert todo.install.command == alike.install.command
+    assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
+    assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{root}/install/fogros2'
