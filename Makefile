@@ -2,12 +2,17 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench soak clean
+.PHONY: help setup demo demo-video test lint bench soak clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
 	@tools/setup.sh demo
 	@tools/run.sh best -- python tools/demo.py
+
+## demo-video   the figures of a short run of H.264 and other transports over a slow link
+demo-video:
+	@tools/setup.sh bench
+	@tools/run.sh best -- python benchmarks/streaming.py --short
 
 ## test   all tests, on the embedded default and, where it is installed, on ROS 2
 test:
@@ -22,7 +27,7 @@ lint:
 ## bench  every benchmark; figures go to benchmarks/results
 bench:
 	@tools/setup.sh bench
-	@set -e; for script in benchmarks/*.py; do \
+	@set -e; for script in $(filter-out benchmarks/theora.py,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
 
 ## soak   the long tests that 'make test' leaves out

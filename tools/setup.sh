@@ -68,6 +68,8 @@ sshd openssh-server
 ssh openssh-client
 sudo sudo
 LIST
+    # FFmpeg's own programs judge the streams that ours make
+    [ "$target" = demo ] || have ffmpeg || echo ffmpeg
     # Podman's networks: netavark since 4.0, the CNI plugins before; its package may bring neither.
     if ! [ -x /usr/lib/podman/netavark ] && ! [ -x /usr/libexec/podman/netavark ] \
             && ! [ -x /usr/lib/cni/bridge ] && ! [ -x /usr/libexec/cni/bridge ]; then
