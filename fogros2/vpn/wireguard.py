@@ -254,7 +254,8 @@ for each in $(grep -lsxz {name} /proc/[0-9]*/cmdline); do
   kill -9 ${{each#/proc/}} || :
 done
 rm -f {socket}
-[ ! -e /sys/class/net/{name} ] || ip link delete dev {name}"""
+# somebody else, an agent say, may take it away at the same moment
+ip link delete dev {name} 2>/dev/null || [ ! -e /sys/class/net/{name} ]"""
     return _Step(do, undo)
 
 

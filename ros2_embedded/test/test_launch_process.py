@@ -3,6 +3,7 @@
 
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -119,7 +120,8 @@ def test_output_destinations(capsys, tmp_path):
     out = capsys.readouterr().out
     assert '] full' in out and '] dict' not in out and '<formatted>' in out.splitlines()
     directory = next((tmp_path / 'log').glob('*/launch.log')).parent
-    texts = {path.name.partition('-')[0] + path.name[path.name.index('-') + 2:]: path.read_text()
+    # the number that launch gave the process has as many digits as there were processes before
+    texts = {re.sub(r'-\d+', '', path.name, count=1): path.read_text()
              for path in directory.glob('[ab]-*.log')}
     assert all('full' in texts[name] for name in ('a.log', 'a-stdout.log'))
     assert 'dict' in texts['b-stdout.log']

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import ipaddress
 import os
 from pathlib import Path
 import subprocess
@@ -103,6 +104,15 @@ def cloud_network(engine: str) -> Iterator[str]:
         pytest.fail(f'no subnet for the tests is free: {made.stderr}')
     yield name
     run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
+
+
+@pytest.fixture(scope='session')
+def nobody(engine: str, cloud_network: str) -> str:
+    """Return an address in the cloud's network that no machine has."""
+    subnet = run(Command((engine, 'network', 'inspect', cloud_network, '--format',
+                          '{{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60).stdout
+    # the engine hands addresses out from the other end
+    return str(list(ipaddress.ip_network(subnet.strip()).hosts())[-1])
 
 
 @pytest.fixture

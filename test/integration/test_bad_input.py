@@ -264,9 +264,9 @@ def test_a_missing_program(refused, cloud_network, program):
 
 # -- computers that exist already ---------------------------------------------------------------
 
-def test_an_unreachable_host(refused, computer):
-    error, text = refused(ssh(computer, host='198.51.100.254'))
-    assert '198.51.100.254 port 22 does not answer' in error and 'is it on' in error
+def test_an_unreachable_host(refused, computer, nobody):
+    error, text = refused(ssh(computer, host=nobody))
+    assert f'{nobody} port 22 does not answer' in error and 'is it on' in error
 
 
 def test_a_host_that_nobody_knows(refused, computer):
