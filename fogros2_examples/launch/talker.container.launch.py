@@ -5,22 +5,16 @@ from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2 import FogROSLaunchDescription
+from fogros2_examples.choice import talker
 
 
 def generate_launch_description():
-    """Describe the demo; ``count:=20`` ends it after 20 messages."""
-    machine = ContainerInstance(
-        name=LaunchConfiguration('name'), on_exit=LaunchConfiguration('on_exit'))
+    """Describe the pair; ``count:=20`` ends it after 20 messages, ``machine:=local`` is here."""
     return FogROSLaunchDescription([
-        DeclareLaunchArgument('name', default_value='talker-machine',
-                              description='what the machine is called'),
-        DeclareLaunchArgument('on_exit', default_value='delete',
-                              description='what becomes of it: delete, stop or keep'),
+        *talker('container', 'talker-machine'),
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),
-        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
-                  output='screen'),
         Node(package='fogros2_examples', executable='listener', output='screen',
              parameters=[{'count': LaunchConfiguration('count')}], on_exit=Shutdown()),
     ])

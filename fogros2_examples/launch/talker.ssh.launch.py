@@ -5,31 +5,16 @@ from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+from fogros2 import FogROSLaunchDescription
+from fogros2_examples.choice import talker
 
 
 def generate_launch_description():
-    """Describe the pair: ``host:=planner.local user:=robot``."""
-    machine = SSHInstance(
-        host=LaunchConfiguration('host'), user=LaunchConfiguration('user'),
-        port=LaunchConfiguration('port'), key=LaunchConfiguration('key'),
-        host_key=LaunchConfiguration('host_key'), bootstrap=LaunchConfiguration('bootstrap'),
-        name=LaunchConfiguration('name'))
+    """Describe the pair; ``host:=planner.local user:=robot`` says which computer."""
     return FogROSLaunchDescription([
-        DeclareLaunchArgument('host', description='name or address of the computer'),
-        DeclareLaunchArgument('user', default_value='', description='login user there'),
-        DeclareLaunchArgument('port', default_value='22', description='port of its SSH server'),
-        DeclareLaunchArgument('key', default_value='', description='private key to log in with'),
-        DeclareLaunchArgument('host_key', default_value='',
-                              description='its public host key; known_hosts decides without'),
-        DeclareLaunchArgument('bootstrap', default_value='auto',
-                              description='how ROS 2 gets there: auto, apt, embedded or none'),
-        DeclareLaunchArgument('name', default_value='ssh-machine',
-                              description='what the machine is called'),
+        *talker('ssh', 'ssh-machine'),
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),
-        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
-                  output='screen'),
         Node(package='fogros2_examples', executable='listener', output='screen',
              parameters=[{'count': LaunchConfiguration('count')}], on_exit=Shutdown()),
     ])

@@ -83,6 +83,14 @@ def test_three_hosts_hear_each_other(launch, cloud_network, tmp_path):
     assert run.errors == [], run.text
 
 
+def test_the_machine_is_chosen_at_launch_time(launch):
+    run = launch('fogros2_examples', 'talker.container.launch.py', 'machine:=local', 'count:=2')
+    assert run.ended() == 0, run.text
+    assert run.text.count('I heard: [Hello World') >= 2
+    assert '[fogros2]' not in run.text, 'a machine was made'
+    assert clean(run), run.text
+
+
 @pytest.mark.parametrize('option', ['-s', '-p'])
 @pytest.mark.parametrize('name', ['talker.container.launch.py', 'talker.ssh.launch.py',
                                   'two_clouds.launch.py'])
