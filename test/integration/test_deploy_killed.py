@@ -36,7 +36,7 @@ signal.pause()
 def test_the_next_launch_takes_the_kept_machine_of_a_killed_one(cloud_network):
     name = f'killed-{uuid.uuid4().hex[:6]}'
     first = subprocess.Popen([sys.executable, '-c', KILLED, name, cloud_network],
-                             stdout=subprocess.PIPE, start_new_session=True)
+                             stdout=subprocess.PIPE, preexec_fn=os.setpgrp)
     assert first.stdout is not None
     interface = first.stdout.readline().decode().strip()
     first.send_signal(signal.SIGKILL)

@@ -50,7 +50,8 @@ class Child:
         words = process.argv(Command(tuple(argv), sudo=True))
         self.process = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
-            start_new_session=True)
+            # a group and no session of its own: sudo's ticket is the terminal's
+            preexec_fn=os.setpgrp)
         self.said: list[dict[str, Any]] = []
         self._news = threading.Condition()
         self._thread = threading.Thread(target=self._read, daemon=True)
