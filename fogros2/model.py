@@ -14,6 +14,7 @@ from typing import Any, Literal, Optional, Union
 OnExit = Literal['delete', 'stop', 'keep']
 Bootstrap = Literal['auto', 'apt', 'embedded', 'none']
 RobotNodes = Literal['after_cloud', 'immediately']
+OnInterrupt = Literal['shutdown', 'robot']
 
 #: Seconds a machine lives at the most unless its launch file says otherwise.
 DEFAULT_LIFETIME = 8 * 3600.0
@@ -48,6 +49,8 @@ class MachineSpec:
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
     :param environment: variables set for every node on the machine.
     :param containers: ``docker run`` command lines started before the nodes.
+    :param on_interrupt: when the provider takes the machine away while its nodes run: end the
+        launch, or run the nodes on the robot.
     """
 
     name: str
@@ -62,6 +65,7 @@ class MachineSpec:
     containers: tuple[str, ...] = ()
     launch_foxglove: bool = False
     vpn: str = 'wireguard'
+    on_interrupt: OnInterrupt = 'shutdown'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +97,14 @@ class Machine:
     :param id: opaque to the core; carries its place (region, context, engine).
     :param created: seconds since the epoch, or None where the provider does not know.
     :param shell: None until the machine can be reached.
-    :param vpn_host: address at which the robot reaches the machine's VPN port (UDP).
+    :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' where it
+        can't, so that the machine has to dial the robot.
+    :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same.
+    :param inner_network: names the network in which ``inner_host`` means something (a cluster, a
+        VPC); two machines of one inner network dial each other there.
+    :param inner_host: the machine's address in it, '' without one.
+    :param place: region, context and namespace, engine: for people to read.
+    :param kind: what it is, such as an instance type: for people to read.
     :param owned: False for a computer that existed before and outlives the launch.
     :param end_command: what the agent runs as root on the machine to end it; empty where it
         must not be ended.
@@ -107,10 +118,35 @@ class Machine:
     created: Optional[float] = None
     shell: Optional[Endpoint] = None
     vpn_host: str = ''
+    vpn_port: int = 0
+    inner_network: str = ''
+    inner_host: str = ''
+    place: str = ''
+    kind: str = ''
     tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
     owned: bool = True
     end_command: tuple[str, ...] = ()
     cost_per_hour: Optional[Decimal] = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Image:
+    """
+    A disk image made of a machine, from which the next ones start.
+
+    :param id: opaque to the core; carries its place.
+    :param dependencies: hash of what is installed in it; a launch takes one that matches its own.
+    """
+
+    id: str
+    name: str
+    provider: str
+    place: str = ''
+    created: Optional[float] = None
+    size_gb: Optional[int] = None
+    state: str = ''
+    dependencies: str = ''
+    tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,6 +159,8 @@ class CreateRequest:
     :param tags: go onto everything that the provider creates.
     :param vpn_port: UDP port to let in.
     :param agent_config: the agent's first configuration, for providers that can start it at boot.
+    :param dependencies: hash of what will have to be installed on it, by which an image that was
+        baked before is found; '' where nothing is known of it.
     :param cancel: set when the launch is ending; for a ``create`` that takes long, as for an image
         to be downloaded: what it then raises is Cancelled.
     """
@@ -132,6 +170,7 @@ class CreateRequest:
     tags: Mapping[str, str]
     vpn_port: int
     agent_config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    dependencies: str = ''
     cancel: Optional[threading.Event] = dataclasses.field(default=None, compare=False)
 
 

@@ -7,10 +7,23 @@ from collections.abc import Iterator
 import os
 from pathlib import Path
 import shutil
+import signal
 import socket
 import subprocess
 
 import pytest
+
+
+def pytest_configure() -> None:
+    """
+    Take signals as a terminal would hand them over.
+
+    What a shell without job control starts in the background ignores SIGINT and SIGQUIT, and so
+    would all that the tests start and then interrupt; nohup does the same to SIGHUP.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Mapping
-from typing import ClassVar
+from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal
+import threading
+from typing import ClassVar, Optional
 
-from fogros2.errors import Unsupported
-from fogros2.model import CreateRequest, Machine, MachineSpec
+from fogros2.errors import ProviderError, Unsupported
+from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
+from fogros2.waiting import wait_until
 
 #: Tags that the core puts on everything; the provider's copy of them is the truth.
 TAG_NAME = 'fogros2-name'
@@ -16,6 +19,7 @@ TAG_ROBOT = 'fogros2-robot'
 TAG_LAUNCH = 'fogros2-launch'
 TAG_EXPIRES = 'fogros2-expires'
 TAG_ON_EXIT = 'fogros2-on-exit'
+TAG_DEPENDENCIES = 'fogros2-dependencies'
 
 
 class Provider(abc.ABC):
@@ -33,6 +37,19 @@ class Provider(abc.ABC):
     #: where it starts none, and the deployment does as soon as it has a shell.
     agent_directory: ClassVar[str] = ''
     agent_program: ClassVar[str] = ''
+    #: Whether its computers are made for a launch, not somebody's that exist already.
+    owned: ClassVar[bool] = True
+    #: Seconds between two looks at a machine that comes up slowly, at the most.
+    look_interval: ClassVar[float] = 3.0
+    #: Whether ``allow`` decides who reaches a machine; the launch then closes the SSH port as soon
+    #: as the VPN carries the connection.
+    firewall: ClassVar[bool] = False
+    #: Whether the host key that ``describe`` tells was handed over at boot, where others may read
+    #: it: the launch then has the machine make another at once, and calls ``pin``.
+    one_time_host_key: ClassVar[bool] = False
+    #: Command line that an agent runs as root every few seconds; once it exits with 0 the machine
+    #: is about to be taken away, and what it printed says why and when. Empty: no such notice.
+    notice: ClassVar[tuple[str, ...]] = ()
 
     def check(self, spec: MachineSpec) -> None:
         """
@@ -41,6 +58,20 @@ class Provider(abc.ABC):
         :raises ConfigurationError: an option is unknown or its value is wrong.
         :raises PrerequisiteError: this computer lacks something.
         """
+
+    def resolve(self, spec: MachineSpec) -> MachineSpec:
+        """
+        Return the spec with every open choice made ('nearest' region, 'cheapest' type).
+
+        Asks whoever it takes, at no cost; called once, after ``check`` and before ``create``.
+
+        :raises FogError: nothing there is fits, or nobody answers.
+        """
+        return spec
+
+    def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return what a machine of a resolved spec will cost (US dollars), None if unknown."""
+        return None
 
     @abc.abstractmethod
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
@@ -97,10 +128,75 @@ class Provider(abc.ABC):
         """
         raise Unsupported(f"provider '{self.name}' can't start a machine")
 
-    def allow(self, machine_id: str, address: str) -> None:
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, cancel: threading.Event,
+    ) -> Machine:
         """
-        Let the robot's new public ``address`` (CIDR) reach the machine's SSH port, it alone.
+        Wait until a machine runs and a connection can be tried, and return it.
+
+        A provider whose API can be watched writes this anew, so that nobody asks again and again.
+
+        :raises ProviderError: it ended meanwhile, or can't come up, with the provider's reason.
+        :raises DeadlineExceeded: after ``timeout`` seconds.
+        :raises Cancelled: ``cancel`` was set.
+        """
+        def look() -> Optional[Machine]:
+            machine = self.describe(machine_id)
+            if machine.state in (MachineState.DELETED, MachineState.STOPPING):
+                raise ProviderError(f"the machine '{name}' ended while it was coming up",
+                                    "the provider's own log says why")
+            return machine if machine.state is MachineState.RUNNING and machine.shell else None
+
+        return wait_until(look, timeout=timeout, cancel=cancel, longest=self.look_interval,
+                          what=f"the machine '{name}' to run")
+
+    def robot_address(self) -> str:
+        """
+        Return the address (CIDR) that this computer's connections to machines come from.
 
         :raises Unsupported: the provider has no firewall.
         """
         raise Unsupported(f"provider '{self.name}' has no firewall")
+
+    def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        """
+        Let ``sources`` (CIDR) reach a TCP port of a machine, they alone; none of them closes it.
+
+        :raises Unsupported: the provider has no firewall.
+        """
+        raise Unsupported(f"provider '{self.name}' has no firewall")
+
+    def pin(self, machine_id: str, host_key: str) -> None:
+        """
+        Remember the host key (OpenSSH form) that the machine has made for itself.
+
+        ``describe`` tells it from now on, on any computer.
+
+        :raises Unsupported: the provider hands no key over at boot.
+        """
+        raise Unsupported(f"provider '{self.name}' hands no host key over at boot")
+
+    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
+        """
+        Make an image of a machine and return its id at once; ``images`` tells when it is ready.
+
+        :param dependencies: see :class:`~fogros2.model.Image`.
+        :raises Unsupported: the provider keeps no images.
+        """
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+
+    def images(self) -> Iterable[Image]:
+        """
+        Yield the images that were made of machines.
+
+        :raises Unsupported: the provider keeps none.
+        """
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+
+    def delete_image(self, image_id: str) -> None:
+        """
+        Delete an image and the disks' copies behind it; idempotent.
+
+        :raises Unsupported: the provider keeps none.
+        """
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
