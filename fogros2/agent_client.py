@@ -63,7 +63,8 @@ class AgentClient:
     A connection to a machine's agent that comes back after a loss.
 
     One thread reads. It calls the subscribers with each event, once and in order, and with
-    ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``, which carry no ``seq``.
+    ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``, and where the agent's log has
+    forgotten some that it would have got ``{'event': 'gap', 'count': n}``; these have no ``seq``.
     A subscriber must not make requests: their replies would come in on its own thread.
 
     :param shell: reaches the machine.
@@ -290,7 +291,7 @@ class AgentClient:
                 if reply.get('next', 0) > 1 and stream is not None:
                     self._follow_on(stream)
             elif reply.get('lost'):
-                self._tell({'event': 'lost', 'count': reply['lost']})
+                self._tell({'event': 'gap', 'count': reply['lost']})
             return
         with self._lock:
             pending = self._pending.get(number) if isinstance(number, int) else None

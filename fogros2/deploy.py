@@ -526,9 +526,17 @@ class RunningMachine:
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """
-        Hand every event of the agent from now on to ``callback``.
+        Hand every event of the machine from now on to ``callback``.
 
-        It is called from a thread of the connection's and must not make requests of the agent.
+        It is called from a thread of the connection's, or from one that watches the machine, and
+        must not make requests of the agent. Besides what the agent says (see ``agent.py``):
+
+        ``{'event': 'notice', 'reason': ...}``  the provider is about to take the machine away, by
+            its own words; once. The agent answers requests still, for as long as they say.
+        ``{'event': 'lost', 'reason': ...}``  the machine is gone: ended, stopped, evicted; once,
+            and nothing comes after it. Requests fail from now on.
+        ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``  the connection's changes.
+        ``{'event': 'gap', 'count': n}``  so many events came too late for the agent's log.
         """
         def tell(event: dict[str, Any]) -> None:
             # an agent that leaves at the end as it was told is no news

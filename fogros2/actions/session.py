@@ -28,7 +28,7 @@ _NOTICES = {
     'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
     'launch_exited': (
         logging.ERROR, 'the launch on the machine ended with exit status {returncode}'),
-    'lost': (logging.WARNING, '{count} events of the agent came too late for its log'),
+    'gap': (logging.WARNING, '{count} events of the agent came too late for its log'),
     'connection lost': (logging.WARNING, 'the connection is lost; its nodes run on'),
     'connection back': (logging.INFO, 'the connection is back'),
     'connection absent': (logging.ERROR, 'the agent is gone: {error}'),

@@ -65,6 +65,6 @@ def describe(event: dict[str, Any]) -> Optional[str]:
         return f"could not be started: {event.get('error')}"
     if kind == 'watchdog':
         return f"watchdog: {event.get('reason')}, {event.get('action')}"
-    if kind == 'lost':
+    if kind == 'gap':
         return f"{event.get('count')} older events are not kept any more"
     return None

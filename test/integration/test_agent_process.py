@@ -383,7 +383,7 @@ def test_much_output_fills_neither_memory_nor_disk(rig):
     assert status['first'] > 1
     client.subscribe(rig.events.append, since=1)
     rig.wait('exited', node='n')
-    assert rig.events[0] == {'event': 'lost', 'count': status['first'] - 1}
+    assert rig.events[0] == {'event': 'gap', 'count': status['first'] - 1}
     assert [e['seq'] for e in rig.events[1:]] == list(range(status['first'], status['next']))
     assert agent.poll() is None
 

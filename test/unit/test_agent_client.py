@@ -197,7 +197,7 @@ def test_what_rotation_took_away_is_said(make):
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
     until(lambda: seen)
-    assert seen == [{'event': 'lost', 'count': 4}]
+    assert seen == [{'event': 'gap', 'count': 4}]
 
 
 def test_requests_are_asked_again_on_the_next_connection_but_for_signals(make):
