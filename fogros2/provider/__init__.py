@@ -51,6 +51,26 @@ class Provider(abc.ABC):
     #: is about to be taken away, and what it printed says why and when. Empty: no such notice.
     notice: ClassVar[tuple[str, ...]] = ()
 
+    @classmethod
+    def configured(cls) -> bool:
+        """
+        Return whether somebody has set this provider up here (credentials, a configuration file).
+
+        Asked by the command line before anything is loaded: one that isn't set up is left out of
+        what goes to all providers, unless a record or an option names it. Files and variables
+        alone; no SDK.
+        """
+        return True
+
+    def answers(self) -> str:
+        """
+        Ask for as little as possible, and return a few words for people (account, version).
+
+        :raises FogError: it can't be reached, or doesn't take our credentials.
+        """
+        count = sum(1 for _ in self.find({}))
+        return f'answers, {count} machine{"" if count == 1 else "s"}'
+
     def check(self, spec: MachineSpec) -> None:
         """
         Look for everything ``create`` will need, quickly and at no cost.
