@@ -239,8 +239,8 @@ def test_a_root_that_cannot_be_overlaid(refused, cloud_network):
 def test_no_root_and_no_sudo(write, cloud_network):
     # nobody has no home and no password, and may not use sudo
     nobody = ['setpriv', '--reuid=nobody', '--regid=nogroup', '--clear-groups']
-    if subprocess.run([*nobody, sys.executable, '-c', ''], capture_output=True).returncode:
-        pytest.skip('needs an interpreter that other users may run')
+    if subprocess.run([*nobody, 'ros2', '--help'], capture_output=True).returncode:
+        pytest.skip('needs an interpreter and a ros2 that other users may run')
     with tempfile.TemporaryDirectory(prefix='fogt') as own:
         shutil.chown(own, 'nobody')
         file = shutil.copy(write(container(cloud_network)), own)
