@@ -13,7 +13,6 @@ from importlib import metadata
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 import uuid
