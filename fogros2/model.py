@@ -99,6 +99,8 @@ class Machine:
     :param shell: None until the machine can be reached.
     :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' where it
         can't, so that the machine has to dial the robot.
+    :param robot_host: where ``vpn_host`` is '': the robot's address as this machine can dial it
+        (UDP, the robot's VPN port); whoever knows that address, an option or the provider.
     :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same.
     :param inner_network: names the network in which ``inner_host`` means something (a cluster, a
         VPC); two machines of one inner network dial each other there.
@@ -119,6 +121,7 @@ class Machine:
     shell: Optional[Endpoint] = None
     vpn_host: str = ''
     vpn_port: int = 0
+    robot_host: str = ''
     inner_network: str = ''
     inner_host: str = ''
     place: str = ''
@@ -158,7 +161,8 @@ class CreateRequest:
     :param authorized_key: public key (OpenSSH form) that the login user accepts.
     :param tags: go onto everything that the provider creates.
     :param vpn_port: UDP port to let in.
-    :param agent_config: the agent's first configuration, for providers that can start it at boot.
+    :param agent_config: the agent's first configuration, for providers that can start it at boot
+        (``agent_directory``); the provider adds ``user`` and the ``end_command`` it tells later.
     :param dependencies: hash of what will have to be installed on it, by which an image that was
         baked before is found; '' where nothing is known of it.
     :param cancel: set when the launch is ending; for a ``create`` that takes long, as for an image

@@ -39,6 +39,19 @@ def convert(name: str, value: Any, default: Any) -> Any:
                 and all(isinstance(item, str) for item in value):
             return tuple(value)
         expected = 'a list of strings'
+    elif isinstance(default, bool):
+        if isinstance(value, bool):
+            return value
+        # what a launch argument comes as
+        if isinstance(value, str) and value.lower() in ('true', 'false'):
+            return value.lower() == 'true'
+        expected = 'True or False'
+    elif isinstance(default, int):
+        if isinstance(value, str) and value.isdigit():
+            value = int(value)
+        if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+            return value
+        expected = 'a whole number'
     elif isinstance(default, float):
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0:
             return float(value)
