@@ -96,6 +96,7 @@ class Machine:
 
     :param id: opaque to the core; carries its place (region, context, engine).
     :param created: seconds since the epoch, or None where the provider does not know.
+    :param stopped: when it was stopped, likewise, for one that is.
     :param shell: None until the machine can be reached.
     :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' where it
         can't, so that the machine has to dial the robot.
@@ -130,6 +131,7 @@ class Machine:
     owned: bool = True
     end_command: tuple[str, ...] = ()
     cost_per_hour: Optional[Decimal] = None
+    stopped: Optional[float] = None
 
 
 @dataclasses.dataclass(frozen=True)
