@@ -14,7 +14,8 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run, which
-from fogros2.waiting import wait_until
+from fogros2.testing.traces import nothing_left as nothing_left_of
+from fogros2.testing.traces import RUN, Traces
 
 #: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
 #: the tests may meet on one computer.
@@ -32,55 +33,18 @@ def own_domain(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the tests' nodes among themselves and off the network of this computer."""
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
-
-def traces(state: Path) -> set[str]:
-    """Return everything on this computer now that a launch may leave behind, one line each."""
-    found = {f'interface {name}' for name in os.listdir('/sys/class/net')
-             if name[:3] == 'fog' and name[:4] != 'fogt'}
-    for process in Path('/proc').glob('[0-9]*'):
-        try:
-            words = (process / 'cmdline').read_bytes().split(b'\0')
-            comm = (process / 'comm').read_text().strip()
-        except OSError:
-            continue
-        # 'fogt' begins the names of tests of single parts, which tidy up by themselves
-        vpn = comm == 'wireguard-go' and not any(w.startswith(b'fogt') for w in words)
-        if vpn or any(w.endswith(b'agent.py') for w in words[:3]):
-            found.add(f'process {process.name} {comm}')
-    for words, what in (
-        (('podman', 'ps', '-a', '--format', '{{.Names}}'), 'container'),
-        (('nft', 'list', 'tables'), 'nftables'),
-        (('ip', 'route', 'show', 'table', 'all'), 'route'),
-    ):
-        if which(words[0]):
-            output = run(Command(words, sudo=True), timeout=30, check=False).stdout
-            found |= {f'{what} {line}' for line in output.splitlines()
-                      if 'fog' in line and 'fogt' not in line}
-    found |= {f'mount {line.split()[1]}' for line in Path('/proc/mounts').read_text().splitlines()
-              if 'fogros2' in line.split()[1]}
-    for folder in (Path('/run'), Path('/tmp'), Path('/var/tmp')):
-        found |= {f'file {p}' for p in folder.glob('fogros2*')}
-    found |= {f'state {p.relative_to(state)}' for p in state.rglob('*') if not p.is_dir()}
-    return found
+    # by this, a process is known to be this run's
+    monkeypatch.setenv(RUN, f'{os.getpid()}-{domain}')
 
 
 @pytest.fixture
-def nothing_left(state_home: Path, root: None) -> Iterator[None]:
-    """Fail a test after which something is there that wasn't before."""
-    before = traces(state_home)
-    yield
-    left: set[str] = set()
-
-    def gone() -> bool:
-        left.clear()
-        left.update(traces(state_home) - before)
-        return not left
-
-    try:
-        wait_until(gone, timeout=10.0, what='everything to be gone')
-    except RuntimeError:
-        pytest.fail(f'left behind: {sorted(left)}')
+def nothing_left(
+    state_home: Path, root: None, own_domain: None, tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[None]:
+    """Fail a test after which something is there that wasn't before, and is nobody else's."""
+    traces = Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
+    with nothing_left_of(traces, timeout=10.0):
+        yield
 
 
 @pytest.fixture(scope='session')
