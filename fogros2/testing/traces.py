@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What launches leave on this computer, and which of it may be somebody else's.
+
+A trace is taken for ours unless it can be shown not to be: it carries the id of a launch, or the
+token of a machine, that another state folder on this computer knows. So another test run, or the
+user's own robot, disturbs nobody, and what nobody knows is a leak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import re
+import tempfile
+from typing import Any
+
+from fogros2.errors import DeadlineExceeded
+from fogros2.model import Command
+from fogros2.process import run, which
+from fogros2.store import process_start
+from fogros2.waiting import wait_until
+
+#: Variable by which a process is known to come from a run of tests; its value is the run's own.
+RUN = 'FOGROS2_TEST_RUN'
+
+#: 'fogt' begins the names of tests of single parts, which tidy up by themselves.
+_SINGLE = 'fogt'
+_INTERFACE = re.compile(r'\bfog([0-9a-f]{6})(?:m\d+)?\b')
+_ROOT = re.compile(r'/fogros2/([A-Za-z0-9_-]+)')
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """
+    Something that a launch may leave behind.
+
+    :param what: a line for people.
+    :param marks: ids of launches and tokens of machines that it carries.
+    """
+
+    what: str
+    marks: frozenset[str] = frozenset()
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """
+    What a state folder knows of a launch or a machine.
+
+    :param mark: its id, or its token.
+    :param pid: the launch's process, with its start (clock ticks); 0 for none.
+    """
+
+    mark: str
+    pid: int = 0
+    start: int = 0
+
+
+class Traces:
+    """
+    A look at this computer, by one run of tests.
+
+    :param state: the state folder of the launches that are looked for.
+    :param files: folder below which the run keeps all its files, its state folders too.
+    :param run: what its processes have in the variable ``RUN``.
+    """
+
+    def __init__(self, state: Path, files: Path, run: str) -> None:
+        self._state = state
+        self._files = files
+        self._run = run
+        self._known_before = {known.mark for known in self._known_elsewhere()}
+        self._before = {trace.what for trace in look(state)}
+
+    def left(self) -> set[str]:
+        """Return what wasn't there when this was made, and is nobody else's."""
+        new = [trace for trace in look(self._state) if trace.what not in self._before]
+        if not new:
+            return set()
+        others = self.others()
+        return {trace.what for trace in new
+                if not trace.marks & others and not self._used_by_others(trace.what)}
+
+    def others(self) -> set[str]:
+        """
+        Return the marks of launches and machines that are certainly not this run's.
+
+        A state folder of another run of tests says so by its place. Of any other folder that
+        counts which was there before, or whose launch lives and doesn't come from this run: a
+        test that forgot its own state folder is no excuse for what it leaves.
+        """
+        found = set()
+        for folder in self._folders_elsewhere():
+            for known in _known(folder):
+                if _of_a_test_run(folder) or known.mark in self._known_before or (
+                        known.pid and process_start(known.pid) == known.start
+                        and not self._ours(known.pid)):
+                    found.add(known.mark)
+        return found
+
+    def _known_elsewhere(self) -> Iterator[Known]:
+        for folder in self._folders_elsewhere():
+            yield from _known(folder)
+
+    def _folders_elsewhere(self) -> set[Path]:
+        """Return state folders that processes on this computer name, or that tests have."""
+        found = set(Path(tempfile.gettempdir()).glob('pytest-of-*/pytest-*/state*'))
+        for process in _processes():
+            variables = _variables(process)
+            own, base = variables.get('FOGROS2_STATE_HOME'), variables.get('XDG_STATE_HOME')
+            home = variables.get('HOME')
+            if own:
+                found.add(Path(own))
+            elif base:
+                found.add(Path(base, 'fogros2'))
+            elif home:
+                found.add(Path(home, '.local/state/fogros2'))
+        files = self._files.resolve()
+        return {folder for folder in found
+                if folder.is_absolute() and not folder.resolve().is_relative_to(files)}
+
+    def _ours(self, pid: int) -> bool:
+        return _variables(Path('/proc', str(pid))).get(RUN) == self._run
+
+    def _used_by_others(self, what: str) -> bool:
+        """Return whether a file is named by processes of which none is this run's."""
+        kind, _, path = what.partition(' ')
+        users = [process for process in _processes()
+                 if any(path in word for word in _words(process))] if kind == 'file' else []
+        return bool(users) and not any(self._ours(int(user.name)) for user in users)
+
+
+@contextlib.contextmanager
+def nothing_left(traces: Traces, *, timeout: float) -> Iterator[None]:
+    """
+    Look, after the block, whether all is gone that it made.
+
+    :param timeout: seconds that what is ending by itself may take.
+    :raises AssertionError: something is there still.
+    """
+    yield
+    left: set[str] = set()
+
+    def gone() -> bool:
+        left.clear()
+        left.update(traces.left())
+        return not left
+
+    try:
+        wait_until(gone, timeout=timeout, what='everything to be gone')
+    except DeadlineExceeded:
+        raise AssertionError(f'left behind: {sorted(left)}') from None
+
+
+def look(state: Path) -> set[Trace]:
+    """Return everything on this computer now that a launch may leave behind."""
+    found = {_named('interface', name) for name in os.listdir('/sys/class/net')
+             if name.startswith('fog') and not name.startswith(_SINGLE)}
+    found |= set(_programs())
+    for words, kind in (
+        (('nft', 'list', 'tables'), 'nftables'),
+        (('ip', 'route', 'show', 'table', 'all'), 'route'),
+    ):
+        found |= {_named(kind, line) for line in _output(*words)
+                  if 'fog' in line and _SINGLE not in line}
+    found |= set(_containers())
+    for line in Path('/proc/mounts').read_text().splitlines():
+        target = line.split()[1]
+        if 'fogros2' in target:
+            found.add(Trace(f'mount {target}', frozenset(_ROOT.findall(target))))
+    for folder in ('run', 'tmp', 'var/tmp'):
+        found |= {Trace(f'file {path}') for path in Path('/', folder).glob('fogros2*')}
+    found |= {Trace(f'state {path.relative_to(state)}')
+              for path in state.rglob('*') if not path.is_dir()}
+    return found
+
+
+def _named(kind: str, line: str) -> Trace:
+    return Trace(f'{kind} {line}', frozenset(_INTERFACE.findall(line)))
+
+
+def _containers() -> Iterator[Trace]:
+    labels = ['fogros2-launch', 'fogros2-token']
+    columns = ['{{.Names}}', *(f'{{{{index .Labels "{label}"}}}}' for label in labels)]
+    for line in _output('podman', 'ps', '-a', '--format', '\t'.join(columns)):
+        name, *marks = line.split('\t')
+        if 'fog' in name and _SINGLE not in name:
+            yield Trace(f'container {name}', frozenset(mark for mark in marks if mark))
+
+
+def _programs() -> Iterator[Trace]:
+    """Yield agents and VPN programs, in containers too."""
+    for process in _processes():
+        words = _words(process)
+        if os.path.basename(words[0] if words else '') == 'wireguard-go':
+            if not any(word.startswith(_SINGLE) for word in words):
+                yield Trace(f'process {process.name} wireguard-go',
+                            frozenset(_INTERFACE.findall(' '.join(words))))
+        elif any(word.endswith('agent.py') for word in words[:3]):
+            yield Trace(f'process {process.name} {" ".join(words[:4])}',
+                        frozenset(_agent_marks(process, words)))
+
+
+def _agent_marks(process: Path, words: list[str]) -> Iterator[str]:
+    """Yield the launches that an agent's configurations name, read in its own file system."""
+    options = dict(zip(words, words[1:]))
+    first = _read_json(process, options.get('--config', ''))
+    # that one names the folder in which the agent keeps what it was told later
+    folder = options.get('--directory') or first.get('directory')
+    for config in (first, _read_json(process, f'{folder}/config.json' if folder else '')):
+        if config.get('launch'):
+            yield str(config['launch'])
+
+
+def _read_json(process: Path, path: str) -> dict[str, Any]:
+    if path.startswith('~/'):
+        path = f'{_variables(process).get("HOME", "")}{path[1:]}'
+    if not path.startswith('/'):
+        return {}
+    words = ('cat', f'{process}/root{path}')
+    text = run(Command(words, sudo=True), timeout=10.0, check=False).stdout
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _known(folder: Path) -> Iterator[Known]:
+    """Yield what a state folder knows; one that changes meanwhile, or isn't ours to read, less."""
+    for path, key in (
+        *((path, '') for path in _listed(folder / 'launches')),
+        *((path, 'launch') for path in _listed(folder / 'machines')),
+    ):
+        try:
+            name = 'record.json' if key else 'process.json'
+            told = json.loads((path / name).read_text())
+        except (OSError, ValueError):
+            told = {}
+        process = (told.get('pid') or 0, told.get('pid_start') or 0)
+        marks: Iterable[str] = (told.get('launch'), told.get('token')) if key else (path.name,)
+        yield from (Known(mark, *process) for mark in marks if mark)
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError:
+        return []
+
+
+def _of_a_test_run(folder: Path) -> bool:
+    return any(part.startswith('pytest-of-') for part in folder.parts)
+
+
+def _processes() -> Iterator[Path]:
+    return Path('/proc').glob('[0-9]*')
+
+
+def _words(process: Path) -> list[str]:
+    try:
+        return (process / 'cmdline').read_bytes().decode(errors='replace').split('\0')[:-1]
+    except OSError:
+        return []
+
+
+def _variables(process: Path) -> dict[str, str]:
+    """Return the variables that a process was started with; none where they aren't ours to see."""
+    try:
+        text = (process / 'environ').read_bytes().decode(errors='replace')
+    except OSError:
+        return {}
+    return dict(item.split('=', 1) for item in text.split('\0') if '=' in item)
+
+
+def _output(*words: str) -> list[str]:
+    if which(words[0]) is None:
+        return []
+    return run(Command(words, sudo=True), timeout=30.0, check=False).stdout.splitlines()

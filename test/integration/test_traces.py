@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The look at what a test leaves behind: it misses nothing of ours, and minds nobody else's."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.process import run
+from fogros2.store import process_start
+from fogros2.testing.traces import nothing_left, RUN, Traces
+from fogros2.waiting import wait_until
+
+#: A program that waits to be killed, whatever its file is called.
+WAITS = 'import sys; sys.stdin.read()'
+
+
+@pytest.fixture
+def launch_id():
+    return secrets.token_hex(3)
+
+
+@pytest.fixture
+def elsewhere():
+    """Return a folder that says nothing of a run of tests."""
+    path = tempfile.mkdtemp(prefix='fogt')
+    yield Path(path)
+    shutil.rmtree(path)
+
+
+@pytest.fixture
+def look(state_home, tmp_path_factory, own_domain):
+    return lambda: Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
+
+
+@pytest.fixture
+def start(children):
+    """Start processes that wait, and return them when they have their names and variables."""
+    def start(*words, **variables):
+        child = subprocess.Popen(
+            [sys.executable, *words], stdin=subprocess.PIPE, env={**os.environ, **variables})
+        children.append(child)
+        wait_until(lambda: words[0].encode() in Path(f'/proc/{child.pid}/cmdline').read_bytes(),
+                   timeout=5, what='the program to be loaded')
+        return child
+
+    return start
+
+
+@pytest.fixture
+def interface(launch_id, tun):
+    """Make a VPN interface of a launch, on which no program runs."""
+    name = f'fog{launch_id}'
+    run(Command(('ip', 'tuntap', 'add', 'mode', 'tun', 'name', name), sudo=True), timeout=10)
+    yield name
+    run(Command(('ip', 'link', 'delete', name), sudo=True), timeout=10)
+
+
+def store(folder, launch_id, child):
+    """Write what a launch keeps of itself."""
+    path = folder / 'launches' / launch_id
+    path.mkdir(parents=True)
+    (path / 'process.json').write_text(json.dumps(
+        {'pid': child.pid, 'pid_start': process_start(child.pid)}))
+
+
+def fake_agent(folder, launch_id):
+    """Return the words of a process that looks like the agent of a launch."""
+    program, config = folder / 'agent.py', folder / 'first.json'
+    program.write_text(WAITS)
+    config.write_text(json.dumps({'directory': str(folder), 'launch': ''}))
+    (folder / 'config.json').write_text(json.dumps({'launch': launch_id}))
+    return str(program), 'serve', '--config', str(config)
+
+
+def test_what_nobody_knows_is_ours(look, interface, state_home):
+    assert look().left() == set(), 'it was there before'
+    traces = look()
+    (state_home / 'forgotten').write_text('')
+    assert traces.left() == {'state forgotten'}
+    with pytest.raises(AssertionError, match='left behind.*another'):
+        with nothing_left(look(), timeout=0.1):
+            (state_home / 'another').write_text('')
+    with nothing_left(look(), timeout=0.1):
+        pass
+
+
+def test_an_interface_of_ours_is_found(look, tun, request):
+    traces = look()
+    name = request.getfixturevalue('interface')
+    assert traces.left() == {f'interface {name}'}
+
+
+def test_an_agent_is_found(look, start, tmp_path, launch_id):
+    traces = look()
+    words = fake_agent(tmp_path, launch_id)
+    child = start(*words)
+    (found,) = traces.left()
+    assert found.startswith(f'process {child.pid} ') and words[0] in found
+
+
+def test_a_strangers_launch_is_his(look, tun, start, elsewhere, launch_id, tmp_path, request):
+    traces = look()
+    name = request.getfixturevalue('interface')
+    program = start(*fake_agent(tmp_path, launch_id))
+    (elsewhere / 'waits.py').write_text(WAITS)
+    launch = start(
+        str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere), **{RUN: 'another'})
+    assert len(traces.left()) == 2, 'nobody knows the launch yet'
+    store(elsewhere, launch_id, launch)
+    assert traces.left() == set()
+    # he is still there, but that launch of his isn't: it could be anybody's, also ours
+    store(elsewhere, '000000', launch)
+    shutil.rmtree(elsewhere / 'launches' / launch_id)
+    assert traces.left() == {f'interface {name}', *(
+        trace for trace in traces.left() if f' {program.pid} ' in trace)}
+
+
+def test_a_launch_of_ours_that_forgot_its_state_folder_is_ours(
+    look, tun, start, elsewhere, launch_id, request,
+):
+    traces = look()
+    name = request.getfixturevalue('interface')
+    (elsewhere / 'waits.py').write_text(WAITS)
+    launch = start(str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere))
+    store(elsewhere, launch_id, launch)
+    assert traces.left() == {f'interface {name}'}
+
+
+def test_another_run_of_tests_may_kill_its_launches(
+    look, tun, elsewhere, launch_id, start, request,
+):
+    traces = look()
+    request.getfixturevalue('interface')
+    folder = elsewhere / 'pytest-of-somebody' / 'pytest-0' / 'state0'
+    (elsewhere / 'waits.py').write_text(WAITS)
+    start(str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(folder), **{RUN: 'another'})
+    launch = start(str(elsewhere / 'waits.py'))
+    store(folder, launch_id, launch)
+    launch.kill()
+    launch.wait(10)
+    assert traces.left() == set()
+
+
+def test_a_file_that_a_strangers_program_uses_is_his(look, start, elsewhere):
+    traces = look()
+    (elsewhere / 'waits.py').write_text(WAITS)
+    with tempfile.NamedTemporaryFile(prefix='fogros2-', dir='/var/tmp') as file:
+        assert traces.left() == {f'file {file.name}'}
+        start(str(elsewhere / 'waits.py'), f'-oUserKnownHostsFile={file.name}', **{RUN: 'other'})
+        assert traces.left() == set()
+        start(str(elsewhere / 'waits.py'), f'-oUserKnownHostsFile={file.name}')
+        assert traces.left() == {f'file {file.name}'}
