@@ -16,6 +16,8 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import ProviderError, StoreError
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.failures import translated
 from fogros2.provider.aws.regions import distance_km, REGIONS
 from fogros2.store import state_home, write_private
 
@@ -66,7 +68,7 @@ class Market:
     """
     What there is in each region, and what it costs; thread-safe.
 
-    :param clients: makes the boto3 clients; the default's have adaptive retries.
+    :param clients: makes the boto3 clients; None for those of the usual account.
     :param cache: folder of what AWS said before, None for the one below the state folder.
     :param clock: seconds since the epoch.
     :param refresh: ask anew, whatever the cache has.
@@ -76,7 +78,7 @@ class Market:
         self, clients: Optional[Clients] = None, *, cache: Optional[Path] = None,
         clock: Callable[[], float] = time.time, refresh: bool = False,
     ) -> None:
-        self._clients = clients or client
+        self._clients = clients or Account().client
         self._cache = cache
         self._clock = clock
         self._refresh = refresh
@@ -183,7 +185,6 @@ class Market:
         return prices
 
     def _pages(self, service: str, region: str, operation: str, **arguments: Any) -> Iterator[Any]:
-        from fogros2.provider.aws.failures import translated
         with translated(f'asking AWS what there is in {region}', region):
             api = self._clients(service, region)
             yield from api.get_paginator(operation).paginate(**arguments)
@@ -225,16 +226,6 @@ class Market:
 
     def _path(self, key: str) -> Path:
         return (self._cache or state_home() / 'cache' / 'aws') / f'{key}.json'
-
-
-def client(service: str, region: str) -> Any:
-    """
-    Return a boto3 client with adaptive retries and short deadlines.
-
-    :raises PrerequisiteError: boto3 isn't installed.
-    """
-    from fogros2.provider.aws.clients import make
-    return make(service, region)
 
 
 def source() -> str:
