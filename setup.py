@@ -47,6 +47,7 @@ setup(
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
         'bench': ['matplotlib'],
+        'kubernetes': ['kubernetes'],
         'test': [
             'hypothesis', 'mypy', 'pytest', 'pytest-timeout', 'ruff', 'types-paramiko',
             'types-PyYAML', *VIDEO],
@@ -56,6 +57,7 @@ setup(
     entry_points={
         'fogros2.provider': [
             'container = fogros2.provider.container:ContainerProvider',
+            'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',
         ],
         'fogros2.shell': [

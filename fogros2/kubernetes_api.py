@@ -1,0 +1,445 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A cluster's API server, as the kubeconfig describes it: requests, watches, exec's WebSocket.
+
+The official client reads the kubeconfig, gets and renews the credentials and sets TLS up. Requests
+are made by path and answered in JSON: its classes for every kind of object take most of a second
+to load, and none of them is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import functools
+import json
+import os
+from pathlib import Path
+import queue
+import threading
+from typing import Any, Optional, TYPE_CHECKING, TypeVar
+from urllib.parse import urlencode
+
+from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError, ProviderError
+from fogros2.waiting import wait_until
+
+if TYPE_CHECKING:
+    import websocket
+
+T = TypeVar('T')
+#: Query parameters; a list repeats the name.
+Query = Mapping[str, Any]
+
+#: Seconds in which a connection to the API server has to stand.
+CONNECT = 5.0
+#: Seconds that one request may take.
+ANSWER = 30.0
+#: Seconds for which an API server that restarts is waited for.
+PATIENCE = 30.0
+#: Seconds of silence after which a watch is begun anew: its connection may be gone.
+SILENCE = 240.0
+#: Token, certificate and namespace of a pod that may use the API itself.
+_IN_CLUSTER = Path('/var/run/secrets/kubernetes.io/serviceaccount')
+
+
+class ApiError(ProviderError):
+    """
+    The API server refused.
+
+    :param status: of HTTP: 403, 404, 409, 422, ...
+    :param reason: in one word: Forbidden, NotFound, AlreadyExists, Invalid, ...
+    :param details: what the answer's ``details`` hold, such as causes.
+    """
+
+    def __init__(
+        self, message: str, hint: str = '', *, status: int = 0, reason: str = '',
+        details: Optional[Mapping[str, Any]] = None,
+    ) -> None:
+        super().__init__(message, hint)
+        self.status = status
+        self.reason = reason
+        self.details = details or {}
+
+
+class Unreachable(ProviderError):
+    """The API server doesn't answer."""
+
+
+class Api:
+    """
+    The API server of one context; thread-safe.
+
+    :param context: name of a context of the kubeconfig; '' for the current one.
+    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    """
+
+    def __init__(self, context: str = '') -> None:
+        self.context, self.namespace, self._client = _load(context)
+        #: Requests made so far, for the figures.
+        self.calls = 0
+
+    @property
+    def server(self) -> str:
+        """The API server's address."""
+        return str(self._client.configuration.host)
+
+    def headers(self) -> dict[str, str]:
+        """Return what authenticates a request; renews what has run out."""
+        found: dict[str, str] = {}
+        for each in self._client.configuration.auth_settings().values():
+            if each['in'] == 'header' and each['value']:
+                found[each['key']] = each['value']
+        return found
+
+    # -- requests -------------------------------------------------------------------------------
+
+    def request(
+        self, method: str, path: str, body: Optional[Mapping[str, Any]] = None,
+        *, patience: float = PATIENCE, cancel: Optional[threading.Event] = None, **query: Any,
+    ) -> dict[str, Any]:
+        """
+        Make a request and return the answer.
+
+        :param patience: seconds for which an API server that doesn't answer is asked again.
+        :raises ApiError: it refused.
+        :raises Unreachable: it doesn't answer.
+        """
+        last: list[ProviderError] = []
+
+        def attempt() -> Optional[dict[str, Any]]:
+            try:
+                return self._once(method, path, body, query)
+            except Unreachable as error:
+                last[:] = [error]
+            except ApiError as error:
+                if error.status not in (429, 500, 502, 503, 504):
+                    raise
+                last[:] = [error]
+            return None
+
+        try:
+            return wait_until(attempt, timeout=patience, cancel=cancel, interval=0.1,
+                              what=f'the API server {self.server}')
+        except DeadlineExceeded as error:
+            raise last[0] from error
+
+    def _once(
+        self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
+    ) -> dict[str, Any]:
+        response = self._send(method, path, body, query, ANSWER)
+        try:
+            data = response.read(decode_content=True)
+        except _http_errors() as error:
+            raise self._unreachable(error) from error
+        finally:
+            response.release_conn()
+        found = _parsed(data)
+        if response.status >= 400:
+            raise _refusal(response.status, found, data)
+        return found
+
+    def _send(
+        self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
+        read: Optional[float],
+    ) -> Any:
+        import urllib3
+
+        headers = {'accept': 'application/json', **self.headers()}
+        if body is not None:
+            headers['content-type'] = 'application/merge-patch+json' \
+                if method == 'PATCH' else 'application/json'
+        self.calls += 1
+        try:
+            return self._client.rest_client.pool_manager.request(
+                method, self._url(path, query), headers=headers, preload_content=False,
+                body=None if body is None else json.dumps(body).encode(), retries=False,
+                timeout=urllib3.Timeout(connect=CONNECT, read=read))
+        except _http_errors() as error:
+            raise self._unreachable(error) from error
+
+    def _url(self, path: str, query: Query) -> str:
+        words = {name: value for name, value in query.items() if value is not None}
+        text = urlencode(words, doseq=True)
+        return f'{self.server}{path}?{text}' if text else f'{self.server}{path}'
+
+    def _unreachable(self, error: BaseException) -> Unreachable:
+        return Unreachable(
+            f'the API server {self.server} does not answer: {_words(error)}',
+            'is the cluster up, and reachable from this robot? `kubectl cluster-info` asks the '
+            'same')
+
+    # -- watches --------------------------------------------------------------------------------
+
+    def follow(
+        self, path: str, look: Callable[[str, dict[str, Any]], Optional[T]], *,
+        timeout: float, what: str, cancel: Optional[threading.Event] = None,
+        again: Optional[Callable[[], Optional[T]]] = None,
+        tick: Optional[Callable[[], Optional[T]]] = None, **query: Any,
+    ) -> T:
+        """
+        Watch objects until ``look`` returns something other than None, and return that.
+
+        :param look: gets ADDED, MODIFIED or DELETED and the object; what is there already comes
+            as ADDED, unless ``resourceVersion`` says where to begin.
+        :param again: asked first when a watch was lost and is begun anew, from what is there then.
+        :param tick: asked a few times a second, for what has a deadline of its own.
+        :raises DeadlineExceeded: after ``timeout`` seconds.
+        :raises Cancelled: ``cancel`` was set.
+        """
+        with contextlib.ExitStack() as undo:
+            watch: Optional[_Watch] = None
+            lost = False
+
+            def probe() -> Optional[tuple[T]]:
+                nonlocal watch, lost, query
+                if watch is None:
+                    if lost and again is not None and (found := again()) is not None:
+                        return (found,)
+                    watch = undo.enter_context(_Watch(self, path, {'watch': 'true', **query}))
+                event = watch.get(0.1)
+                if event is not None and event[0] in ('CLOSED', 'ERROR'):
+                    watch.__exit__()
+                    watch, lost = None, True
+                    query = {k: v for k, v in query.items() if k != 'resourceVersion'}
+                elif event is not None and event[0] != 'BOOKMARK':
+                    found = look(*event)
+                    return None if found is None else (found,)
+                found = tick() if tick is not None else None
+                return None if found is None else (found,)
+
+            return wait_until(probe, timeout=timeout, what=what, cancel=cancel,
+                              interval=0.0)[0]
+
+    # -- exec -----------------------------------------------------------------------------------
+
+    def websocket(self, path: str, query: Query, *, timeout: float) -> websocket.WebSocket:
+        """
+        Open a WebSocket for a pod's ``exec``.
+
+        :raises ApiError: refused, or no such pod.
+        :raises Unreachable: the API server doesn't answer.
+        """
+        import websocket
+
+        self.calls += 1
+        options: dict[str, Any] = {}
+        configuration = self._client.configuration
+        if proxy := configuration.proxy:
+            from urllib.parse import urlsplit
+            found = urlsplit(proxy)
+            options.update(http_proxy_host=found.hostname, http_proxy_port=found.port,
+                           proxy_type='http')
+            if found.username:
+                options['http_proxy_auth'] = (found.username, found.password or '')
+        url = self._url(path, query).replace('http', 'ws', 1)
+        try:
+            return websocket.create_connection(
+                url, timeout=timeout, sslopt=_tls(configuration), enable_multithread=False,
+                header=[f'{name}: {value}' for name, value in self.headers().items()],
+                subprotocols=['v4.channel.k8s.io'], skip_utf8_validation=True, **options)
+        except websocket.WebSocketBadStatusException as error:
+            data = error.resp_body or b''
+            raise _refusal(error.status_code, _parsed(data), data) from error
+        except (websocket.WebSocketException, OSError) as error:
+            raise self._unreachable(error) from error
+
+
+class _Watch:
+    """One watch: a thread reads its lines, so that whoever waits can be cancelled."""
+
+    def __init__(self, api: Api, path: str, query: Query) -> None:
+        self._events: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
+        self._response = self._open(api, path, query)
+        self._thread = threading.Thread(target=self._read, name='fog-watch', daemon=True)
+        if self._response is not None:
+            self._thread.start()
+
+    def _open(self, api: Api, path: str, query: Query) -> Any:
+        try:
+            response = api._send('GET', path, None, query, SILENCE)
+        except Unreachable:
+            self._events.put(('CLOSED', {}))
+            # an API server that restarts is asked ten times a second
+            threading.Event().wait(0.1)
+            return None
+        if response.status >= 400:
+            data = response.read(decode_content=True)
+            response.release_conn()
+            if response.status not in (410, 429, 500, 502, 503, 504):
+                raise _refusal(response.status, _parsed(data), data)
+            self._events.put(('CLOSED', {}))
+            return None
+        return response
+
+    def _read(self) -> None:
+        rest = b''
+        with contextlib.suppress(OSError, ValueError, AttributeError, *_http_errors()):
+            for data in self._response.stream(1 << 16):
+                *lines, rest = (rest + data).split(b'\n')
+                for line in lines:
+                    event = _parsed(line)
+                    if 'type' in event:
+                        self._events.put((event['type'], event.get('object') or {}))
+        self._events.put(('CLOSED', {}))
+
+    def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:
+        """Return the next event, None if none came in time."""
+        try:
+            return self._events.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+    def __enter__(self) -> _Watch:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        response, self._response = self._response, None
+        if response is None:
+            return
+        with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
+            response.shutdown()  # wakes the reader
+        self._thread.join(2.0)
+        response.close()
+
+
+@functools.lru_cache(maxsize=8)
+def _cached(context: str, kubeconfig: Optional[str]) -> Api:
+    return Api(context)
+
+
+def connect(context: str = '') -> Api:
+    """
+    Return the API server of a context of the kubeconfig, '' for the current one.
+
+    All who name the same one share its connections.
+
+    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    """
+    return _cached(context, os.environ.get('KUBECONFIG'))
+
+
+def kubeconfig_files() -> list[Path]:
+    """Return the files that the kubeconfig is made of, those that exist."""
+    names = os.environ.get('KUBECONFIG') or '~/.kube/config'
+    paths = [Path(name).expanduser() for name in names.split(os.pathsep) if name]
+    return [path for path in paths if path.is_file()]
+
+
+def configured() -> bool:
+    """Return whether there is a kubeconfig, or this is a pod that may use the API."""
+    return bool(kubeconfig_files()) or (_IN_CLUSTER / 'token').is_file()
+
+
+def _load(context: str) -> tuple[str, str, Any]:
+    """Return a context's name, its namespace and a client of the SDK."""
+    try:
+        import kubernetes.client
+        import kubernetes.config
+    except ImportError as error:
+        raise PrerequisiteError(
+            f"Kubernetes' client for Python is missing: {error}",
+            "python3 -m pip install 'fogros2[kubernetes]'") from error
+    config: Any = kubernetes.config
+    if not kubeconfig_files():
+        if not configured():
+            raise PrerequisiteError(
+                'there is no kubeconfig on this computer',
+                "set KUBECONFIG, or get one: 'aws eks update-kubeconfig', "
+                "'gcloud container clusters get-credentials', 'az aks get-credentials'")
+        config.load_incluster_config()
+        namespace = (_IN_CLUSTER / 'namespace').read_text().strip()
+        return '', namespace, kubernetes.client.ApiClient()
+    files = os.environ.get('KUBECONFIG') or str(Path('~/.kube/config').expanduser())
+    try:
+        contexts, active = config.list_kube_config_contexts(files)
+        names = [str(each['name']) for each in contexts]
+        name = context or str((active or {}).get('name', ''))
+        if name not in names:
+            raise PrerequisiteError(
+                f"the kubeconfig has no context '{name}'", f"there are: {', '.join(names)}")
+        entry = next(each for each in contexts if each['name'] == name)
+        client = config.new_client_from_config(files, context=name)
+    except (config.ConfigException, OSError, ValueError, TypeError, KeyError) as error:
+        raise PrerequisiteError(f"the kubeconfig {files} can't be used: {_words(error)}",
+                                '`kubectl config view` shows it') from error
+    return name, str(entry['context'].get('namespace') or 'default'), client
+
+
+def _tls(configuration: Any) -> dict[str, Any]:
+    """Return how the WebSocket checks the API server, the same way as the requests."""
+    import ssl
+    options: dict[str, Any] = {'cert_reqs': ssl.CERT_NONE, 'check_hostname': False}
+    if configuration.verify_ssl:
+        options = {'cert_reqs': ssl.CERT_REQUIRED}
+        if configuration.ssl_ca_cert:
+            options['ca_certs'] = configuration.ssl_ca_cert
+        if configuration.assert_hostname is not None:
+            options['check_hostname'] = bool(configuration.assert_hostname)
+    for name, key in (('cert_file', 'certfile'), ('key_file', 'keyfile'),
+                      ('tls_server_name', 'server_hostname')):
+        if value := getattr(configuration, name, None):
+            options[key] = value
+    return options
+
+
+def _http_errors() -> tuple[type[BaseException], ...]:
+    import urllib3
+    return (urllib3.exceptions.HTTPError, OSError)
+
+
+def _parsed(data: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(data)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
+    message = str(answer.get('message') or data[:300].decode(errors='replace')
+                  or f'HTTP status {status}')
+    hint = 'the kubeconfig holds credentials that the cluster does not take: log in again' \
+        if status == 401 else ''
+    return ApiError(' '.join(message.split()), hint, status=status,
+                    reason=str(answer.get('reason') or ''), details=answer.get('details'))
+
+
+def _words(error: BaseException) -> str:
+    """Return the innermost reason of a chain of the client's errors, in one line."""
+    reason: object = getattr(error, 'reason', None) or error
+    text = ' '.join(str(reason).split())
+    # urllib3 puts its object in front
+    return text.rpartition('>: ')[2] or text or type(error).__name__
+
+
+def cancelled(cancel: Optional[threading.Event], what: str) -> None:
+    """
+    Say whether to go on.
+
+    :raises Cancelled: ``cancel`` is set.
+    """
+    if cancel is not None and cancel.is_set():
+        raise Cancelled(what)
+
+
+def selector(labels: Mapping[str, str]) -> str:
+    """Return labels as a query's ``labelSelector``."""
+    return ','.join(f'{key}={value}' if value else key for key, value in labels.items())
+
+
+def path(kind: str, namespace: str = '', name: str = '', *rest: str) -> str:
+    """
+    Return the path of objects of a kind, in all namespaces if none is named.
+
+    >>> path('jobs', 'robots', 'talker')
+    '/apis/batch/v1/namespaces/robots/jobs/talker'
+    """
+    group = '/apis/batch/v1' if kind == 'jobs' else '/api/v1'
+    parts = [group, *(['namespaces', namespace] if namespace else []), kind,
+             *([name] if name else []), *rest]
+    return '/'.join(parts)
+
+
+def items(found: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
+    """Return the objects of a list."""
+    return found.get('items') or []

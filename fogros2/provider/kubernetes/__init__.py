@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pods as machines: a Job each, which owns the pod and its Service and ends both by deadline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import threading
+import time
+from typing import Any, ClassVar, Optional
+
+from fogros2 import kubernetes_api
+from fogros2.errors import (
+    ConfigurationError,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    ProviderError,
+)
+from fogros2.kubernetes_api import Api, ApiError, items, path, selector
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import Provider
+from fogros2.provider.kubernetes import boot, hints, manifests, names, pods, ways
+from fogros2.provider.kubernetes.names import MachineId
+from fogros2.provider.kubernetes.options import Options
+from fogros2.provider.kubernetes.start import Start
+
+_REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
+#: Seconds for which an API server is waited for before anything has begun.
+_FIRST = 5.0
+#: Seconds that a pod is given when the robot ends it: its nodes have ended before.
+_GRACE = 1
+#: Seconds in which everything of a machine has to be gone.
+_GONE = 120.0
+
+
+class KubernetesProvider(Provider):
+    """Pods of the cluster that the kubeconfig names."""
+
+    name: ClassVar[str] = 'kubernetes'
+    shell_kind: ClassVar[str] = 'kubernetes'
+    look_interval: ClassVar[float] = 1.0
+    notice: ClassVar[tuple[str, ...]] = boot.NOTICE_COMMAND
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        #: Contexts and namespaces that launch files have named.
+        self._places: set[tuple[str, str]] = set()
+        self._lifetimes: dict[str, float] = {}
+        #: Jobs as they were made here, so that nobody has to ask for them.
+        self._made: dict[str, dict[str, Any]] = {}
+        #: Uid of the pod that was found at first: another one of the same Job isn't the machine.
+        self._pods: dict[str, str] = {}
+
+    @classmethod
+    def configured(cls) -> bool:
+        """Return whether there is a kubeconfig, or this is a pod that may use the API."""
+        return kubernetes_api.configured()
+
+    def answers(self) -> str:
+        """Return the API server's version and the namespace that is used."""
+        api = kubernetes_api.connect()
+        version = api.request('GET', '/version', patience=_FIRST)
+        return f"{api.server} answers, {version.get('gitVersion')}, namespace '{api.namespace}'"
+
+    def check(self, spec: MachineSpec) -> None:
+        """Look at the options, and ask the cluster what this user may do there."""
+        options = Options.parse(spec.options)
+        if spec.on_exit == 'stop':
+            raise ConfigurationError(
+                f"'{spec.name}' is a pod, which can't be stopped and started again",
+                "use on_exit='keep' or 'delete'")
+        api, namespace = self._place(options)
+        self._lifetimes[names.job_name(spec.name)] = spec.lifetime
+        review = api.request(
+            'POST', _REVIEW, {'spec': {'namespace': namespace}}, patience=_FIRST)
+        status = review.get('status') or {}
+        lacking = hints.missing_rights(status.get('resourceRules') or ())
+        # a cluster whose authorizer can't list all rules says so; what it refuses is told then
+        if lacking and not status.get('incomplete'):
+            raise PrerequisiteError(
+                f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
+                f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Try the pod's admission, then make the Job and what leads UDP to it."""
+        options = Options.parse(spec.options)
+        api, namespace = self._place(options)
+        self._lifetimes[names.job_name(spec.name)] = spec.lifetime
+        existing = None
+        try:
+            api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
+                        dryRun='All', cancel=request.cancel)
+        except ApiError as error:
+            # the first attempt with this token may have used the quota up
+            existing = self._existing(api, namespace, spec, request)
+            if existing is None:
+                raise _refused(error, f"the pod of '{spec.name}'", namespace) from error
+        job = existing or self._make_job(api, namespace, spec, request, options)
+        machine_id = str(MachineId(namespace, str(job['metadata']['name']),
+                                   str(job['metadata']['uid']), api.context))
+        try:
+            ways.make(api, namespace, spec, request, options, job)
+        except BaseException:
+            self.destroy(machine_id)
+            raise
+        self._made[machine_id] = job
+        return machine_id
+
+    def _make_job(
+        self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
+        options: Options,
+    ) -> dict[str, Any]:
+        try:
+            return api.request('POST', path('jobs', namespace),
+                               manifests.job(spec, request, options), cancel=request.cancel)
+        except ApiError as error:
+            if error.reason != 'AlreadyExists':
+                raise _refused(error, f"the Job of '{spec.name}'", namespace) from error
+            existing = self._existing(api, namespace, spec, request)
+            if existing is None:
+                raise NameTaken(
+                    f"namespace '{namespace}' has a machine '{spec.name}' already",
+                    f'give the machine another name=, or: ros2 fog delete {spec.name}') from error
+            return existing
+
+    def _existing(
+        self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
+    ) -> Optional[dict[str, Any]]:
+        """Return the Job that an earlier attempt with this token has made."""
+        with contextlib.suppress(ApiError):
+            found = api.request('GET', path('jobs', namespace, names.job_name(spec.name)))
+            if names.annotation(found, names.ATTEMPT) == request.token:
+                return found
+        return None
+
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, cancel: threading.Event,
+    ) -> Machine:
+        """Watch the pod until it runs, then find the way that UDP takes to it."""
+        where = MachineId.parse(machine_id)
+        api = kubernetes_api.connect(where.context)
+        begin = time.monotonic()
+        job = self._made.get(machine_id) or self._job(api, where)
+        pod = Start(api, where, job, name=name).wait(timeout=timeout, cancel=cancel)
+        self._pods[machine_id] = str(pod['metadata']['uid'])
+        change = self._again(machine_id, job)
+        exposure = ways.known(job)
+        if exposure is None:
+            exposure = ways.find(
+                api, where, job, pod, cancel=cancel,
+                timeout=max(1.0, timeout - (time.monotonic() - begin)))
+            change.update(manifests.exposure_patch({names.EXPOSURE: str(exposure)}))
+        if change:
+            with _translated(f"the Job of '{name}'", where.namespace):
+                job = api.request(
+                    'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
+        return self._machine(api, where, job, pod)
+
+    def _again(self, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the change by which a machine that was kept lives for another lifetime."""
+        lifetime = self._lifetimes.get(str(job['metadata']['name']))
+        begun = (job.get('status') or {}).get('startTime')
+        if machine_id in self._made or lifetime is None or not begun:
+            return {}
+        age = max(0.0, time.time() - pods.timestamp(str(begun)))
+        return {'spec': {'activeDeadlineSeconds': int(age + lifetime) + 1}}
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return what the cluster knows of a machine now."""
+        where = MachineId.parse(machine_id)
+        api = kubernetes_api.connect(where.context)
+        job = self._job(api, where)
+        pod = pods.pod_of(job, self._pods_of(api, where))
+        known = self._pods.get(machine_id)
+        if known and (pod is None or pod['metadata']['uid'] != known):
+            raise MachineNotFound(f"the pod of '{where.job}' is gone")
+        return self._machine(api, where, job, pod)
+
+    def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """Yield the Jobs that carry all of ``tags``, in all namespaces if that is allowed."""
+        contexts = {'', *(context for context, _ in self._places)}
+        seen: set[str] = set()
+        for context in sorted(contexts):
+            if context == '' and not kubernetes_api.configured():
+                continue
+            api = kubernetes_api.connect(context)
+            labels = selector(names.wanted(tags))
+            for namespace, jobs in self._jobs(api, labels):
+                wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
+                found = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
+                for job in wanted:
+                    meta = job['metadata']
+                    if meta['uid'] not in seen:
+                        seen.add(str(meta['uid']))
+                        where = MachineId(str(meta['namespace']), str(meta['name']),
+                                          str(meta['uid']), api.context)
+                        yield self._machine(api, where, job, pods.pod_of(job, found))
+
+    def _jobs(self, api: Api, labels: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+        try:
+            yield '', list(items(self._ask(api, 'jobs', '', labels)))
+            return
+        except ApiError as error:
+            if error.status != 403:
+                raise
+        namespaces = {api.namespace, *(
+            space for context, space in self._places if context in ('', api.context))}
+        for namespace in sorted(namespaces):
+            with _translated('listing the machines', namespace):
+                yield namespace, list(items(self._ask(api, 'jobs', namespace, labels)))
+
+    def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
+        return api.request('GET', path(kind, namespace), labelSelector=labels, patience=_FIRST)
+
+    def destroy(self, machine_id: str) -> None:
+        """Delete the Job; returns when it, its pod and its Service are gone."""
+        where = MachineId.parse(machine_id)
+        api = kubernetes_api.connect(where.context)
+        target = path('jobs', where.namespace, where.job)
+
+        def gone() -> Optional[bool]:
+            try:
+                now = api.request('GET', target)
+            except ApiError as error:
+                if error.status == 404:
+                    return True
+                raise
+            return True if now['metadata']['uid'] != where.uid else None
+
+        with _translated(f"deleting '{where.job}'", where.namespace):
+            try:
+                answer = api.request('DELETE', target, {
+                    'kind': 'DeleteOptions', 'apiVersion': 'v1',
+                    'propagationPolicy': 'Foreground', 'preconditions': {'uid': where.uid}})
+            except ApiError as error:
+                # gone, or gone and another of the name in its place
+                if error.status in (404, 409):
+                    return
+                raise
+            # or the pod would take the time that it gets when the cluster takes it away
+            api.request(
+                'DELETE', path('pods', where.namespace),
+                {'kind': 'DeleteOptions', 'apiVersion': 'v1', 'gracePeriodSeconds': _GRACE},
+                labelSelector=selector({names.MACHINE: where.job}))
+            api.follow(
+                path('jobs', where.namespace),
+                lambda event, job: True if event == 'DELETED' else None, again=gone,
+                timeout=_GONE, what=f"'{where.job}' to be deleted",
+                fieldSelector=f'metadata.name={where.job}',
+                resourceVersion=(answer.get('metadata') or {}).get('resourceVersion'))
+        self._pods.pop(machine_id, None)
+
+    # -- what all of them need ------------------------------------------------------------------
+
+    def _place(self, options: Options) -> tuple[Api, str]:
+        api = kubernetes_api.connect(options.context)
+        namespace = options.namespace or api.namespace
+        with self._lock:
+            self._places.add((options.context, namespace))
+        return api, namespace
+
+    def _job(self, api: Api, where: MachineId) -> dict[str, Any]:
+        try:
+            job = api.request('GET', path('jobs', where.namespace, where.job))
+        except ApiError as error:
+            if error.status == 404:
+                raise MachineNotFound(f"'{where.job}' does not exist any more") from error
+            raise _refused(error, f"reading '{where.job}'", where.namespace) from error
+        if job['metadata']['uid'] != where.uid:
+            raise MachineNotFound(f"'{where.job}' does not exist any more")
+        return job
+
+    def _pods_of(self, api: Api, where: MachineId) -> list[dict[str, Any]]:
+        with _translated('listing pods', where.namespace):
+            return list(items(self._ask(
+                api, 'pods', where.namespace, selector({names.MACHINE: where.job}))))
+
+    def _machine(
+        self, api: Api, where: MachineId, job: Mapping[str, Any],
+        pod: Optional[Mapping[str, Any]],
+    ) -> Machine:
+        state = pods.state_of(job, pod)
+        tags = names.tags_of(job)
+        status = (pod or {}).get('status') or {}
+        shell = None
+        if pod is not None and state is MachineState.RUNNING:
+            shell = Endpoint(
+                'kubernetes', names.endpoint_host(
+                    where.namespace, str(pod['metadata']['name']), where.context),
+                0, names.annotation(job, names.LOGIN))
+        exposure = ways.known(job)
+        address = str(status.get('podIP') or '')
+        return Machine(
+            id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,
+            state=state, created=pods.timestamp(str(job['metadata']['creationTimestamp'])),
+            shell=shell, vpn_host=address if exposure is None else exposure.host,
+            vpn_port=0 if exposure is None else exposure.port,
+            robot_host=ways.robot_host(api, job),
+            inner_network=f'kubernetes {api.server}', inner_host=address,
+            place=f'{where.context}/{where.namespace}'.lstrip('/'), kind=kind_of(job),
+            tags=tags, end_command=boot.END_COMMAND)
+
+
+def kind_of(job: Mapping[str, Any]) -> str:
+    """Return what a machine is in a few words: what it may use, and its image."""
+    container = job['spec']['template']['spec']['containers'][0]
+    limits = (container.get('resources') or {}).get('limits') or {}
+    words = [f'{value} {name}' for name, value in sorted(limits.items())]
+    return ', '.join([*words, str(container['image']).rpartition('/')[2]])
+
+
+def _refused(error: ApiError, what: str, namespace: str) -> ProviderError:
+    message = str(error.args[0])
+    return ProviderError(f'the cluster refused {what}: {message}',
+                         error.hint or hints.of_refusal(message, namespace))
+
+
+@contextlib.contextmanager
+def _translated(what: str, namespace: str) -> Iterator[None]:
+    try:
+        yield
+    except ApiError as error:
+        raise _refused(error, what, namespace) from error

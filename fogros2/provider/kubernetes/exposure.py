@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How WireGuard's UDP gets from the robot to a pod.
+
+A load balancer, a port of the nodes, or, where neither lets UDP through, the pod dials the robot.
+WireGuard answers nobody it doesn't know, so the pod answers a question of ours on that port until
+its agent comes: what answers is known to work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+import dataclasses
+import re
+import secrets
+import select
+import socket
+import threading
+import time
+from typing import Any, Optional
+from urllib.parse import urlsplit
+
+from fogros2.kubernetes_api import cancelled
+
+#: Seconds between two questions.
+INTERVAL = 0.1
+#: Seconds in which a load balancer has to be there, and to answer: clouds take minutes.
+LOAD_BALANCER = 180.0
+#: Seconds in which a port of a node that is going to answer does.
+NODE_PORT = 6.0
+
+#: Versions of the API server that tell whose cluster it is, and that it makes load balancers.
+_VERSIONS = {r'-eks-': 'EKS', r'-gke\.': 'GKE', r'\+k3s': 'k3s', r'\+rke2': '', r'-aliyun': 'ACK'}
+_SERVERS = {r'\.eks\.amazonaws\.com(\.cn)?$': 'EKS', r'\.azmk8s\.io$': 'AKS',
+            r'\.gke\.goog$': 'GKE', r'\.k8s\.ondigitalocean\.com$': 'DigitalOcean'}
+#: API groups of what makes load balancers in clusters of one's own.
+_GROUPS = {'metallb.io': 'MetalLB', 'purelb.io': 'PureLB', 'loxilb.io': 'LoxiLB'}
+
+
+@dataclasses.dataclass(frozen=True)
+class Exposure:
+    """
+    The way that was found.
+
+    :param kind: one of ``options.EXPOSURES``.
+    :param host: where the robot reaches the pod, '' where the pod dials the robot.
+    :param port: UDP port there, 0 for the VPN's own.
+    :param why: in a few words, for people.
+    """
+
+    kind: str
+    host: str = ''
+    port: int = 0
+    why: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.kind} {self.host or "-"} {self.port} {self.why}'
+
+    @classmethod
+    def parse(cls, text: str) -> Optional[Exposure]:
+        """Return what ``str`` has written down, None if it is no such text."""
+        words = text.split(' ', 3)
+        if len(words) < 3 or not words[2].isdigit():
+            return None
+        return cls(words[0], '' if words[1] == '-' else words[1], int(words[2]),
+                   words[3] if len(words) > 3 else '')
+
+
+def load_balancers(version: str, server: str, groups: Iterable[str] = ()) -> str:
+    """
+    Return who makes load balancers in a cluster, '' if nobody is known to.
+
+    Asking for one where nobody makes any means waiting in vain.
+
+    :param version: ``gitVersion`` of the API server.
+    :param server: its URL.
+    :param groups: the API groups it has.
+    """
+    for pattern, name in _VERSIONS.items():
+        if re.search(pattern, version) and name:
+            return name
+    host = urlsplit(server).hostname or ''
+    for pattern, name in _SERVERS.items():
+        if re.search(pattern, host):
+            return name
+    return next((name for group, name in _GROUPS.items() if group in groups), '')
+
+
+def ingress(service: Mapping[str, Any]) -> list[str]:
+    """Return the addresses and names of a load balancer, once it has some."""
+    found = ((service.get('status') or {}).get('loadBalancer') or {}).get('ingress') or ()
+    return [str(each.get('ip') or each.get('hostname')) for each in found
+            if each.get('ip') or each.get('hostname')]
+
+
+def node_port(service: Mapping[str, Any]) -> int:
+    """Return the port of the nodes that leads to the pod, 0 if there is none."""
+    return int(service['spec']['ports'][0].get('nodePort') or 0)
+
+
+def node_addresses(node: Mapping[str, Any]) -> list[str]:
+    """Return a node's addresses, those for outside first."""
+    found = (node.get('status') or {}).get('addresses') or ()
+    order = ('ExternalIP', 'InternalIP')
+    return [str(each['address']) for kind in order for each in found if each['type'] == kind]
+
+
+def first_to_answer(
+    places: Sequence[tuple[str, int]], word: str, *, timeout: float,
+    cancel: Optional[threading.Event] = None,
+) -> Optional[tuple[str, int]]:
+    """
+    Return the first of several (host, port) at which the pod answers, None if none does.
+
+    :param word: what the pod listens for.
+    :raises Cancelled: ``cancel`` was set.
+    """
+    question = word.encode() + b' ' + secrets.token_hex(8).encode()
+    deadline = time.monotonic() + timeout
+    with contextlib.ExitStack() as undo:
+        links: dict[socket.socket, tuple[str, int]] = {}
+        for host, port in places:
+            with contextlib.suppress(OSError):
+                family, kind, protocol, _, address = socket.getaddrinfo(
+                    host, port, socket.AF_INET, socket.SOCK_DGRAM)[0]
+                link = undo.enter_context(socket.socket(family, kind, protocol))
+                link.setblocking(False)
+                # connected: another's datagram isn't taken for an answer
+                link.connect(address)
+                links[link] = (str(address[0]), port)
+        while links and time.monotonic() < deadline:
+            cancelled(cancel, 'looking for a way into the cluster')
+            for link in links:
+                with contextlib.suppress(OSError):
+                    link.send(question)
+            ready, _, _ = select.select(list(links), [], [], INTERVAL)
+            for link in ready:
+                with contextlib.suppress(OSError):
+                    if link.recv(512) == question:
+                        return links[link]
+            if ready and not any(link.fileno() < 0 for link in links):
+                # refused, by a node that isn't ready: not a reason to ask in a tight loop
+                (cancel or threading.Event()).wait(INTERVAL / 2)
+    return None
+
+
+def own_address(server: str) -> str:
+    """Return the address from which this computer speaks with an API server, '' if it can't."""
+    parts = urlsplit(server)
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.connect((parts.hostname or '', parts.port or 443))
+        return str(link.getsockname()[0])
+    return ''

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a cluster's refusals mean, and what to do about them; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import re
+from typing import Any
+
+#: API group, resource, verbs.
+Right = tuple[str, str, tuple[str, ...]]
+#: What a robot has to be allowed, as in deploy/kubernetes/role.yaml.
+RIGHTS: tuple[Right, ...] = (
+    ('batch', 'jobs', ('create', 'get', 'list', 'watch', 'patch', 'delete')),
+    ('', 'pods', ('create', 'get', 'list', 'watch', 'deletecollection')),
+    ('', 'pods/exec', ('create', 'get')),
+    ('', 'events', ('list',)),
+    ('', 'services', ('create', 'get', 'list')),
+)
+
+_FORBIDDEN = re.compile(
+    r'User "(?P<user>[^"]*)" cannot (?P<verb>\w+) resource "(?P<resource>[^"]*)"'
+    r' in API group "(?P<group>[^"]*)"(?: in the namespace "(?P<namespace>[^"]*)")?')
+
+
+def of_refusal(message: str, namespace: str) -> str:
+    """
+    Return the remedy for what the API server, or one of its admission plugins, said.
+
+    >>> of_refusal('pods "x" is forbidden: violates PodSecurity "baseline:latest"', 'robots')[:21]
+    'a VPN takes NET_ADMIN'
+    """
+    if match := _FORBIDDEN.search(message):
+        resource = match['resource'] + (f".{match['group']}" if match['group'] else '')
+        where = f"namespace '{match['namespace']}'" if match['namespace'] else 'whole cluster'
+        return (f"let '{match['user']}' {match['verb']} {resource} in the {where}: "
+                'deploy/kubernetes/role.yaml has all that a robot needs')
+    if 'violates PodSecurity' in message:
+        return ('a VPN takes NET_ADMIN, which the namespace forbids: kubectl label namespace '
+                f'{namespace} pod-security.kubernetes.io/enforce=privileged --overwrite')
+    if 'pod security policy' in message.lower():
+        return ('a VPN takes NET_ADMIN: let the service account use a PodSecurityPolicy whose '
+                'allowedCapabilities has it')
+    if 'admission webhook' in message:
+        return ('a policy of the cluster refuses the pod, which asks for NET_ADMIN and user 0, '
+                f"and is not privileged: have it allowed in namespace '{namespace}'")
+    if 'security context constraint' in message:
+        return ('a VPN takes NET_ADMIN: grant the service account a security context constraint '
+                'that allows it')
+    if 'exceeded quota' in message:
+        return (f"ask for less (mcpu=, mb=, gpus=), end other machines of namespace '{namespace}',"
+                ' or have its quota raised')
+    if 'failed quota' in message or 'must specify' in message:
+        return f"the quota of namespace '{namespace}' wants mcpu= and mb= to be given"
+    if 'LimitRange' in message or re.search(r'(minimum|maximum) \S+ usage per', message):
+        return f"the limits of namespace '{namespace}' allow other mcpu= and mb= alone"
+    if re.search(r'namespaces? "[^"]*" not found', message):
+        return f'kubectl create namespace {namespace}'
+    if 'serviceaccount' in message and 'not found' in message:
+        return 'check service_account='
+    if 'RuntimeClass' in message and 'not found' in message:
+        return 'check runtime_class=; `kubectl get runtimeclass` lists what there is'
+    if 'is being terminated' in message:
+        return f"namespace '{namespace}' is being deleted: take another one"
+    return ''
+
+
+def missing_rights(
+    rules: Iterable[Mapping[str, Any]], rights: Sequence[Right] = RIGHTS,
+) -> list[str]:
+    """
+    Return what a user may not do though a robot needs it, such as 'create pods/exec'.
+
+    :param rules: ``resourceRules`` of a SelfSubjectRulesReview's answer.
+    """
+    allowed = [rule for rule in rules if not rule.get('resourceNames')]
+
+    def may(group: str, resource: str, verb: str) -> bool:
+        kind, _, part = resource.partition('/')
+        fit = {resource, '*', *([f'*/{part}'] if part else [])}
+        return any(
+            {'*', verb} & set(rule.get('verbs') or ())
+            and {'*', group} & set(rule.get('apiGroups') or ())
+            and fit & set(rule.get('resources') or ())
+            for rule in allowed)
+
+    return [f'{verb} {resource}{f".{group}" if group else ""}'
+            for group, resource, verbs in rights for verb in verbs
+            if not may(group, resource, verb)]
+
+
+def of_scheduling(message: str, gpu_resource: str = 'nvidia.com/gpu') -> str:
+    """Return the remedy for a pod that fits on no node."""
+    hints = []
+    if f'Insufficient {gpu_resource}' in message:
+        hints.append(f'no node has enough free {gpu_resource}: is its device plugin installed, '
+                     'or another gpu_resource= right?')
+    if re.search(r'Insufficient (cpu|memory|pods|ephemeral)', message):
+        hints.append('ask for less (mcpu=, mb=), or add a node')
+    if re.search(r"didn't match (Pod's )?node (affinity|selector)|node selector", message):
+        hints.append('no node carries the labels of node_selector=')
+    if 'taint' in message:
+        hints.append('nodes carry taints: name them in tolerations=')
+    return '; '.join(hints) or '`kubectl describe nodes` shows what they have'
+
+
+def of_image(reason: str, message: str, image: str) -> str:
+    """Return the remedy for an image that can't be had, or a container that can't begin."""
+    text = message.lower()
+    if reason == 'InvalidImageName':
+        return f"container_image='{image}' is no image's name"
+    if re.search(r'unauthorized|authorization|denied|forbidden|credentials|401|403', text):
+        return ('the registry wants a login, or has no such image: check container_image=, and '
+                'name the secret in image_pull_secrets=')
+    if re.search(r'not ?found|manifest unknown|does not exist|no such', text):
+        return 'check container_image=, its tag and its registry'
+    if re.search(r'no match for platform|exec format|no matching manifest', text):
+        return ("the image isn't made for the nodes' architecture: build it for theirs, or "
+                'choose nodes with node_selector=')
+    if reason in ('ErrImagePull', 'ImagePullBackOff'):
+        return 'can the nodes reach the registry?'
+    if reason == 'CreateContainerConfigError':
+        return 'the image or the options ask for what the namespace does not have'
+    return '`kubectl describe pod` shows more'

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a launch file may ask of a pod; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import dataclasses
+import re
+from typing import Any
+
+from fogros2.errors import ConfigurationError
+from fogros2.provider.options import convert, known
+
+IMAGE = 'docker.io/library/ros:jazzy-ros-base'
+#: How the robot's VPN gets to a pod, in the order in which 'auto' tries them.
+EXPOSURES = ('load_balancer', 'node_port', 'pod_dials_robot', 'pod_ip')
+
+_LABEL = re.compile(r'[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?')
+_TOLERATION = ('key', 'operator', 'value', 'effect', 'tolerationSeconds')
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """
+    What a launch file may ask of a pod.
+
+    :param container_image: has Python 3.10 and ``sh`` at least.
+    :param namespace: '' for the context's own.
+    :param context: of the kubeconfig; '' for the current one.
+    :param zone: the pod runs there if it can.
+    :param mcpu: thousandths of a CPU, as request and as limit; 0 for no say.
+    :param mb: MiB of memory, as request and as limit; 0 for no say.
+    :param gpus: devices of the kind ``gpu_resource``.
+    :param node_selector: labels that the node has to carry.
+    :param tolerations: as in a pod's specification.
+    :param runtime_class: such as 'nvidia'.
+    :param image_pull_secrets: names of secrets in the namespace.
+    :param service_account: whose rights the pod's admission is judged by; its token stays away.
+    :param expose: one of ``EXPOSURES``, or 'auto'.
+    :param robot_host: address at which pods reach the robot, for pods that have to dial it; ''
+        for the one that its connection to the API server comes from.
+    :param user: login user, made where the image has none of this name.
+    :param env: variables of every login.
+    :param annotations: for the Service, such as a cloud's wishes for a load balancer.
+    """
+
+    container_image: str = IMAGE
+    namespace: str = ''
+    context: str = ''
+    zone: str = ''
+    mcpu: int = 0
+    mb: int = 0
+    gpus: int = 0
+    gpu_resource: str = 'nvidia.com/gpu'
+    node_selector: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    tolerations: tuple[Mapping[str, Any], ...] = ()
+    runtime_class: str = ''
+    image_pull_secrets: tuple[str, ...] = ()
+    service_account: str = ''
+    expose: str = 'auto'
+    robot_host: str = ''
+    user: str = 'fog'
+    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    annotations: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, given: Mapping[str, Any]) -> Options:
+        """
+        Return the options of a spec.
+
+        :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
+        """
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        options = cls(**{
+            name: _converted(name, value, fields[name].default)
+            for name, value in known(given, fields, 'a Kubernetes machine').items()})
+        _check_values(options)
+        return options
+
+
+def _converted(name: str, value: Any, default: Any) -> Any:
+    if name == 'tolerations':
+        return _tolerations(value)
+    return convert(name, value, {} if default is dataclasses.MISSING else default)
+
+
+def _tolerations(value: Any) -> tuple[Mapping[str, Any], ...]:
+    if isinstance(value, Sequence) and not isinstance(value, str) and all(
+            isinstance(each, Mapping) and set(each) <= set(_TOLERATION) for each in value):
+        return tuple(dict(each) for each in value)
+    raise ConfigurationError(
+        f"option 'tolerations' can't be {value!r}",
+        "it takes dictionaries such as {'key': 'gpu', 'operator': 'Exists'}")
+
+
+def _check_values(options: Options) -> None:
+    if options.expose not in ('auto', *EXPOSURES):
+        raise ConfigurationError(f"expose= can't be '{options.expose}'",
+                                 f"it takes auto, {', '.join(EXPOSURES)}")
+    if not options.container_image or any(c.isspace() for c in options.container_image) \
+            or options.container_image.startswith('-'):
+        raise ConfigurationError(f"container_image= can't be '{options.container_image}'",
+                                 f"it takes an image's name, such as {IMAGE}")
+    if options.namespace and not _LABEL.fullmatch(options.namespace):
+        raise ConfigurationError(f"'{options.namespace}' can't be a namespace",
+                                 'lower-case letters, digits and - make one, 63 at most')
+    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
+        raise ConfigurationError(f"'{options.user}' can't be a user name")
+    if any(c.isspace() or c in '/@' for c in options.robot_host):
+        raise ConfigurationError(f"robot_host= can't be '{options.robot_host}'",
+                                 'it takes an address or a name')
+    for name in options.env:
+        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name):
+            raise ConfigurationError(f"env= can't carry the variable {name!r}")

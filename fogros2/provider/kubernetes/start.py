@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Waiting for a pod to run: one watch, and a verdict on what keeps it from running."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2.errors import DeadlineExceeded, ProviderError
+from fogros2.kubernetes_api import Api, ApiError, items, path, selector
+from fogros2.model import MachineState
+from fogros2.provider.kubernetes import hints, names, pods
+from fogros2.provider.kubernetes.names import MachineId
+from fogros2.provider.kubernetes.pods import Trouble
+
+#: Seconds for which something may be in the way that time can mend: a node that is just being
+#: freed, a registry that doesn't answer at first.
+PATIENCE = 15.0
+#: Seconds after which the events are asked why there is no pod, or one that doesn't begin.
+QUIET = 5.0
+
+
+class Start:
+    """
+    The time from a Job to its running pod.
+
+    :param name: the machine's, for messages.
+    """
+
+    def __init__(
+        self, api: Api, where: MachineId, job: Mapping[str, Any], *, name: str,
+    ) -> None:
+        self._api = api
+        self._where = where
+        self._job = job
+        self._name = name
+        self._pod: Optional[dict[str, Any]] = None
+        self._trouble: Optional[Trouble] = None
+        self._since = 0.0
+        self._scales_up = False
+        self._next_events = time.monotonic() + QUIET
+
+    def wait(self, *, timeout: float, cancel: threading.Event) -> dict[str, Any]:
+        """
+        Return the pod as soon as its container runs.
+
+        :raises ProviderError: it can't, with the event's text.
+        :raises DeadlineExceeded: it doesn't, with what is in the way.
+        """
+        try:
+            return self._api.follow(
+                path('pods', self._where.namespace), self._look, tick=self._tick,
+                again=self._again, timeout=timeout, cancel=cancel,
+                what=f"the pod of '{self._name}' to run",
+                labelSelector=selector({names.MACHINE: self._where.job}))
+        except ApiError as error:
+            raise ProviderError(
+                f'the cluster refused to let the pods be watched: {error.args[0]}',
+                hints.of_refusal(str(error.args[0]), self._where.namespace)) from error
+        except DeadlineExceeded as error:
+            if self._trouble is None:
+                raise
+            raise self._error(self._trouble) from error
+
+    def _look(self, event: str, pod: dict[str, Any]) -> Optional[dict[str, Any]]:
+        if pods.pod_of(self._job, [pod]) is None:
+            return None  # of another Job that had the name
+        if event == 'DELETED' or pods.state_of(self._job, pod) is MachineState.STOPPING:
+            raise ProviderError(
+                f"'{self._name}' ended while it was coming up: {pods.end_of(self._job, pod)}",
+                'is its image one with Python 3 and sh, and nobody deletes it?')
+        if pods.is_running(pod):
+            return pod
+        self._pod = pod
+        gpus = [name for name in self._limits() if '/' in name]
+        self._note(pods.trouble_of(pod, gpu_resource=gpus[0] if gpus else 'nvidia.com/gpu'))
+        return None
+
+    def _limits(self) -> Mapping[str, Any]:
+        container = self._job['spec']['template']['spec']['containers'][0]
+        return (container.get('resources') or {}).get('limits') or {}
+
+    def _note(self, trouble: Optional[Trouble]) -> None:
+        if trouble is not None and trouble.final:
+            raise self._error(trouble)
+        if trouble is None or self._trouble is None:
+            self._since = time.monotonic()
+        self._trouble = trouble
+
+    def _error(self, trouble: Trouble) -> ProviderError:
+        return ProviderError(f"the pod of '{self._name}' does not run: {trouble.what}",
+                             trouble.hint)
+
+    def _again(self) -> None:
+        """Look whether the Job is there still, when a watch was lost."""
+        try:
+            self._api.request('GET', path('jobs', self._where.namespace, self._where.job))
+        except ApiError as error:
+            if error.status == 404:
+                raise ProviderError(f"'{self._name}' was deleted while it was coming up") \
+                    from error
+            raise
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        late = self._trouble is not None and now - self._since >= PATIENCE
+        if now >= self._next_events and (late or self._trouble is None):
+            # seldom: what it tells can't be watched without being told of everybody's
+            self._next_events = now + 4 * QUIET
+            self._events()
+        if late and self._trouble is not None and not self._scales_up:
+            raise self._error(self._trouble)
+
+    def _events(self) -> None:
+        meta = (self._pod or self._job)['metadata']
+        found = items(self._api.request(
+            'GET', path('events', self._where.namespace),
+            fieldSelector=f"involvedObject.uid={meta['uid']}"))
+        self._scales_up = pods.scales_up(found)
+        told = pods.trouble_in(found)
+        if told is not None and (told.final or self._trouble is None):
+            self._note(told)
