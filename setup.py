@@ -31,6 +31,8 @@ def data_files():
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
 
 
+#: What machines at AWS take; `import fogros2` and `ros2 fog` work without.
+AWS = ['boto3', 'requests']
 #: What nodes that handle images need; a robot that streams none doesn't.
 VIDEO = ['av', 'numpy', 'opencv-python-headless']
 
@@ -46,16 +48,18 @@ setup(
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
+        'aws': AWS,
         'bench': ['matplotlib'],
         'kubernetes': ['kubernetes'],
         'test': [
-            'hypothesis', 'mypy', 'pytest', 'pytest-timeout', 'ruff', 'types-paramiko',
-            'types-PyYAML', *VIDEO],
+            'hypothesis', 'moto[server]', 'mypy', 'pytest', 'pytest-timeout', 'ruff',
+            'types-paramiko', 'types-PyYAML', *AWS, *VIDEO],
         'video': VIDEO,
     },
     zip_safe=False,
     entry_points={
         'fogros2.provider': [
+            'aws = fogros2.provider.aws:AWSProvider',
             'container = fogros2.provider.container:ContainerProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',
@@ -91,8 +95,11 @@ setup(
             'doctor = ros2fog_cli.verb.doctor:DoctorVerb',
             'env = ros2fog_cli.verb.env:EnvVerb',
             'gc = ros2fog_cli.verb.gc:GcVerb',
+            'image = ros2fog_cli.verb.image:ImageVerb',
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
+            'price = ros2fog_cli.verb.price:PriceVerb',
+            'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
         ],
     },

@@ -18,11 +18,15 @@ from fogros2.provider import Provider, TAG_NAME
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
 
+#: A key whose private half nobody has; providers look whether it is one.
+PUBLIC_KEY = ('ssh-ed25519 '
+              'AAAAC3NzaC1lZDI1NTE5AAAAILTdX1OUsetUy/jyOuvKiGOBNBXDpA+BhuJy7Gz4ifrw test')
+
 
 def request_for(spec: MachineSpec, *, token: Optional[str] = None, **tags: str) -> CreateRequest:
     """Return a request as the core makes it, for a machine that nobody logs in to."""
     return CreateRequest(
-        token=token or str(uuid.uuid4()), authorized_key='ssh-ed25519 AAAA test',
+        token=token or str(uuid.uuid4()), authorized_key=PUBLIC_KEY,
         tags={TAG_NAME: spec.name, **tags}, vpn_port=51820)
 
 

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""boto3's clients: made once per service and region, patient, their errors translated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import os
+from pathlib import Path
+import threading
+from typing import Any, Optional
+
+from fogros2.errors import PrerequisiteError
+from fogros2.provider.aws.failures import translated
+
+#: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
+ATTEMPTS = 8
+CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
+#: Variables and files that say that somebody has set AWS up on this computer.
+_VARIABLES = (
+    'AWS_ACCESS_KEY_ID', 'AWS_PROFILE', 'AWS_DEFAULT_PROFILE', 'AWS_WEB_IDENTITY_TOKEN_FILE',
+    'AWS_CONTAINER_CREDENTIALS_RELATIVE_URI', 'AWS_CONTAINER_CREDENTIALS_FULL_URI')
+_FILES = {'AWS_SHARED_CREDENTIALS_FILE': '~/.aws/credentials', 'AWS_CONFIG_FILE': '~/.aws/config'}
+
+
+def configured() -> bool:
+    """Return whether somebody has set AWS up here; files and variables alone are looked at."""
+    if any(os.environ.get(name) for name in _VARIABLES):
+        return True
+    return any(Path(os.environ.get(variable) or usual).expanduser().is_file()
+               for variable, usual in _FILES.items())
+
+
+class Account:
+    """
+    An AWS account as boto3 finds it (variables, files, roles); thread-safe.
+
+    ``AWS_ENDPOINT_URL`` leads every call to another server, as boto3 has it.
+
+    :param session: a ``boto3.session.Session``; None for the usual one, made when first needed.
+    """
+
+    def __init__(self, session: Optional[Any] = None) -> None:
+        self._session = session
+        self._clients: dict[tuple[str, str, bool], Any] = {}
+        # making clients of one session in several threads isn't safe; using them is
+        self._lock = threading.RLock()
+
+    def session(self) -> Any:
+        """
+        Return the boto3 session.
+
+        :raises PrerequisiteError: boto3 isn't installed, or its configuration can't be read.
+        """
+        with self._lock:
+            if self._session is None:
+                try:
+                    import boto3
+                except ImportError as error:
+                    raise PrerequisiteError(
+                        'machines at AWS take boto3, which is not installed',
+                        "python3 -m pip install 'fogros2[aws]'") from error
+                with translated('reading the AWS configuration'):
+                    self._session = boto3.session.Session()
+            return self._session
+
+    def region(self) -> str:
+        """Return the region that the user's configuration names, '' for none."""
+        return str(os.environ.get('AWS_REGION') or self.session().region_name or '')
+
+    def check_credentials(self) -> None:
+        """
+        Look whether there are credentials; AWS isn't asked whether they are good.
+
+        :raises PrerequisiteError: there are none.
+        """
+        session = self.session()
+        with translated('looking for AWS credentials'):
+            with self._lock:
+                found = session.get_credentials()
+        if found is None:
+            raise PrerequisiteError(
+                'there are no AWS credentials on this computer',
+                'aws configure, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY')
+
+    def client(self, service: str, region: str, *, hasty: bool = False) -> Any:
+        """
+        Return the client of a service in a region.
+
+        :param hasty: for a question that somebody waits for: short deadlines, few attempts.
+        """
+        with self._lock:
+            found = self._clients.get((service, region, hasty))
+            if found is None:
+                session = self.session()
+                from botocore.config import Config
+                config = Config(
+                    retries={'mode': 'adaptive', 'total_max_attempts': 2 if hasty else ATTEMPTS},
+                    connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
+                    read_timeout=5.0 if hasty else READ_TIMEOUT,
+                    user_agent_extra='fogros2', max_pool_connections=20)
+                with translated(f"reaching AWS's {service}", region):
+                    found = session.client(service, region_name=region, config=config)
+                self._clients[(service, region, hasty)] = found
+            return found
+
+    def call(
+        self, service: str, region: str, operation: str, what: str, *, hasty: bool = False,
+        **parameters: Any,
+    ) -> Mapping[str, Any]:
+        """
+        Make one call and return its answer.
+
+        :param operation: as boto3's method is called.
+        :param what: completes '... in eu-central-1 failed'.
+        :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
+        """
+        client = self.client(service, region, hasty=hasty)
+        with translated(what, region, decode=lambda message: self._decode(region, message)):
+            answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
+        return answer
+
+    def pages(
+        self, service: str, region: str, operation: str, key: str, what: str,
+        **parameters: Any,
+    ) -> Iterator[Mapping[str, Any]]:
+        """Yield what all pages of an answer have under ``key``."""
+        client = self.client(service, region)
+        with translated(what, region, decode=lambda message: self._decode(region, message)):
+            # all of it within the block: a page is asked for when the one before is used up
+            found = [entry for page in client.get_paginator(operation).paginate(**parameters)
+                     for entry in page[key]]
+        yield from found
+
+    def _decode(self, region: str, message: str) -> str:
+        """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""
+        from botocore.exceptions import BotoCoreError, ClientError
+        try:
+            answer = self.client('sts', region, hasty=True).decode_authorization_message(
+                EncodedMessage=message)
+        except (ClientError, BotoCoreError):
+            return ''
+        return str(answer['DecodedMessage'])

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How a machine is made: its group and key, then one try after another to get an instance.
+
+Every try has its own client token that follows from the request's, so that asking again under the
+same token asks for the same machine. What was made for nothing is taken away again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
+from decimal import Decimal
+from typing import Any, Optional
+
+from fogros2.errors import Cancelled, FogError, NameTaken
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.provider.aws import images, instances, network
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.failures import AwsError, code_of, GONE, NO_ROOM, NO_ROOM_IN_REGION
+from fogros2.provider.aws.host_key import one_time
+from fogros2.provider.aws.images import Kind
+from fogros2.provider.aws.instances import MachineId, Place, TAG_ATTEMPT
+from fogros2.provider.aws.options import Options
+from fogros2.provider.aws.user_data import user_data
+
+#: Returns what a machine costs by the hour (US dollars), None where nobody knows.
+Price = Callable[[str, str], Optional[Decimal]]
+
+
+class Creation:
+    """
+    One request for a machine, in as many regions and zones as it takes.
+
+    :param robot_address: asked only where no ``ssh_from=`` names who may log in.
+    :param price: of a type in a region.
+    """
+
+    def __init__(
+        self, account: Account, spec: MachineSpec, request: CreateRequest, options: Options, *,
+        robot_address: Callable[[], str], price: Price,
+    ) -> None:
+        self.account = account
+        self.spec = spec
+        self.request = request
+        self.options = options
+        self.attempt = instances.attempt_of(request.token)
+        self._robot_address = robot_address
+        self._price = price
+
+    def run(self, regions: list[str], types: list[str]) -> MachineId:
+        """
+        Return the machine, in the first of the regions that has room for one of the types.
+
+        :raises NameTaken: a machine of that name is there, made under another token.
+        :raises FogError: see :mod:`~fogros2.provider.aws.failures`; nothing is left behind.
+        """
+        for number, region in enumerate(regions):
+            try:
+                return self._in_region(region, types)
+            except AwsError as error:
+                last = number == len(regions) - 1
+                if error.code not in NO_ROOM or last:
+                    raise
+        raise AssertionError('no region to try')
+
+    def _in_region(self, region: str, types: list[str]) -> MachineId:
+        with ThreadPoolExecutor(3, 'fog-aws') as pool:
+            # all of it before anything is made; side by side, since each is a way there and back
+            there = pool.submit(self._existing, region)
+            sources = pool.submit(self._sources)
+            vpc = pool.submit(network.vpc_of, self.account, region, self.options.subnet) \
+                if self.options.subnet else None
+            found = there.result()
+            if found is not None:
+                return found
+            kinds = images.kinds(self.account, region, types)
+            chosen = [(kind, self._image(region, kind, kinds)) for kind in kinds]
+            return self._make(region, chosen, sources.result(), _done(vpc))
+
+    def _existing(self, region: str) -> Optional[MachineId]:
+        """Return the machine that an earlier call with this token made, None for none."""
+        found = instances.instances_in(self.account.pages(
+            'ec2', region, 'describe_instances', 'Reservations',
+            f"looking for machines called '{self.spec.name}'",
+            Filters=[*instances.tag_filters({TAG_NAME: self.spec.name}),
+                     {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]))
+        for instance in found:
+            tags = instances.tags_of(instance)
+            if tags[TAG_ATTEMPT] == self.attempt:
+                return MachineId(region, instance['InstanceId'], self.attempt)
+        for instance in found:
+            owner = instances.tags_of(instance).get(TAG_ROBOT, '')
+            whose = f" of the robot '{owner}'" if owner else ''
+            raise NameTaken(
+                f"there is a machine '{self.spec.name}'{whose} in {region} already",
+                f'give the machine another name=, or: ros2 fog delete {self.spec.name}')
+        return None
+
+    def _sources(self) -> list[str]:
+        return list(self.options.ssh_from) or [self._robot_address()]
+
+    def _image(self, region: str, kind: Kind, kinds: list[Kind]) -> Mapping[str, Any]:
+        """Return a kind's image, asked once for all kinds that take the same."""
+        key = (region, kind.arch, kind.nvidia)
+        known: dict[Any, Mapping[str, Any]] = self.__dict__.setdefault('_images', {})
+        if key not in known:
+            known[key] = images.choose(
+                self.account, region, kind, self.options, self.request.dependencies)
+        return known[key]
+
+    def _make(
+        self, region: str, chosen: list[tuple[Kind, Mapping[str, Any]]], sources: list[str],
+        vpc: str,
+    ) -> MachineId:
+        tags = instances.own_tags(self.spec, self.request, self.options)
+        host_key = one_time(self.request.token)
+        data = user_data(
+            name=self.spec.name, user=self.options.user,
+            authorized_key=self.request.authorized_key, host_key=host_key,
+            agent_config=self.request.agent_config)
+        with contextlib.ExitStack() as undo:
+            # in this order: an undo of what was not made yet finds nothing, and that is fine
+            undo.callback(_attempt, lambda: self._drop_group(region))
+            undo.callback(_attempt, lambda: drop_key(self.account, region, self.attempt))
+            with ThreadPoolExecutor(1, 'fog-aws') as pool:
+                importing = pool.submit(self._import_key, region, tags)
+                group = network.create_group(
+                    self.account, region, attempt=self.attempt, name=self.spec.name, vpc=vpc,
+                    tags=tags, vpn_port=self.request.vpn_port, sources=sources)
+                importing.result()
+            instance = self._first_with_room(region, chosen, group, {
+                **tags, instances.TAG_HOST_KEY: host_key.public}, data)
+            undo.pop_all()
+            return MachineId(region, instance, self.attempt)
+
+    def _first_with_room(
+        self, region: str, chosen: list[tuple[Kind, Mapping[str, Any]]], group: str,
+        tags: dict[str, str], data: bytes,
+    ) -> str:
+        image_of = {kind.name: image for kind, image in chosen}
+        refused: Optional[AwsError] = None
+        full: set[str] = set()
+        for place in self._places(region, list(image_of)):
+            if place.kind in full:
+                continue
+            if self.request.cancel is not None and self.request.cancel.is_set():
+                raise Cancelled(f"creating '{self.spec.name}'")
+            price = self._price(region, place.kind)
+            if price is not None:
+                tags = {**tags, instances.TAG_PRICE: str(price)}
+                if self.options.max_price is not None and price > self.options.max_price:
+                    continue
+            words = instances.run_request(
+                self.spec, self.request, self.options, place=place, image=image_of[place.kind],
+                group=group, tags=tags, user_data=data)
+            try:
+                answer = self.account.call(
+                    'ec2', region, 'run_instances',
+                    f"creating '{self.spec.name}' ({place.kind})", **words)
+            except AwsError as error:
+                if error.code not in NO_ROOM:
+                    raise
+                # a quota holds for the whole region, a lack of machines for a zone
+                if error.code in NO_ROOM_IN_REGION:
+                    full.add(place.kind)
+                refused = error
+                continue
+            return str(answer['Instances'][0]['InstanceId'])
+        raise refused or AwsError(
+            f"no machine for '{self.spec.name}' in {region} costs at most "
+            f'max_price={self.options.max_price}', 'ros2 fog price shows what there is',
+            code='SpotMaxPriceTooLow')
+
+    def _places(self, region: str, types: list[str]) -> Iterator[Place]:
+        """Yield the tries: where EC2 likes best first, then zone by zone, type by type."""
+        if self.options.subnet:
+            yield from (Place(region, kind, self.options.subnet) for kind in types)
+            return
+        subnets: Optional[list[str]] = None
+        for kind in types:
+            yield Place(region, kind)
+            if subnets is None:  # the first had no room: who is there to ask else?
+                subnets = network.default_subnets(self.account, region)
+            yield from (Place(region, kind, subnet) for subnet in subnets)
+
+    def _import_key(self, region: str, tags: Mapping[str, str]) -> None:
+        try:
+            self.account.call(
+                'ec2', region, 'import_key_pair', f"importing the login key of '{self.spec.name}'",
+                KeyName=instances.own_name(self.attempt),
+                PublicKeyMaterial=self.request.authorized_key.encode(),
+                TagSpecifications=[{
+                    'ResourceType': 'key-pair', 'Tags': instances.tag_list(tags)}])
+        except AwsError as error:
+            if error.code != 'InvalidKeyPair.Duplicate':
+                raise
+
+    def _drop_group(self, region: str) -> None:
+        network.delete_groups(
+            self.account, region,
+            [str(group['GroupId'])
+             for group in network.find_groups(self.account, region, self.attempt)],
+            timeout=15.0)
+
+
+def drop_key(account: Account, region: str, attempt: str) -> None:
+    """Delete the key of an attempt; there may be none."""
+    try:
+        account.call('ec2', region, 'delete_key_pair', 'deleting the login key',
+                     KeyName=instances.own_name(attempt))
+    except AwsError as error:
+        if code_of(error) not in GONE:
+            raise
+
+
+def _attempt(undo: Callable[[], None]) -> None:
+    """Undo, and go on undoing where that fails: the first error is the one to tell."""
+    with contextlib.suppress(FogError):
+        undo()
+
+
+def _done(future: Optional[Future[str]]) -> str:
+    return '' if future is None else future.result()

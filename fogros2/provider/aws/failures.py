@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What AWS answers when it refuses, as FogErrors: one table from its error codes to hints.
+
+The codes are those of the EC2 API reference ("Error codes for the Amazon EC2 API") and of the
+common errors of all AWS services.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import json
+import re
+from typing import Any, NamedTuple, Optional
+
+from fogros2.errors import FogError, PrerequisiteError, ProviderError
+
+#: There is no room for this machine in this zone; another zone may have it.
+NO_ROOM_IN_ZONE = frozenset({
+    'InsufficientInstanceCapacity', 'InsufficientHostCapacity', 'InsufficientCapacity',
+    'InsufficientFreeAddressesInSubnet', 'Unsupported', 'UnfulfillableCapacity',
+    'SpotMaxPriceTooLow',
+})
+#: The account may have no more of this kind in this region; another kind or region may do.
+NO_ROOM_IN_REGION = frozenset({
+    'VcpuLimitExceeded', 'InstanceLimitExceeded', 'MaxSpotInstanceCountExceeded',
+    'SpotInstanceCountExceeded',
+})
+NO_ROOM = NO_ROOM_IN_ZONE | NO_ROOM_IN_REGION
+#: What was named isn't there (any more).
+GONE = frozenset({
+    'InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed', 'InvalidGroup.NotFound',
+    'InvalidGroupId.Malformed', 'InvalidKeyPair.NotFound', 'InvalidAMIID.NotFound',
+    'InvalidAMIID.Malformed', 'InvalidAMIID.Unavailable', 'InvalidSnapshot.NotFound',
+    'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound',
+})
+
+
+class Failure(NamedTuple):
+    """What a code means: our words for it ('' keeps AWS's), what to do, what it counts as."""
+
+    reason: str
+    hint: str
+    kind: type[FogError] = ProviderError
+
+
+_LOG_IN = 'aws sso login, or new keys: aws configure'
+_QUOTA = 'ask for more at Service Quotas (EC2, in this region), or take another type or region'
+_FAILURES = {
+    # who is asking
+    'AuthFailure': Failure(
+        'AWS does not take these credentials in this region',
+        'check them with: aws sts get-caller-identity; is the region enabled in the account?',
+        PrerequisiteError),
+    'InvalidClientTokenId': Failure(
+        'AWS does not know this access key', 'check it with: aws configure list',
+        PrerequisiteError),
+    'UnrecognizedClientException': Failure(
+        'AWS does not know this access key', 'check it with: aws configure list',
+        PrerequisiteError),
+    'SignatureDoesNotMatch': Failure(
+        '', "is the secret access key right, and this computer's clock?", PrerequisiteError),
+    'ExpiredToken': Failure('the credentials have expired', _LOG_IN, PrerequisiteError),
+    'ExpiredTokenException': Failure('the credentials have expired', _LOG_IN, PrerequisiteError),
+    'RequestExpired': Failure(
+        "the request's time is not AWS's, or the credentials have expired",
+        "set this computer's clock: timedatectl set-ntp true", PrerequisiteError),
+    'RequestTimeTooSkewed': Failure(
+        "this computer's clock is wrong", 'timedatectl set-ntp true', PrerequisiteError),
+    'OptInRequired': Failure(
+        'the account has not enabled this region or service',
+        'enable it in the AWS console, or name another region=', PrerequisiteError),
+    'PendingVerification': Failure(
+        'AWS is still verifying this account for this region', 'it takes up to four hours',
+        PrerequisiteError),
+    'Blocked': Failure('AWS has blocked this account', 'ask AWS Support', PrerequisiteError),
+    # what was asked for
+    'InvalidInstanceType': Failure(
+        'the region has no such instance type', 'ros2 fog price shows what it has'),
+    'InvalidParameterCombination': Failure('', ''),
+    'Unsupported': Failure(
+        '', 'the type may not be offered in this zone: ros2 fog price, or another region='),
+    'InvalidAMIID.NotFound': Failure(
+        'there is no such image in this region',
+        'an AMI belongs to one region; leave ami_image= out for Ubuntu 24.04'),
+    'InvalidAMIID.Malformed': Failure('that is no id of an image', 'ami_image= takes ami-...'),
+    'InvalidAMIID.Unavailable': Failure(
+        'the image is not ready, or was deleted', 'ros2 fog image list'),
+    'AuthorizationNotFound': Failure('', ''),
+    'OperationNotPermitted': Failure('', ''),
+    'VPCIdNotSpecified': Failure(
+        'the account has no default VPC in this region',
+        'aws ec2 create-default-vpc, or name a subnet='),
+    'DefaultVpcDoesNotExist': Failure(
+        'the account has no default VPC in this region',
+        'aws ec2 create-default-vpc, or name a subnet='),
+    'MissingInput': Failure('', ''),
+    'InvalidSubnetID.NotFound': Failure('there is no such subnet in this region',
+                                        'check subnet= and region='),
+    'InvalidGroup.NotFound': Failure('there is no such security group in this VPC',
+                                     'check security_groups= and subnet='),
+    'InvalidGroupId.Malformed': Failure('that is no id of a security group',
+                                        'security_groups= takes sg-...'),
+    'InvalidParameterValue': Failure('', ''),
+    'InvalidKey.Format': Failure('', 'the login key has to be an Ed25519 or RSA key'),
+    'IdempotentParameterMismatch': Failure(
+        'another machine was asked for under the same token', 'start the launch again'),
+    'InvalidAMIName.Duplicate': Failure(
+        'there is an image of that name', 'ros2 fog image delete, or another name'),
+    # how much of it
+    'InsufficientInstanceCapacity': Failure(
+        'AWS has no free machine of this type here at the moment',
+        'try later, or give more types and places: instance_types=, regions='),
+    'VcpuLimitExceeded': Failure("the account's quota of vCPUs is used up", _QUOTA),
+    'InstanceLimitExceeded': Failure("the account's quota of instances is used up", _QUOTA),
+    'MaxSpotInstanceCountExceeded': Failure(
+        "the account's quota of spot instances is used up", _QUOTA),
+    'SpotMaxPriceTooLow': Failure(
+        'the spot price is above max_price= at the moment',
+        'ros2 fog price --spot shows it; spot=False takes a machine on demand'),
+    'VolumeLimitExceeded': Failure("the account's quota of disks is used up", _QUOTA),
+    'SecurityGroupLimitExceeded': Failure(
+        "the account's quota of security groups is used up", 'ros2 fog gc, or ask for more'),
+    'RulesPerSecurityGroupLimitExceeded': Failure('', 'fewer addresses in ssh_from='),
+    'IncorrectInstanceState': Failure('', 'ros2 fog list shows its state'),
+    'UnsupportedOperation': Failure('', ''),
+    'OperationNotSupported': Failure('', ''),
+    'DependencyViolation': Failure('something uses it still', 'ros2 fog delete again in a minute'),
+    'AddressLimitExceeded': Failure('', _QUOTA),
+    # AWS itself
+    'RequestLimitExceeded': Failure('AWS asks for fewer requests', 'try again in a minute'),
+    'Throttling': Failure('AWS asks for fewer requests', 'try again in a minute'),
+    'ThrottlingException': Failure('AWS asks for fewer requests', 'try again in a minute'),
+    'InternalError': Failure('', 'try again; https://health.aws.amazon.com has what is known'),
+    'InternalFailure': Failure('', 'try again; https://health.aws.amazon.com has what is known'),
+    'ServiceUnavailable': Failure('', 'try again in a minute'),
+    'Unavailable': Failure('', 'try again in a minute'),
+    'ParameterNotFound': Failure(
+        'AWS names no such image in this region', 'name one with ami_image='),
+}
+#: The policy of the credentials, or of their organisation, says no.
+DENIED = ('UnauthorizedOperation', 'AccessDenied', 'AccessDeniedException',
+          'UnauthorizedException')
+_ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)')
+_ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
+
+
+class AwsError(ProviderError):
+    """AWS refused; ``code`` is its error code."""
+
+    def __init__(self, message: str, hint: str = '', *, code: str = '') -> None:
+        super().__init__(message, hint)
+        self.code = code
+
+
+def code_of(error: BaseException) -> str:
+    """Return AWS's error code behind an error of ours, '' where there is none."""
+    return error.code if isinstance(error, AwsError) else ''
+
+
+@contextlib.contextmanager
+def translated(
+    what: str, region: str = '', *, decode: Optional[Callable[[str], str]] = None,
+) -> Iterator[None]:
+    """
+    Turn what boto3 raises in the block into FogErrors.
+
+    :param what: what the block does, such as 'creating the security group'.
+    :param decode: turns an encoded authorization failure into its JSON, '' where it can't.
+    :raises PrerequisiteError: no credentials, bad ones, no route to AWS, a wrong clock.
+    :raises AwsError: AWS refused.
+    """
+    from botocore import exceptions
+
+    try:
+        yield
+    except exceptions.ClientError as error:
+        raise refused(error.response, error.operation_name, what, region, decode) from error
+    except exceptions.BotoCoreError as error:
+        raise _unsent(error, what, region) from error
+
+
+def refused(
+    response: Any, operation: str, what: str, region: str,
+    decode: Optional[Callable[[str], str]] = None,
+) -> FogError:
+    """Return the error for an answer of AWS's that says no; ``response`` as botocore has it."""
+    details = response.get('Error') or {}
+    code = str(details.get('Code', ''))
+    said = ' '.join(str(details.get('Message', '')).split())
+    where = f'{what} in {region}' if region else what
+    if code in DENIED:
+        action = denied_action(said, operation, decode)
+        return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
+                        f'add {action} to it: doc/aws.md has the whole policy', code=code)
+    known = _FAILURES.get(code) or Failure('', '')
+    reason = known.reason or said or code or 'AWS gave no reason'
+    if known.reason and said and code.startswith('Invalid'):
+        reason += f' ({said[:160].rstrip(".")})'
+    message = f'{where} failed: {reason}'
+    if code and code not in message:
+        message += f' [{code}]'
+    if known.kind is not ProviderError:
+        return known.kind(message, known.hint)
+    return AwsError(message, known.hint, code=code)
+
+
+def denied_action(
+    said: str, operation: str, decode: Optional[Callable[[str], str]] = None,
+) -> str:
+    """
+    Return the action that a policy lacks, such as 'ec2:RunInstances'.
+
+    A call may need more than its own action (tags at creation, a role handed over): AWS says
+    which in plain words, or in words that whoever may ``sts:DecodeAuthorizationMessage`` reads.
+    """
+    encoded = _ENCODED.search(said)
+    if encoded and decode:
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            return str(json.loads(decode(encoded[1]))['context']['action'])
+    named = _ACTION.search(said)
+    if named:
+        return named[1]
+    service = {'GetCallerIdentity': 'sts', 'GetParameter': 'ssm',
+               'GetProducts': 'pricing'}.get(operation, 'ec2')
+    return f'{service}:{operation}'
+
+
+def _unsent(error: BaseException, what: str, region: str) -> FogError:
+    """Return the error for a request that never got an answer."""
+    from botocore import exceptions as known
+
+    where = f'{what} in {region}' if region else what
+    said = ' '.join(str(error).split())
+    hints: tuple[tuple[tuple[type[BaseException], ...], str, str], ...] = (
+        ((known.NoCredentialsError,), 'there are no AWS credentials on this computer',
+         'aws configure, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY'),
+        ((known.PartialCredentialsError,), f'the AWS credentials are incomplete: {said}',
+         'aws configure'),
+        ((known.ProfileNotFound,), said, 'aws configure list-profiles shows them; AWS_PROFILE'),
+        ((known.SSOError, known.TokenRetrievalError), f'the AWS login is over: {said}',
+         'aws sso login'),
+        ((known.CredentialRetrievalError, known.MetadataRetrievalError),
+         f"the AWS credentials can't be had: {said}", 'aws sts get-caller-identity'),
+        ((known.NoRegionError, known.InvalidRegionError), said or 'no region is named',
+         "region='eu-central-1', or aws configure"),
+        ((known.ConfigParseError, known.ConfigNotFound), said, 'check ~/.aws/config'),
+    )
+    for kinds, reason, hint in hints:
+        if isinstance(error, kinds):
+            return PrerequisiteError(f'{where} failed: {reason}', hint)
+    if isinstance(error, (known.HTTPClientError, known.ConnectionError)):
+        return PrerequisiteError(
+            f'{where} failed: AWS does not answer: {said}',
+            'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?')
+    return ProviderError(f'{where} failed: {said}')

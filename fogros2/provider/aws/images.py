@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which disk image a machine starts from, and the images that are baked of machines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import datetime
+import re
+import time
+from typing import Any, NamedTuple, Optional
+
+from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.model import Image
+from fogros2.provider import TAG_DEPENDENCIES
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.failures import AwsError, code_of, GONE
+from fogros2.provider.aws.instances import PROVIDER, tag_list, TAG_USER, tags_of
+from fogros2.provider.aws.options import Options
+
+#: On images and their snapshots: the name they were given.
+TAG_BAKED = 'fogros2-baked'
+#: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
+UBUNTU = {
+    'x86_64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id',
+    'arm64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id',
+}
+#: The same with NVIDIA's driver in it.
+DEEP_LEARNING = {
+    'x86_64': '/aws/service/deeplearning/ami/x86_64/'
+              'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
+    'arm64': '/aws/service/deeplearning/ami/arm64/'
+             'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
+}
+_STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
+_ID = re.compile(r'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
+
+
+class Kind(NamedTuple):
+    """What has to be known of an instance type to choose its image."""
+
+    name: str
+    arch: str
+    nvidia: bool
+
+
+def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
+    """
+    Return instance types as a region has them, in the order of ``names``.
+
+    :raises ConfigurationError: it has none of that name.
+    """
+    what = f'looking for the instance type {" or ".join(names)}'
+    try:
+        found = {entry['InstanceType']: entry for entry in account.call(
+            'ec2', region, 'describe_instance_types', what, InstanceTypes=names)['InstanceTypes']}
+    except AwsError as error:
+        if error.code != 'InvalidInstanceType':
+            raise
+        raise ConfigurationError(str(error.args[0]), error.hint) from error
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise ConfigurationError(f'{region} has no instance type {" or ".join(missing)}',
+                                 f'ros2 fog price --region {region} shows what it has')
+    return [_kind(found[name]) for name in names]
+
+
+def _kind(entry: Mapping[str, Any]) -> Kind:
+    arches = entry['ProcessorInfo'].get('SupportedArchitectures') or ()
+    return Kind(
+        str(entry['InstanceType']),
+        next((arch for arch in ('x86_64', 'arm64') if arch in arches), ''),
+        any(str(gpu.get('Manufacturer', '')).upper() == 'NVIDIA'
+            for gpu in entry.get('GpuInfo', {}).get('Gpus') or ()))
+
+
+def choose(
+    account: Account, region: str, kind: Kind, options: Options, dependencies: str,
+) -> Mapping[str, Any]:
+    """
+    Return the image (as EC2 describes it) that a machine starts from.
+
+    :param dependencies: of the launch; an image baked with the same is preferred.
+    :raises ConfigurationError: the image doesn't exist, or is for another processor.
+    """
+    if kind.arch not in UBUNTU:
+        raise ConfigurationError(f'machines of the type {kind.name} run no Ubuntu',
+                                 'take one with an x86_64 or arm64 processor')
+    if options.ami_image:
+        return _named(account, region, kind, options.ami_image)
+    baked = _baked(account, region, kind, options, dependencies) if dependencies else None
+    if baked is not None:
+        return baked
+    parameter = (DEEP_LEARNING if kind.nvidia else UBUNTU)[kind.arch]
+    identity = account.call('ssm', region, 'get_parameter', f'asking for the image {parameter}',
+                            Name=parameter)['Parameter']['Value']
+    return _named(account, region, kind, str(identity))
+
+
+def _named(account: Account, region: str, kind: Kind, identity: str) -> Mapping[str, Any]:
+    try:
+        found = account.call('ec2', region, 'describe_images', f'looking for the image {identity}',
+                             ImageIds=[identity])['Images']
+    except AwsError as error:
+        if error.code not in GONE:
+            raise
+        raise ConfigurationError(str(error.args[0]), error.hint) from error
+    if not found:
+        raise ConfigurationError(f'there is no image {identity} in {region}',
+                                 'an AMI belongs to one region; leave ami_image= out')
+    image: Mapping[str, Any] = found[0]
+    if image.get('State', 'available') != 'available':
+        raise ConfigurationError(f'the image {identity} in {region} is {image["State"]}',
+                                 'ros2 fog image list shows when it is available')
+    if image.get('Architecture', kind.arch) != kind.arch:
+        raise ConfigurationError(
+            f'the image {identity} is for {image["Architecture"]} processors, and {kind.name} '
+            f'has {kind.arch}', 'another ec2_instance_type=, or leave ami_image= out')
+    return image
+
+
+def _baked(
+    account: Account, region: str, kind: Kind, options: Options, dependencies: str,
+) -> Optional[Mapping[str, Any]]:
+    """Return the newest image of ours with the same dependencies, None for none."""
+    found = account.call(
+        'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
+        Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
+                 {'Name': 'tag-key', 'Values': [TAG_BAKED]},
+                 {'Name': 'architecture', 'Values': [kind.arch]},
+                 {'Name': 'state', 'Values': ['available']}])['Images']
+    fitting = [image for image in found
+               if tags_of(image).get(TAG_USER, options.user) == options.user]
+    return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
+
+
+def bake(
+    account: Account, region: str, instance: Mapping[str, Any], name: str, dependencies: str,
+) -> str:
+    """
+    Have EC2 make an image of an instance, without rebooting it, and return our id of it.
+
+    What was written in the last half minute may be missing, unless the machine was told to
+    ``sync``: its nodes run on.
+    """
+    own = tags_of(instance)
+    tags = {'Name': name, TAG_BAKED: name, TAG_USER: own.get(TAG_USER, ''),
+            TAG_DEPENDENCIES: dependencies}
+    listed = tag_list({key: value for key, value in tags.items() if value})
+    # names are taken once in a region: the second image of a name has another second
+    stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
+    plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
+    answer = account.call(
+        'ec2', region, 'create_image', f"making the image '{name}'",
+        InstanceId=instance['InstanceId'], Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
+        Description=f'FogROS2: {plain}',
+        TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
+                           {'ResourceType': 'snapshot', 'Tags': listed}])
+    return f'aws:{region}/{answer["ImageId"]}'
+
+
+def images_in(account: Account, region: str) -> Iterator[Image]:
+    """Yield the images that were baked in a region."""
+    for entry in account.pages(
+            'ec2', region, 'describe_images', 'Images', 'looking for images', Owners=['self'],
+            Filters=[{'Name': 'tag-key', 'Values': [TAG_BAKED]}]):
+        tags = tags_of(entry)
+        sizes = [int(mapping.get('Ebs', {}).get('VolumeSize') or 0)
+                 for mapping in entry.get('BlockDeviceMappings') or ()]
+        state = str(entry.get('State', ''))
+        yield Image(
+            f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), PROVIDER, region,
+            created=_when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
+            state=_STATES.get(state, state), dependencies=tags.get(TAG_DEPENDENCIES, ''),
+            tags=tags)
+
+
+def _when(text: Optional[str]) -> Optional[float]:
+    """Return EC2's ISO 8601 time as seconds since the epoch."""
+    try:
+        return datetime.datetime.fromisoformat(str(text).replace('Z', '+00:00')).timestamp()
+    except ValueError:
+        return None
+
+
+def delete(account: Account, image_id: str) -> None:
+    """
+    Delete an image and its snapshots, those as well that an earlier attempt left.
+
+    :raises MachineNotFound: the id is none of ours.
+    """
+    parts = _ID.fullmatch(image_id)
+    if parts is None:
+        raise MachineNotFound(f"'{image_id}' is no image at AWS", 'ros2 fog image list')
+    region, identity = parts.groups()
+    what = f'deleting the image {identity}'
+    found = account.call('ec2', region, 'describe_images', what, Owners=['self'],
+                         Filters=[{'Name': 'image-id', 'Values': [identity]}])['Images']
+    snapshots = {str(mapping['Ebs']['SnapshotId'])
+                 for image in found for mapping in image.get('BlockDeviceMappings') or ()
+                 if mapping.get('Ebs', {}).get('SnapshotId')}
+    if found and TAG_BAKED not in tags_of(found[0]):
+        raise ProviderError(f'{identity} in {region} is no image of FogROS2',
+                            'ros2 fog image list shows those that are')
+    # EC2 writes the image's id into the description of each snapshot that it makes for one
+    snapshots |= {str(entry['SnapshotId']) for entry in account.pages(
+        'ec2', region, 'describe_snapshots', 'Snapshots', what, OwnerIds=['self'],
+        Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},
+                 {'Name': 'tag-key', 'Values': [TAG_BAKED]}])}
+    if found:
+        _gone_is_fine(account, region, 'deregister_image', what, ImageId=identity)
+    for snapshot in sorted(snapshots):
+        _gone_is_fine(account, region, 'delete_snapshot', what, SnapshotId=snapshot)
+
+
+def _gone_is_fine(account: Account, region: str, operation: str, what: str, **words: Any) -> None:
+    try:
+        account.call('ec2', region, operation, what, **words)
+    except AwsError as error:
+        if code_of(error) not in GONE:
+            raise

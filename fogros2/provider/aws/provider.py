@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""EC2 instances as machines: the Provider's methods, each put together from its own module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from decimal import Decimal
+import os
+import threading
+import time
+from typing import Any, ClassVar, Optional, TypeVar
+
+from fogros2.errors import (
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
+from fogros2.provider import Provider
+from fogros2.provider.aws import clients, ending, images, instances, network, user_data
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.creation import Creation
+from fogros2.provider.aws.failures import AwsError, code_of, DENIED, GONE
+from fogros2.provider.aws.instances import MachineId
+from fogros2.provider.aws.options import check_spec, DEFAULT_TYPE, NEAREST, Options
+from fogros2.waiting import wait_until
+
+T = TypeVar('T')
+
+#: Names the regions that 'all regions' means, such as 'eu-central-1 us-east-1'.
+REGIONS_VARIABLE = 'FOGROS2_AWS_REGIONS'
+#: Seconds for which EC2 may not know an instance that it has just made.
+SETTLING = 60.0
+#: Regions asked at once.
+PARALLEL = 20
+
+# Runs on the machine every few seconds; asks only AWS's own metadata service, with a token.
+_NOTICE = """\
+import sys, urllib.error, urllib.request as r
+u = 'http://169.254.169.254/latest/'
+try:
+    t = r.urlopen(r.Request(u + 'api/token', method='PUT', headers={
+        'X-aws-ec2-metadata-token-ttl-seconds': '60'}), timeout=2).read().decode()
+    print(r.urlopen(r.Request(u + 'meta-data/spot/instance-action', headers={
+        'X-aws-ec2-metadata-token': t}), timeout=2).read().decode())
+except (OSError, ValueError):
+    sys.exit(1)
+"""
+
+
+class AWSProvider(Provider):
+    """
+    EC2 instances.
+
+    :param account: who asks AWS; None for the account that boto3 finds.
+    """
+
+    name: ClassVar[str] = instances.PROVIDER
+    shell_kind: ClassVar[str] = 'ssh'
+    agent_directory: ClassVar[str] = user_data.AGENT_DIRECTORY
+    agent_program: ClassVar[str] = user_data.AGENT_PROGRAM
+    firewall: ClassVar[bool] = True
+    one_time_host_key: ClassVar[bool] = True
+    notice: ClassVar[tuple[str, ...]] = ('python3', '-ISc', _NOTICE)
+
+    def __init__(self, account: Optional[Account] = None) -> None:
+        self._account = account or Account()
+        self._robot_address = network.RobotAddress()
+        self._regions: tuple[str, ...] = ()
+        #: Instances that this process has made, and when (monotonic).
+        self._made: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    # -- before anything is made ----------------------------------------------------------------
+
+    @classmethod
+    def configured(cls) -> bool:
+        """Return whether somebody has set AWS up here."""
+        return clients.configured()
+
+    def set_regions(self, regions: Sequence[str]) -> None:
+        """Look in these regions from now on; 'all' are all that the account has enabled."""
+        self._regions = tuple(regions)
+
+    def answers(self) -> str:
+        """Ask AWS who we are, which no policy can refuse."""
+        region = self._base_region()
+        told = self._account.call('sts', region, 'get_caller_identity', 'asking AWS who we are',
+                                  hasty=True)
+        return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
+
+    def check(self, spec: MachineSpec) -> None:
+        """Look at the options, for boto3 and for credentials; AWS isn't asked."""
+        options = check_spec(spec)
+        self._account.check_credentials()
+        self._region(options)
+
+    def resolve(self, spec: MachineSpec) -> MachineSpec:
+        """Choose the region and the type, and refuse what costs more than ``max_price``."""
+        from fogros2.provider.aws import choices
+        from fogros2.provider.aws.prices import Market
+        options = check_spec(spec)
+        chosen: dict[str, Any] = {}
+        region = self._region(options)
+        if region == NEAREST:
+            region = choices.nearest_region()
+        kind = options.ec2_instance_type
+        market = Market(self._account.client)
+        if options.chooses_type:
+            wants = choices.wants(
+                arch=options.arch or None, min_cpu=int(options.min_cpu) or None,
+                min_memory_gb=options.min_memory_gb or None, cpu_type=options.cpu_type or None,
+                gpu=int(options.gpu) if options.gpu.isdigit() else options.gpu or None,
+                gpu_memory_gb=options.gpu_memory_gb or None, max_price=options.max_price,
+                spot=options.spot)
+            choice = choices.choose([region], wants, market)
+            kind = choice.chosen.type.name
+            # the next cheapest fit as well: where there is no room for the cheapest
+            chosen['instance_types'] = list(options.instance_types) or [
+                offer.type.name for offer in choice.offers[1:3]]
+        kind = kind or DEFAULT_TYPE
+        if options.max_price is not None and not options.chooses_type:
+            price = choices.price_of(region, kind, spot=options.spot, market=market)
+            if price is not None and price > options.max_price:
+                raise ConfigurationError(
+                    f'{kind} in {region} costs {price} US dollars an hour, more than max_price='
+                    f'{options.max_price}', 'ros2 fog price shows what is cheaper')
+        return dataclasses.replace(spec, options={
+            **spec.options, **chosen, 'region': region, 'ec2_instance_type': kind})
+
+    def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return the price of a machine (US dollars an hour); its disk and traffic come on top."""
+        options = Options.parse(spec.options)
+        region = self._region(options)
+        if region == NEAREST or options.chooses_type:
+            return None
+        return self._price(region, options.ec2_instance_type or DEFAULT_TYPE, options.spot)
+
+    def _price(self, region: str, kind: str, spot: bool) -> Optional[Decimal]:
+        from fogros2.provider.aws import choices
+        from fogros2.provider.aws.prices import Market
+        with contextlib.suppress(FogError):
+            return choices.price_of(
+                region, kind, spot=spot, market=Market(self._hasty))
+        return None
+
+    def _hasty(self, service: str, region: str) -> Any:
+        return self._account.client(service, region, hasty=True)
+
+    # -- a machine's life -----------------------------------------------------------------------
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Ask for an instance where there is room for one; nothing is left of a failure."""
+        spec = self._chosen(spec)
+        options = check_spec(spec)
+        creation = Creation(
+            self._account, spec, request, options, robot_address=self._robot_address,
+            price=lambda region, kind: self._price(region, kind, options.spot))
+        machine = creation.run(
+            list(dict.fromkeys([self._region(options), *options.regions])),
+            list(dict.fromkeys([options.ec2_instance_type or DEFAULT_TYPE,
+                                *options.instance_types])))
+        with self._lock:
+            self._made[machine.instance] = time.monotonic()
+        return str(machine)
+
+    def _chosen(self, spec: MachineSpec) -> MachineSpec:
+        """Return a spec with its choices made, as ``resolve`` has done for a launch."""
+        options = check_spec(spec)
+        unresolved = options.chooses_type or self._region(options) == NEAREST
+        return self.resolve(spec) if unresolved else spec
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return what EC2 knows of an instance now."""
+        machine = MachineId.parse(machine_id)
+        found = self._look(machine)
+        if found is None:
+            return Machine(machine_id, '', self.name, MachineState.PENDING, place=machine.region)
+        if found['State']['Name'] == 'terminated':
+            raise MachineNotFound(f'{machine.instance} in {machine.region} was terminated')
+        return dataclasses.replace(instances.machine_of(machine.region, found), id=machine_id)
+
+    def _look(self, machine: MachineId) -> Optional[Mapping[str, Any]]:
+        """
+        Return an instance as EC2 describes it, None for one so new that it isn't known yet.
+
+        :raises MachineNotFound: it isn't known (any more).
+        """
+        try:
+            found = instances.instances_in(self._account.call(
+                'ec2', machine.region, 'describe_instances', f'looking for {machine.instance}',
+                InstanceIds=[machine.instance])['Reservations'])
+        except AwsError as error:
+            if code_of(error) not in GONE:
+                raise
+            found = []
+        if found:
+            return found[0]
+        with self._lock:
+            made = self._made.get(machine.instance)
+        if made is not None and time.monotonic() - made < SETTLING:
+            return None
+        raise MachineNotFound(f'there is no {machine.instance} in {machine.region} any more')
+
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, cancel: threading.Event,
+    ) -> Machine:
+        """Wait until an instance runs and has an address; EC2 is asked ever less often."""
+        machine = MachineId.parse(machine_id)
+
+        def look() -> Optional[Machine]:
+            instance = self._look(machine)
+            if instance is None:
+                return None
+            found = instances.machine_of(machine.region, instance)
+            if found.state not in (MachineState.PENDING, MachineState.RUNNING):
+                raise ProviderError(
+                    f"'{name}' ({machine.instance}) ended while it was coming up: "
+                    f"{instances.reason_of(instance) or 'EC2 does not say why'}",
+                    'the EC2 console has its system log')
+            ready = found.state is MachineState.RUNNING and found.shell is not None
+            return dataclasses.replace(found, id=machine_id) if ready else None
+
+        # the boot takes ten seconds and more: few questions, but a fast one is seen at once
+        return wait_until(look, timeout=timeout, cancel=cancel, interval=0.25, longest=4.0,
+                          what=f"'{name}' ({machine.instance}) to run")
+
+    def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """Yield the instances that carry all of ``tags``, of all regions at once."""
+        def ask(region: str) -> list[Machine]:
+            found = instances.instances_in(self._account.pages(
+                'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
+                Filters=[*instances.tag_filters(tags),
+                         {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]))
+            return [instances.machine_of(region, instance) for instance in found]
+        for machines in self._in_regions(ask):
+            yield from machines
+
+    def destroy(self, machine_id: str) -> None:
+        """End an instance and all that was made for it; returns when everything is gone."""
+        try:
+            machine = MachineId.parse(machine_id)
+        except MachineNotFound:
+            return
+        ending.destroy(self._account, machine)
+
+    def stop(self, machine_id: str) -> None:
+        """Have an instance stop; its disk stays, and is billed."""
+        machine = MachineId.parse(machine_id)
+        found = self._look(machine)
+        if found is not None and found.get('InstanceLifecycle') == 'spot':
+            raise Unsupported("a spot instance can't be stopped and started again",
+                              "use on_exit='delete' or 'keep', or spot=False")
+        self._account.call('ec2', machine.region, 'stop_instances', f'stopping {machine.instance}',
+                           InstanceIds=[machine.instance])
+
+    def start(self, machine_id: str) -> None:
+        """Start a stopped instance; one that is stopping still is waited for."""
+        machine = MachineId.parse(machine_id)
+
+        def stopped() -> bool:
+            found = self._look(machine)
+            return found is None or found['State']['Name'] != 'stopping'
+
+        wait_until(stopped, timeout=ending.PATIENCE, interval=1.0, longest=5.0,
+                   what=f'{machine.instance} in {machine.region} to be stopped')
+        self._account.call('ec2', machine.region, 'start_instances',
+                           f'starting {machine.instance}', InstanceIds=[machine.instance])
+
+    # -- who reaches it, and who it is ----------------------------------------------------------
+
+    def robot_address(self) -> str:
+        """Return this computer's public address as AWS sees it, or as the user has named it."""
+        return self._robot_address()
+
+    def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        """Change the machine's own security group."""
+        machine = MachineId.parse(machine_id)
+        network.allow(self._account, machine.region, machine.attempt, port, sources)
+
+    def pin(self, machine_id: str, host_key: str) -> None:
+        """Keep the machine's new host key in a tag of the instance."""
+        machine = MachineId.parse(machine_id)
+        self._account.call(
+            'ec2', machine.region, 'create_tags', f'noting the host key of {machine.instance}',
+            Resources=[machine.instance], Tags=instances.tag_list({
+                instances.TAG_HOST_KEY: ' '.join(host_key.split()[:2])}))
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
+        """Have EC2 make an AMI of an instance, which runs on."""
+        machine = MachineId.parse(machine_id)
+        found = self._look(machine)
+        if found is None:
+            raise MachineNotFound(f'EC2 does not know {machine.instance} yet', 'try again')
+        return images.bake(self._account, machine.region, found, name, dependencies)
+
+    def images(self) -> Iterator[Image]:
+        """Yield the AMIs that were baked, of all regions."""
+        for found in self._in_regions(lambda r: list(images.images_in(self._account, r))):
+            yield from found
+
+    def delete_image(self, image_id: str) -> None:
+        """Deregister an AMI and delete its snapshots."""
+        images.delete(self._account, image_id)
+
+    # -- regions --------------------------------------------------------------------------------
+
+    def _region(self, options: Options) -> str:
+        """
+        Return the region that a machine is asked for in, or 'nearest'.
+
+        :raises ConfigurationError: nobody has named one.
+        """
+        region = options.region or self._account.region()
+        if not region:
+            raise ConfigurationError(
+                'no region is named for a machine at AWS',
+                "region='eu-central-1', region='nearest', or: aws configure")
+        return region
+
+    def _base_region(self) -> str:
+        """Return a region to ask what belongs to none."""
+        named = [region for region in self._named_regions() if region != 'all']
+        return self._account.region() or (named[0] if named else 'us-east-1')
+
+    def _named_regions(self) -> list[str]:
+        return list(self._regions) or os.environ.get(
+            REGIONS_VARIABLE, '').replace(',', ' ').split()
+
+    def _all_regions(self) -> list[str]:
+        """Return the regions to look in: those that were named, or all that are enabled."""
+        named = self._named_regions()
+        if named and 'all' not in named:
+            return named
+        found = self._account.call('ec2', self._base_region(), 'describe_regions',
+                                   'asking for the regions of the account')['Regions']
+        return sorted(str(entry['RegionName']) for entry in found)
+
+    def _in_regions(self, ask: Callable[[str], T]) -> Iterable[T]:
+        """
+        Return what each region answers, asked all at once.
+
+        A region that an organisation closes to these credentials can hold no machine of theirs:
+        it counts only where it was named, or none is open.
+        """
+        regions = self._all_regions()
+        named = bool(self._named_regions()) and 'all' not in self._named_regions()
+
+        def try_region(region: str) -> tuple[Optional[T], Optional[FogError]]:
+            try:
+                return ask(region), None
+            except FogError as error:
+                return None, error
+
+        with ThreadPoolExecutor(min(PARALLEL, len(regions)), 'fog-aws') as pool:
+            answers = list(pool.map(try_region, regions))
+        found = [answer for answer, error in answers if answer is not None]
+        for _, error in answers:
+            if error is not None and (named or not found or code_of(error) not in DENIED):
+                raise error
+        return found
