@@ -19,8 +19,10 @@ it: the VPN's, and the one that ends the machine.
 ``configure``  any key of ``CONFIG``; re-arms lifetime and, with ``heartbeat``, the watch over it.
                Another ``launch`` than before: its nodes stop first, and what was kept for it goes;
                refused (kind ``busy``) while the earlier one sets the machine up or sends
-               heartbeats, unless ``force`` is true.
+               heartbeats, unless ``force`` names that earlier one: the robot knows it to be dead.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s)
+``watch``      ``what``, ``argv`` run as root each ``interval`` (s, 5): once it exits with 0 there
+               is one event of the name ``what``, its output as ``reason``, and the watch is over
 ``launch``     start the process that will run the nodes, ahead of time
 ``start``      ``nodes``: list of NodeSpec; an id that is known already is left alone
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
@@ -33,7 +35,8 @@ it: the VPN's, and the one that ends the machine.
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
-and ``launch_exited`` where the nodes' launch process ended without having been told to.
+``notice`` (see ``watch``), and ``launch_exited`` where the nodes' launch process ended without
+having been told to.
 """
 
 from __future__ import annotations
@@ -70,6 +73,9 @@ SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKI
 #: Seconds that a keep's command may take, and between attempts to end the machine.
 COMMAND_TIMEOUT = 30.0
 RETRY_END = 30.0
+#: Events that a watch may be for, and bytes of what its command prints that are told.
+WATCHED = ('notice',)
+REASON = 2000
 MARK = 'FOGROS2_AGENT_MARK'
 #: Linux: bind to an address that isn't there yet.
 IP_FREEBIND = 15
@@ -385,6 +391,15 @@ class Kept:
         self.timer: Optional[Timer] = None
 
 
+class Watched:
+    """A command that is run again and again until it succeeds."""
+
+    def __init__(self, request: Json) -> None:
+        self.what = str(request['what'])
+        self.argv = words(request['argv'])
+        self.interval = max(0.05, float(request.get('interval', 5.0)))
+
+
 def words(argv: Any) -> list[str]:
     """
     Return a command line as it came.
@@ -450,6 +465,7 @@ class Agent:
         self.clients: list[Client] = []
         self.nodes: dict[str, Json] = {}
         self.kept: dict[str, Kept] = {}
+        self.watched: dict[str, Watched] = {}
         self.launch: Optional[CloudLaunch] = None
         self.after_launch: list[Callable[[], None]] = []
         self.stopping = self.ending = self.done = False
@@ -657,15 +673,20 @@ class Agent:
 
     def spawn(
         self, argv: list[str], then: Callable[[int], None], *, timeout: float = COMMAND_TIMEOUT,
+        output: int = -1,
     ) -> None:
-        """Run a command as root where possible; ``then`` gets its exit status, 127: none such."""
+        """
+        Run a command as root where possible; ``then`` gets its exit status, 127: none such.
+
+        Its output goes to the agent's own log, standard output to the descriptor ``output``.
+        """
         own_log = sys.stderr.fileno()
         environment = {**os.environ, 'PATH': search_path()}
         try:
             with self.root():
                 child = subprocess.Popen(
-                    argv, stdin=subprocess.DEVNULL, stdout=own_log, stderr=own_log, cwd='/',
-                    env=environment, start_new_session=True)
+                    argv, stdin=subprocess.DEVNULL, stdout=own_log if output < 0 else output,
+                    stderr=own_log, cwd='/', env=environment, start_new_session=True)
         except (OSError, ValueError) as error:
             say(f'{argv[0] if argv else "an empty command"}: {error}')
             self.at(0.0, lambda: then(127))
@@ -866,7 +887,8 @@ class Agent:
             raise Refused('this machine is ending', 'launch again', 'ending')
         taken_over = new.get('launch', self.config['launch']) != self.config['launch']
         age = self.sign_of_life()
-        if taken_over and age is not None and not request.get('force'):
+        dead = request.get('force') or None
+        if taken_over and age is not None and dead != self.config['launch']:
             raise Refused(
                 f"this machine belongs to launch '{self.config['launch']}', whose last sign of "
                 f'life is {age:.0f} s old', 'end that launch, or choose another name', 'busy')
@@ -892,7 +914,7 @@ class Agent:
                 return {'error': str(error), 'hint': error.hint}
             return {'machine': self.config['machine'], 'next': self.log.next}
 
-        left = taken_over and (self.launch is not None or bool(self.kept))
+        left = taken_over and (self.launch is not None or bool(self.kept or self.watched))
         if self.stopping or left or (self.launch and stale and not running):
             reply = self.reply_later(client, request)
 
@@ -915,6 +937,15 @@ class Agent:
         self.kept[kept.what] = kept
         if kept.alive:
             self._look(kept)
+        return {}
+
+    def do_watch(self, client: Client, request: Json) -> Json:
+        """Wait for a command to succeed; ``what`` again replaces it."""
+        watched = Watched(request)
+        if watched.what not in WATCHED or not watched.argv:
+            raise Refused(f"there is no watch for '{watched.what}'", ', '.join(WATCHED))
+        self.watched[watched.what] = watched
+        self._see(watched)
         return {}
 
     def do_launch(self, client: Client, request: Json) -> Json:
@@ -1290,6 +1321,26 @@ class Agent:
 
         self.spawn(kept.alive, looked, timeout=10.0)
 
+    def _see(self, watched: Watched) -> None:
+        """Run a watch's command; come back unless it succeeded or the watch is over."""
+        if self.watched.get(watched.what) is not watched or self.ending:
+            return
+        output = os.memfd_create('watch', os.MFD_CLOEXEC)
+
+        def ran(status: int) -> None:
+            said = os.pread(output, REASON, 0).decode(errors='replace').strip()
+            os.close(output)
+            if self.watched.get(watched.what) is not watched:
+                return
+            if status == 0:
+                del self.watched[watched.what]
+                say(f'{watched.what}: {said}')
+                self.emit(watched.what, reason=said)
+            else:
+                self.at(watched.interval, lambda: self._see(watched))
+
+        self.spawn(watched.argv, ran, timeout=10.0, output=output)
+
     def sign_of_life(self) -> Optional[float]:
         """Return seconds since a launch that has the machine spoke, None while none has it."""
         spoke = self.watchdog.beat_at
@@ -1371,6 +1422,7 @@ class Agent:
         """Take the kept things down, then go on."""
         commands = [argv for kept in self.kept.values() for argv in kept.down]
         self.kept.clear()
+        self.watched.clear()
         self.spawn_all(commands, lambda good: then())
 
     def _leave_for_good(self) -> None:

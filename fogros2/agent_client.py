@@ -117,6 +117,11 @@ class AgentClient:
         """The seq that the next event delivered will have at the least."""
         return self._next or 1
 
+    @property
+    def silent_for(self) -> float:
+        """Seconds since anything came from the machine; a quarter of ``silence`` is usual."""
+        return time.monotonic() - self._heard
+
     def connect(self) -> None:
         """
         Open the connection now rather than with the first request; harmless when it is open.

@@ -13,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import functools
+import hashlib
+import json
 import os
 from pathlib import Path
 import shlex
@@ -99,6 +101,30 @@ class Preparation:
         if self.mode == 'none':
             return 'there already' if not (self.tools or self.commands) else 'completed'
         return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
+
+
+def dependencies(spec: MachineSpec, under: Underlay) -> str:
+    """
+    Return 16 hexadecimal digits that stand for what has to be installed on a machine.
+
+    The ROS distribution, the packages that every machine gets, and what the workspace depends on
+    outside itself; equal digits, equal needs. What travels each time, as the workspace itself,
+    doesn't count. An image of a machine is found by them.
+
+    :param under: the environment of the robot's launch.
+    :raises WorkspaceError: a manifest of the workspace can't be read.
+    """
+    embedded = any(
+        next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
+        for prefix in under.prefixes)
+    needs = {
+        'distro': under.environment.get('ROS_DISTRO') or DISTRO,
+        'bootstrap': spec.bootstrap,
+        'kind': 'embedded' if embedded else 'ros',
+        'packages': sorted({*APT_PACKAGES, *TOOLS.values()}),
+        'workspace': workspaces.dependencies(spec.workspace) if spec.workspace else [],
+    }
+    return hashlib.sha256(json.dumps(needs, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def ensure(

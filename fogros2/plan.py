@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
+from decimal import Decimal
 import difflib
 import ipaddress
 import os
@@ -12,8 +13,8 @@ from pathlib import Path
 import sys
 from typing import Any, Optional
 
-from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
-from fogros2.model import MachineSpec, Peer, VpnInterface
+from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
+from fogros2.model import Machine, MachineSpec, Peer, VpnInterface
 
 #: Kept free below the machines' addresses: .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
@@ -82,16 +83,68 @@ def machine_port(launch_id: str) -> int:
     return 49152 + int(launch_id, 16) % 16000
 
 
-def machine_peers(
-    robot: Peer, own_name: str, machines: Mapping[str, Peer],
-) -> list[Peer]:
+@dataclasses.dataclass(frozen=True)
+class Place:
     """
-    Return a machine's peers: the robot, then every other machine.
+    Where a machine is in the VPN, and the ways to it.
 
-    The robot has no endpoint there: it dials, from behind whatever NAT it is.
+    :param peer: as those outside see it; its endpoint is None where they can't dial it.
+    :param inner_network: names the network in which ``inner_endpoint`` means something.
+    :param inner_endpoint: ``host:port`` for machines of the same inner network.
+    :param robot_endpoint: ``host:port`` at which it dials the robot, None where the robot dials.
     """
-    others = [peer for name, peer in sorted(machines.items()) if name != own_name]
-    return [dataclasses.replace(robot, endpoint=None), *others]
+
+    peer: Peer
+    inner_network: str = ''
+    inner_endpoint: Optional[str] = None
+    robot_endpoint: Optional[str] = None
+
+
+def endpoint(host: str, port: int) -> str:
+    """Return ``host:port``, an IPv6 address in brackets."""
+    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
+
+
+def place(machine: Machine, peer: Peer, port: int, robot_port: int) -> Place:
+    """
+    Return where a machine is, by what its provider tells.
+
+    :param peer: the machine without an endpoint.
+    :param port: UDP port of its VPN interface, ``robot_port`` that of the robot's.
+    :raises VpnError: neither can the robot dial it, nor it the robot.
+    """
+    outside = inner = robot = None
+    if machine.vpn_host:
+        outside = endpoint(machine.vpn_host, machine.vpn_port or port)
+    elif machine.robot_host:
+        robot = endpoint(machine.robot_host, robot_port)
+    else:
+        raise VpnError(
+            f"the robot has no way to '{machine.name}' for the VPN, nor it to the robot",
+            'one of the two has to be reachable by UDP: see the options of its provider')
+    if machine.inner_network and machine.inner_host:
+        inner = endpoint(machine.inner_host, port)
+    return Place(dataclasses.replace(peer, endpoint=outside), machine.inner_network, inner, robot)
+
+
+def machine_peers(robot: Peer, own: Place, others: Iterable[Place]) -> list[Peer]:
+    """
+    Return a machine's peers: the robot, then the other machines.
+
+    The robot has an endpoint there only where it can't dial the machine: else it dials, from
+    behind whatever NAT it is. Machines of one inner network dial each other in it. Two machines
+    that nobody outside can dial have no way to each other unless they share such a network.
+    """
+    return [dataclasses.replace(robot, endpoint=own.robot_endpoint), *(
+        dataclasses.replace(other.peer, endpoint=other.inner_endpoint)
+        if own.inner_network and own.inner_network == other.inner_network
+        and other.inner_endpoint is not None else other.peer
+        for other in others)]
+
+
+def price(per_hour: Decimal) -> str:
+    """Return a price in US dollars an hour as people read it."""
+    return f'${per_hour.quantize(Decimal("0.0001"))} an hour'
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import json
 import os
 from pathlib import Path
@@ -60,6 +61,26 @@ def process_start(pid: int) -> Optional[int]:
     return None if fields[0] == 'Z' else int(fields[19])
 
 
+@functools.lru_cache(maxsize=1)
+def boot_id() -> str:
+    """Return the id of this computer's present boot, '' where there is none to be had."""
+    try:
+        return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
+    except OSError:
+        return ''
+
+
+def process_alive(pid: int, start: int, boot: str = '') -> bool:
+    """
+    Return whether a process is the one that was noted.
+
+    :param start: as :func:`process_start` had it.
+    :param boot: as :func:`boot_id` had it: after a boot, process ids and clock begin anew; ''
+        where it wasn't noted.
+    """
+    return bool(pid) and boot in ('', boot_id()) and process_start(pid) == start
+
+
 @dataclasses.dataclass(frozen=True)
 class Record:
     """
@@ -70,7 +91,13 @@ class Record:
     :param created: seconds since the epoch when the creation was asked for.
     :param armed: when its lifetime last began: a launch that reuses it begins it anew.
     :param launch: id of the launch that has the machine, '' when none has.
-    :param pid: process of that launch, with ``pid_start`` (clock ticks) against reuse of ids.
+    :param last: id of the launch that has it or had it last: its agent may not know of its end.
+    :param asked: the provider's options as they were asked for; those of ``spec`` have every open
+        choice made ('cheapest', 'nearest'). None in records of before: the same.
+    :param pid: process of that launch, with ``pid_start`` (clock ticks) and ``boot`` (the boot's
+        id) against reuse of ids.
+    :param shell: how the machine is reached from outside the VPN.
+    :param host_key: the one that the machine made itself, '' where the provider's tells.
     :param vpn: the machine's own VPN interface.
     :param public_key: the machine's VPN public key.
     :param robot_vpn: the robot's side of it.
@@ -87,9 +114,13 @@ class Record:
     armed: float = 0.0
     machine_id: Optional[str] = None
     launch: str = ''
+    last: str = ''
     pid: int = 0
     pid_start: int = 0
+    boot: str = ''
+    asked: Optional[Mapping[str, Any]] = None
     shell: Optional[Endpoint] = None
+    host_key: str = ''
     vpn: Optional[VpnInterface] = None
     public_key: str = ''
     robot_vpn: Optional[VpnInterface] = None
@@ -101,7 +132,12 @@ class Record:
     @property
     def launch_alive(self) -> bool:
         """Whether the launch that took the machine still runs."""
-        return bool(self.pid) and process_start(self.pid) == self.pid_start
+        return process_alive(self.pid, self.pid_start, self.boot)
+
+    @property
+    def asked_options(self) -> Mapping[str, Any]:
+        """The provider's options as they were asked for."""
+        return self.spec.options if self.asked is None else self.asked
 
 
 class MachineDirectory:

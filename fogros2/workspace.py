@@ -117,6 +117,25 @@ def inspect(path: str | os.PathLike[str]) -> Workspace:
     return Workspace(root, installed, sources, links, outside, compiled, python)
 
 
+def dependencies(path: str | os.PathLike[str]) -> list[str]:
+    """
+    Return what a workspace's packages depend on that isn't in it, as rosdep keys, sorted.
+
+    :raises WorkspaceError: a manifest can't be read.
+    """
+    root = Path(os.path.abspath(os.path.expanduser(path)))
+    sources = dict(_sources(root / 'src' if (root / 'src').is_dir() else root))
+    manifests = {name: folder / 'package.xml' for name, folder in sources.items()}
+    for name, prefix in _installed(root / 'install'):
+        manifests.setdefault(name, prefix / 'share' / name / 'package.xml')
+    needed: set[str] = set()
+    for manifest in manifests.values():
+        if manifest.is_file():
+            needed |= {(element.text or '').strip() for element in _parsed(manifest)
+                       if element.tag == 'depend' or element.tag.endswith('_depend')}
+    return sorted(needed - {''} - set(manifests))
+
+
 def plan(
     workspace: Workspace, machine: HostFacts, robot: HostFacts, *, ros_setup: Sequence[str],
     can_build: bool, name: str,
@@ -271,8 +290,12 @@ def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _package_name(manifest: Path) -> str:
+    return (_parsed(manifest).findtext('name') or '').strip()
+
+
+def _parsed(manifest: Path) -> ElementTree.Element:
     try:
-        return (ElementTree.parse(manifest).getroot().findtext('name') or '').strip()
+        return ElementTree.parse(manifest).getroot()
     except (ElementTree.ParseError, OSError) as error:
         raise WorkspaceError(f'{manifest} is no package manifest: {error}') from error
 

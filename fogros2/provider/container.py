@@ -95,6 +95,7 @@ class ContainerProvider(Provider):
     """Containers of podman or docker on this computer."""
 
     name: ClassVar[str] = 'container'
+    look_interval: ClassVar[float] = 0.1
     agent_directory: ClassVar[str] = f'/{container_entry.AGENT_DIRECTORY}'
     agent_program: ClassVar[str] = f'/{container_entry.FOLDER}/agent.py'
 

@@ -78,6 +78,8 @@ class SSHProvider(Provider):
     """Computers that others set up and look after."""
 
     name: ClassVar[str] = 'ssh'
+    owned: ClassVar[bool] = False
+    look_interval: ClassVar[float] = 0.1
 
     def check(self, spec: MachineSpec) -> None:
         """Look at the options; nothing is asked over the network."""

@@ -67,6 +67,7 @@ class FakeProvider(Provider):
     """
 
     name: ClassVar[str] = 'fake'
+    look_interval: ClassVar[float] = 0.05
 
     def __init__(
         self, *, polls: int = 0, shell: Endpoint = FAKE_ENDPOINT,

@@ -796,7 +796,7 @@ def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
 
 @pytest.mark.parametrize('how', [
     {'command': 'release', 'on_exit': 'keep'},
-    {'command': 'configure', 'launch': 'another', 'force': True}])
+    {'command': 'configure', 'launch': 'another', 'force': 'abc123'}])
 def test_what_was_kept_goes_with_the_launch_that_asked_for_it(rig, how):
     thing = rig.folder / 'thing'
     rig.serve(on_exit='keep')
@@ -824,7 +824,7 @@ def test_a_launch_with_a_heartbeat_is_not_robbed_of_its_machine(rig, free_udp_po
     rig.wait('output', node='n')
     with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
         client.request('configure', launch='def456')
-    client.request('configure', launch='def456', force=True)
+    client.request('configure', launch='def456', force='abc123')
     assert rig.wait('exited', node='n')['returncode'] == -2
     status = client.request('status')
     assert (status['launch'], status['nodes'], status['heartbeat_age']) == ('def456', [], None)
@@ -925,7 +925,7 @@ def test_nodes_do_not_outlive_a_killed_agent(rig):
 def test_an_agent_that_died_is_replaced_with_its_watch_and_its_log(rig, free_udp_port):
     first = rig.serve(robot_timeout=3.0, end_command=ends(rig))
     client = rig.client()
-    client.request('configure', launch='def456', force=True, heartbeat={
+    client.request('configure', launch='def456', force='abc123', heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
     client.request('start', nodes=[rig.node('n', SLEEP)])
     node = rig.wait('started', node='n')['pid']

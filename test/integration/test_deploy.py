@@ -99,13 +99,13 @@ def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
     events = []
     launch = Launch(report=events.append)
     machine = launch.up(spec())
-    undo = machine._launch._robot_vpn()._take_down
+    undo = machine._launch.robot_vpn()._take_down
 
     def failing():
         undo()
         raise Injected('the undo failed')
 
-    launch._undo.callback(launch.attempt, '', 'VPN interface', failing)
+    launch.undo.callback(launch.attempt, '', 'VPN interface', failing)
     failures = launch.down()
     assert [str(failure) for failure in failures] == ['the undo failed']
     assert any(isinstance(e, StepFailed) and e.reason == 'the undo failed' for e in events)
@@ -179,7 +179,7 @@ def test_a_killed_wireguard_comes_back(spec):
     launch = Launch()
     try:
         machine = launch.up(spec())
-        interface = launch._robot_vpn().interface.name
+        interface = launch.robot_vpn().interface.name
         before = wireguard_of(interface)
         run(Command(('sh', '-c', 'kill -9 "$@"', 'sh', *map(str, before)), sudo=True), timeout=10)
         wait_until(lambda: wireguard_of(interface) - before, timeout=20,

@@ -10,8 +10,16 @@ import time
 
 import pytest
 
-from fogros2 import deploy, process
-from fogros2.deploy import _Deployment, Launch, RobotVpn
+from fogros2 import plugin_system, process
+from fogros2.deploy import entering, job, Launch
+from fogros2.deploy import launch as launches
+from fogros2.deploy.creating import Creation
+from fogros2.deploy.deployment import Deployment
+from fogros2.deploy.entering import Entrance
+from fogros2.deploy.guarding import Guard
+from fogros2.deploy.job import Job
+from fogros2.deploy.joining import Joining
+from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.errors import (
     AgentError,
     Cancelled,
@@ -44,7 +52,8 @@ ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/ke
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider()
-    monkeypatch.setattr(deploy, 'provider', lambda name: fake)
+    for module in (job, launches):
+        monkeypatch.setattr(module, 'provider', lambda name: fake)
     return fake
 
 
@@ -92,12 +101,12 @@ def kept(store, provider, **changes):
     spec = MachineSpec('planner', 'fake', on_exit='keep', options={'size': 1})
     launch = Launch(store=store, environment={})
     with store.machine('planner').lock():
-        deployment = _Deployment(launch, spec)
-        deployment._claim('token')
+        mine = Job(launch, spec)
+        Creation(mine)._claim('token')
         machine = Machine('fake-1', 'planner', 'fake', MachineState.PENDING, tags={
             'fogros2-on-exit': 'keep'})
         provider._machines['fake-1'], provider._waits['fake-1'] = machine, 0
-        deployment._save(machine_id='fake-1', launch='', pid=0, pid_start=0)
+        mine.save(machine_id='fake-1', launch='', pid=0, pid_start=0)
     return spec
 
 
@@ -123,14 +132,16 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
 
     def sync(self, *arguments):
         syncing.set()
-        wait_until(lambda: False, timeout=60, cancel=self.cancel, what='the workspace')
+        wait_until(lambda: False, timeout=60, cancel=self.job.cancel, what='the workspace')
 
-    stand_in = {'_create': None, '_connect': None, '_interface': None, '_arm': None,
-                '_prepare_host': None, '_configure_dds': {}}
-    for name, value in stand_in.items():
-        monkeypatch.setattr(_Deployment, name, lambda self, *_, value=value: value)
-    monkeypatch.setattr(_Deployment, '_join_vpn', join)
-    monkeypatch.setattr(_Deployment, '_sync', sync)
+    stand_in = [
+        (Creation, 'run', None), (Entrance, 'connect', None), (Joining, 'interface', None),
+        (Guard, 'arm', None), (Deployment, 'prepare_host', None),
+        (Deployment, 'configure_dds', {})]
+    for part, name, value in stand_in:
+        monkeypatch.setattr(part, name, lambda self, *_, value=value: value)
+    monkeypatch.setattr(Joining, 'join', join)
+    monkeypatch.setattr(Deployment, 'sync', sync)
     begin = time.monotonic()
     with pytest.raises(VpnError, match='no way there'):
         launch.up(SPEC)
@@ -156,8 +167,8 @@ def test_a_computer_that_another_robot_uses_by_the_same_name_is_left_alone(
         streams=[BusyAgent()])
     machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False,
                       shell=Endpoint('fake', user='fog'))
-    monkeypatch.setattr(_Deployment, '_create', lambda self, undo: machine)
-    monkeypatch.setattr(_Deployment, '_connect', lambda self, machine, undo: shell)
+    monkeypatch.setattr(Creation, 'run', lambda self: machine)
+    monkeypatch.setattr(Entrance, 'connect', lambda self, machine: shell)
     with pytest.raises(AgentError, match="belongs to launch 'abc'"):
         launch.up(MachineSpec('planner', 'ssh'))
     assert shell.files == {}
@@ -173,15 +184,15 @@ def mute():
 
 
 def reach(launch, port):
-    deployment = _Deployment(launch, MachineSpec('planner', 'ssh'))
+    mine = Job(launch, MachineSpec('planner', 'ssh'))
     machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False, shell=Endpoint(
         'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
-    with deploy.contextlib.ExitStack() as undo:
-        deployment._connect(machine, undo)
+    with mine.undo:
+        Entrance(mine).connect(machine)
 
 
 def test_a_login_that_nobody_answers_can_be_cancelled(launch, provider, monkeypatch, mute):
-    monkeypatch.setattr(deploy, 'LOGIN_ATTEMPT', 0.5)
+    monkeypatch.setattr(entering, 'LOGIN_ATTEMPT', 0.5)
     timer = threading.Timer(0.2, launch.cancel.set)
     timer.start()
     begin = time.monotonic()
@@ -209,8 +220,8 @@ def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
         robot._stop.set()
         raise FogError('enough')
 
-    robot = launch._robot_vpn()
-    robot.vpn = deploy.plugin_system.load('fogros2.vpn', 'wireguard')()
+    robot = launch.robot_vpn()
+    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     monkeypatch.setattr(process, 'run', run)
     monkeypatch.setattr(robot._stop, 'wait', lambda timeout: robot._stop.is_set())
     robot._keep()

@@ -9,7 +9,8 @@ import threading
 import pytest
 
 from fogros2 import process
-from fogros2.deploy import Launch, RobotVpn
+from fogros2.deploy import Launch
+from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.model import Command, VpnInterface
 from fogros2.report import Event, StepFailed
 from fogros2.store import Store
@@ -41,7 +42,7 @@ def test_the_folder_by_which_gc_finds_the_interface_stays_as_long(
         launch: Launch, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
     down = Command(('false' if refused else 'true',), what='take it down')
     monkeypatch.setattr(WireGuard, 'down', lambda self, interface: iter([down]))
-    launch._robot_vpn().ensure()
+    launch.robot_vpn().ensure()
     folder = launch.store.launch(launch.id)
     assert len(launch.down()) == refused
     assert folder.exists() == refused
@@ -52,7 +53,7 @@ def test_the_folder_by_which_gc_finds_the_interface_stays_as_long(
 
 def test_it_is_said_once_each_time(
         launch: Launch, monkeypatch: pytest.MonkeyPatch, events: list[Event]) -> None:
-    robot = launch._robot_vpn()
+    robot = launch.robot_vpn()
     for granted in (True, False, False, True, False):
         monkeypatch.setattr(process, 'refresh_ticket', lambda granted=granted: granted)
         robot._refresh_ticket()

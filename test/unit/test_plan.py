@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of fogros2.plan: values in, values out."""
 
+import dataclasses
+from decimal import Decimal
+
 import pytest
 
 from fogros2 import plan
-from fogros2.errors import ConfigurationError, DdsError, WorkspaceError
-from fogros2.model import Peer
+from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
+from fogros2.model import Machine, MachineState, Peer
 
 NETWORK = '198.18.7.0/24'
 
@@ -40,12 +43,59 @@ def test_a_subnet_that_is_full_says_so():
         plan.machine_interface('a1b2c3', NETWORK, 253, 4, '/k')
 
 
+ROBOT = Peer('robot', 'R', '198.18.7.1', '198.51.100.9:1')
+PLANNER = plan.Place(Peer('planner', 'P', '198.18.7.2', '198.51.100.1:1'))
+SLAM = plan.Place(Peer('slam', 'S', '198.18.7.3', '198.51.100.2:1'))
+
+
 def test_a_machine_dials_its_siblings_but_not_the_robot():
-    robot = Peer('robot', 'R', '198.18.7.1', '203.0.113.9:1')
-    planner = Peer('planner', 'P', '198.18.7.2', '203.0.113.1:1')
-    slam = Peer('slam', 'S', '198.18.7.3', '203.0.113.2:1')
-    peers = plan.machine_peers(robot, 'slam', {'slam': slam, 'planner': planner})
-    assert peers == [Peer('robot', 'R', '198.18.7.1', None), planner]
+    peers = plan.machine_peers(ROBOT, SLAM, [PLANNER])
+    assert peers == [Peer('robot', 'R', '198.18.7.1', None), PLANNER.peer]
+
+
+def test_a_machine_that_nobody_can_dial_dials_the_robot():
+    hidden = plan.Place(Peer('pod', 'D', '198.18.7.4'), robot_endpoint='198.51.100.9:4')
+    assert plan.machine_peers(ROBOT, hidden, [PLANNER]) == [
+        Peer('robot', 'R', '198.18.7.1', '198.51.100.9:4'), PLANNER.peer]
+    # and the others wait for it
+    assert plan.machine_peers(ROBOT, PLANNER, [hidden])[1].endpoint is None
+
+
+def test_machines_of_one_inner_network_dial_each_other_there():
+    def inside(place, network, host):
+        return dataclasses.replace(place, inner_network=network, inner_endpoint=host)
+
+    one, two = inside(PLANNER, 'c', '10.0.0.1:5'), inside(SLAM, 'c', '10.0.0.2:5')
+    assert plan.machine_peers(ROBOT, one, [two])[1] == Peer(
+        'slam', 'S', '198.18.7.3', '10.0.0.2:5')
+    elsewhere = inside(SLAM, 'd', '10.0.0.2:5')
+    assert plan.machine_peers(ROBOT, one, [elsewhere])[1] == SLAM.peer
+    assert plan.machine_peers(ROBOT, PLANNER, [SLAM])[1] == SLAM.peer
+
+
+@pytest.mark.parametrize(('known', 'peer', 'inner', 'robot'), [
+    ({'vpn_host': '198.51.100.1'}, '198.51.100.1:7', None, None),
+    ({'vpn_host': '2001:db8::1'}, '[2001:db8::1]:7', None, None),
+    ({'vpn_host': 'node.example', 'vpn_port': 30007}, 'node.example:30007', None, None),
+    ({'robot_host': '198.51.100.9'}, None, None, '198.51.100.9:9'),
+    ({'vpn_host': 'n', 'vpn_port': 3, 'inner_network': 'c', 'inner_host': '10.0.0.1'},
+     'n:3', '10.0.0.1:7', None)])
+def test_a_machine_s_place_is_where_its_provider_says(known, peer, inner, robot):
+    machine = Machine('id', 'pod', 'fake', MachineState.RUNNING, **known)
+    place = plan.place(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
+    assert (place.peer.endpoint, place.inner_endpoint, place.robot_endpoint) == (
+        peer, inner, robot)
+
+
+def test_a_machine_without_any_way_is_refused():
+    machine = Machine('id', 'pod', 'fake', MachineState.RUNNING)
+    with pytest.raises(VpnError, match="no way to 'pod'.*UDP"):
+        plan.place(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
+
+
+def test_a_price_reads_as_money():
+    assert plan.price(Decimal('0.0416')) == '$0.0416 an hour'
+    assert plan.price(Decimal(3)) == '$3.0000 an hour'
 
 
 def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps 1 to 3: make a machine, or take the one that was kept, and wait until it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import time
+from typing import Any, Optional
+import uuid
+
+from fogros2 import bootstrap, model, plan, process
+from fogros2.deploy.job import Job
+from fogros2.errors import (
+    ConfigurationError,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    Unsupported,
+)
+from fogros2.model import Command, CreateRequest, Machine, MachineState
+from fogros2.provider import (
+    TAG_DEPENDENCIES,
+    TAG_EXPIRES,
+    TAG_LAUNCH,
+    TAG_NAME,
+    TAG_ON_EXIT,
+    TAG_ROBOT,
+)
+from fogros2.store import boot_id, process_start, robot_name
+
+
+class Creation:
+    """How a deployment comes by its machine, and how the machine ends."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._asked = False
+
+    def run(self) -> Machine:
+        """
+        Return the machine, as soon as a connection can be tried.
+
+        :raises NameTaken: somebody else has a machine of that name, or it is another than asked.
+        :raises ProviderError: refused, or it ended while it came up.
+        """
+        job = self._job
+        with job.step('machine') as detail:
+            kept = self._kept()
+            if kept is not None:
+                self._adopt(kept)
+                detail.append('kept from before')
+            else:
+                self._create()
+            price = job.launch.price(job.spec)
+            machine = job.provider.reachable(
+                job.machine_id, name=job.name, timeout=job.timeouts.boot, cancel=job.cancel)
+            price = machine.cost_per_hour if machine.cost_per_hour is not None else price
+            if price is not None:
+                job.launch.begin_cost(job.name, price)
+                detail.append(plan.price(price))
+            job.save(shell=machine.shell)
+            detail.append(machine.shell.host if machine.shell else machine.id[:20])
+            return machine
+
+    # -- one that is there ----------------------------------------------------------------------
+
+    def _kept(self) -> Optional[Machine]:
+        """Return the machine of this name that an earlier launch kept or stopped, if any."""
+        job = self._job
+        if job.folder.exists():
+            before = job.folder.load()
+            if before.launch_alive:
+                raise NameTaken(
+                    f"the launch with process {before.pid} has the machine '{job.name}'",
+                    'give the machine another name=, or end that launch')
+            if before.provider != job.spec.provider:
+                raise NameTaken(
+                    f"'{job.name}' is a machine of the provider '{before.provider}'",
+                    f'give the machine another name=, or: ros2 fog delete {job.name}')
+            if before.machine_id is not None:
+                with contextlib.suppress(MachineNotFound):
+                    machine = job.provider.describe(before.machine_id)
+                    if machine.state is not MachineState.DELETED:
+                        self._check_alike(before.asked_options, machine)
+                        # what was chosen then holds; all else is as this launch has it
+                        job.spec = dataclasses.replace(job.spec, options=before.spec.options)
+                        job.record = dataclasses.replace(before, spec=job.spec)
+                        job.former = before.last or before.launch
+                        return machine
+        try:
+            found = list(job.provider.find({TAG_NAME: job.name}))
+        except Unsupported:
+            return None
+        for machine in found:
+            owner = machine.tags.get(TAG_ROBOT, '?')
+            whose = 'this robot' if owner == robot_name() else f"the robot '{owner}'"
+            raise NameTaken(
+                f"{whose} has a machine '{job.name}' that this launch has no key for",
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        return None
+
+    def _check_alike(self, before: Any, machine: Machine) -> None:
+        """Refuse to take a machine for another one than it was asked to be."""
+        job = self._job
+        then, now = (json.loads(model.to_json(o)) for o in (before, job.spec.options))
+        other = sorted(key for key in {*then, *now} if then.get(key) != now.get(key))
+        if other:
+            raise NameTaken(
+                f"the machine '{job.name}' of an earlier launch has another {', '.join(other)}",
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        if job.spec.on_exit == 'stop' and machine.tags.get(TAG_ON_EXIT, 'stop') != 'stop':
+            raise ConfigurationError(
+                f"the machine '{job.name}' was not made to be stopped and started",
+                f"keep it with on_exit='keep', or: ros2 fog delete {job.name}")
+
+    def _adopt(self, machine: Machine) -> None:
+        job = self._job
+        job.reused = True
+        job.undoing('end', self._end)
+        self._claim(job.record.token)
+        if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
+            job.provider.start(machine.id)
+
+    # -- a new one ------------------------------------------------------------------------------
+
+    def _create(self) -> None:
+        job = self._job
+        job.spec = job.launch.resolved(job.spec)
+        token = str(uuid.uuid4())
+        job.folder.delete()
+        job.record = dataclasses.replace(job.record, spec=job.spec)
+        job.undoing('end', self._end)
+        self._claim(token)
+        config: dict[str, Any] = {}
+        if job.provider.agent_directory:
+            config = plan.agent_config(
+                job.spec, job.launch.id, job.provider.agent_directory, [])
+            config['boot_timeout'] = job.timeouts.boot + job.timeouts.ssh
+        dependencies = self._dependencies()
+        tags = {
+            TAG_NAME: job.name, TAG_ROBOT: robot_name(), TAG_LAUNCH: job.launch.id,
+            TAG_EXPIRES: str(int(time.time() + job.spec.lifetime)),
+            TAG_ON_EXIT: job.spec.on_exit,
+            **({TAG_DEPENDENCIES: dependencies} if dependencies else {}),
+        }
+        key = self._login_key() if job.provider.owned and job.provider.shell_kind == 'ssh' else ''
+        self._asked = True
+        machine_id = job.provider.create(job.spec, CreateRequest(
+            token=token, authorized_key=key, tags=tags,
+            vpn_port=plan.machine_port(job.launch.id), agent_config=config,
+            dependencies=dependencies, cancel=job.cancel))
+        job.save(machine_id=machine_id)
+
+    def _dependencies(self) -> str:
+        """Return the hash by which an image is found that has what the machine will need."""
+        job = self._job
+        try:
+            under = job.launch.underlay(job.spec.workspace)
+        except PrerequisiteError:
+            return ''  # the step that needs it says so
+        return bootstrap.dependencies(job.spec, under)
+
+    def _claim(self, token: str) -> None:
+        """Write down that this launch has the machine, before there is anything to lose."""
+        job = self._job
+        pid = os.getpid()
+        job.save(
+            token=token, created=job.record.created or time.time(), armed=time.time(),
+            launch=job.launch.id, last=job.launch.id,
+            pid=pid, pid_start=process_start(pid) or 0, boot=boot_id(),
+            robot_vpn=job.launch.robot_vpn().interface)
+
+    def _login_key(self) -> str:
+        job = self._job
+        path: Path = job.folder.key_file
+        process.run(Command((
+            'ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', f'fogros2-{job.name}',
+            '-f', str(path)), what='make the login key'), timeout=job.timeouts.command)
+        return path.with_suffix('.pub').read_text().strip()
+
+    # -- the end --------------------------------------------------------------------------------
+
+    def _end(self) -> None:
+        """End the machine by its ``on_exit``; the record goes only when the machine has gone."""
+        job = self._job
+        mode = job.spec.on_exit
+        if job.gone or job.failed and not job.reused:
+            mode = 'delete'
+        try:
+            with job.step(mode if job.provider.owned else 'let go'):
+                if mode == 'delete':
+                    for machine_id in self._made():
+                        job.provider.destroy(machine_id)
+                    job.folder.delete()
+                    return
+                if mode == 'stop' and job.record.machine_id is not None:
+                    job.provider.stop(job.record.machine_id)
+                job.save(launch='', pid=0, pid_start=0, robot_vpn=None)
+        finally:
+            job.launch.end_cost(job.name)
+
+    def _made(self) -> list[str]:
+        """Return the id of the machine; a creation that failed half-way is found by its tags."""
+        job = self._job
+        if job.record.machine_id is not None:
+            return [job.record.machine_id]
+        if not self._asked:
+            return []
+        try:
+            return [machine.id for machine in job.provider.find(
+                {TAG_NAME: job.name, TAG_LAUNCH: job.launch.id})]
+        except Unsupported:
+            return []

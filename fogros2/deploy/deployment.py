@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One machine's way up, step by step; its undo stack becomes the running machine's way down."""
+
+from __future__ import annotations
+
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from fogros2 import bootstrap, workspace
+from fogros2.deploy.creating import Creation
+from fogros2.deploy.entering import Entrance
+from fogros2.deploy.guarding import Guard
+from fogros2.deploy.job import Job
+from fogros2.deploy.joining import Joining
+from fogros2.deploy.running import RunningMachine
+from fogros2.model import MachineSpec, VpnInterface
+from fogros2.report import Progress
+from fogros2.shell import Shell
+
+if TYPE_CHECKING:
+    from fogros2.deploy.launch import Launch
+
+
+class Deployment:
+    """The steps of one machine."""
+
+    def __init__(self, launch: Launch, spec: MachineSpec) -> None:
+        self.launch = launch
+        self.job = Job(launch, spec)
+        self.creation = Creation(self.job)
+        self.entrance = Entrance(self.job)
+        self.guard = Guard(self.job)
+        self.joining = Joining(self.job, self.guard)
+
+    def run(self) -> RunningMachine:
+        """Take the steps; on any failure undo those taken."""
+        job = self.job
+        with job.undo:
+            job.undo.enter_context(job.folder.lock())
+            # the robot's side needs nothing of the machine's: it comes up meanwhile
+            with ThreadPoolExecutor(4, f'fog-{job.name}') as pool:
+                robot = pool.submit(self.launch.robot_vpn().ensure)
+                machine = self.creation.run()
+                shell = self.entrance.connect(machine)
+                interface = self.joining.interface()
+                agent = self.guard.arm(machine, shell)
+                ros = self.prepare_host(shell)
+                robot.result()
+                joining = pool.submit(self.joining.join, machine, shell, agent, interface)
+                syncing = pool.submit(self.sync, shell, ros)
+                configuring = pool.submit(self.configure_dds, shell, interface)
+                self._all_of(joining, syncing, configuring)
+                public_key = joining.result().place.peer.public_key
+                dds = configuring.result()
+            with job.step('agent') as detail:
+                heartbeat = self.guard.start(agent, interface, ros, dds)
+                detail.append(f'VPN round trip {(heartbeat.round_trip or 0) * 1e3:.2f} ms')
+            job.save(public_key=public_key)
+            # once more, to come first on the way down
+            self.guard.undo_nodes(agent)
+            self.entrance.go_inside(interface)
+            job.failed = False
+            running = RunningMachine(
+                self.launch, job, machine, shell, agent, heartbeat, interface,
+                self.guard.first_event)
+            running.undo = job.undo.pop_all()
+            return running
+
+    def _all_of(self, *tasks: Future[Any]) -> None:
+        """Wait for steps that run side by side; the first that fails ends the others."""
+        for task in wait(tasks, return_when=FIRST_EXCEPTION).done:
+            if task.exception() is not None:
+                self.job.cancel.set()
+                task.result()
+
+    # -- step 4: ROS on the machine -------------------------------------------------------------
+
+    def prepare_host(self, shell: Shell) -> bootstrap.RosInstall:
+        """Make the machine ready for ROS 2 nodes; see :func:`fogros2.bootstrap.ensure`."""
+        job = self.job
+        with job.step('ROS 2') as detail:
+            ros, note = bootstrap.ensure(
+                shell, self.launch.underlay(job.spec.workspace), job.spec,
+                timeout=job.timeouts.install, cancel=job.cancel)
+            detail.append(note)
+            return ros
+
+    # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
+
+    def sync(self, shell: Shell, ros: bootstrap.RosInstall) -> None:
+        """Send the workspace, and build it there where it has to be."""
+        job = self.job
+        if job.spec.workspace is None:
+            return
+        with job.step('workspace') as detail:
+            note = workspace.transfer(
+                shell, Path(job.spec.workspace), ros, timeouts=job.timeouts,
+                cancel=job.cancel,
+                on_progress=lambda done, total: self.launch.report(
+                    Progress(job.name, 'workspace', done, total)))
+            detail.append(note)
+
+    def configure_dds(self, shell: Shell, interface: VpnInterface) -> dict[str, str]:
+        """Write the DDS configuration there; return the variables that nodes need."""
+        vendor = self.launch.dds()
+        # the robot hears of a machine by multicast, machines of each other by asking
+        peers = self.launch.addresses_but(self.job.name)
+        path = f'{self.guard.directory}/dds.xml'
+        shell.put(
+            vendor.render(vendor.machine_interfaces(interface.name), peers).encode(),
+            path, mode=0o600, timeout=self.job.timeouts.command)
+        return dict(vendor.environment(path, {}))

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps 8 to 11: the agent that guards a machine, armed before anything slow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import contextlib
+import functools
+import threading
+from typing import Any, Optional
+
+from fogros2 import bootstrap, model, plan
+from fogros2.agent_client import agent_source, AgentClient, Heartbeat
+from fogros2.deploy.job import Job
+from fogros2.errors import (
+    AgentAbsent,
+    AgentError,
+    Cancelled,
+    CommandError,
+    DeadlineExceeded,
+    FogError,
+    VpnError,
+)
+from fogros2.model import Command, Machine, VpnInterface
+from fogros2.shell import Shell
+from fogros2.waiting import wait_until
+
+AGENT_FOLDER = '/run/fogros2'
+#: Seconds between two looks for the provider's notice that it takes the machine away.
+NOTICE_INTERVAL = 5.0
+#: Seconds without a word after which a machine isn't taken to be there without asking it.
+QUIET = 3.0
+
+# One that was released has left; one that was never reached hasn't. Another robot's stays: the
+# agent says in its configuration whose it is. $1 folder, $2 launch, $3 our configuration.
+_REMOVE = """\
+running() { [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }
+rm -f -- "$3"
+if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
+    grep -qsF "\\"launch\\": \\"$2\\"" "$1/config.json" || exit 0
+    kill -s TERM $pid; n=0
+    while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
+else
+    # another robot may be about to start one
+    for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
+fi
+rm -rf -- "$1"
+"""
+
+
+class Guard:
+    """The agent of one machine, from the robot's side."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._released = False
+        self._rearming: Optional[_Rearming] = None
+        #: The number of the first event that is this launch's.
+        self.first_event = 1
+
+    @property
+    def directory(self) -> str:
+        """The agent's folder on the machine."""
+        return self._job.provider.agent_directory or f'{AGENT_FOLDER}/{self._job.name}'
+
+    # -- armed ----------------------------------------------------------------------------------
+
+    def arm(self, machine: Machine, shell: Shell) -> AgentClient:
+        """
+        Make sure that an agent guards the machine.
+
+        :raises AgentError: another launch has it.
+        """
+        job, program = self._job, self._job.provider.agent_program
+        config = plan.agent_config(job.spec, job.launch.id, self.directory, machine.end_command)
+        config['user'] = machine.shell.user if machine.shell else ''
+        # from here on we speak to it all the time, first to re-arm it, then by heartbeats
+        config['boot_timeout'] = job.spec.robot_timeout
+        with job.step('guard'):
+            agent = None
+            if not program:
+                program = f'{self.directory}/agent.py'
+                if job.on(shell, [Command.script(
+                        f'[ ! -S {self.directory}/agent.sock ] || echo there', sudo=True,
+                        what='look for an agent')]).strip():
+                    # of a launch that died, or of another robot, whose it stays
+                    agent = self._reach(shell, program, config)
+                job.undoing('guard', functools.partial(self._remove, shell))
+                if agent is None:
+                    self._install(shell, program, config)
+            job.save(agent=self.directory, agent_program=program)
+            agent = agent or wait_until(
+                lambda: self._reach(shell, program, config),
+                timeout=job.timeouts.agent, cancel=job.cancel,
+                what=f"the agent of '{job.name}'")
+            job.undo.callback(agent.close)
+            job.heard = lambda: agent.silent_for < QUIET
+            self.undo_nodes(agent)
+            self._rearming = _Rearming(agent, job.launch.id, job.spec.robot_timeout / 4)
+            job.undo.callback(self._rearming.close)
+            if job.provider.notice:
+                agent.request('watch', timeout=job.timeouts.agent, what='notice',
+                              argv=list(job.provider.notice), interval=NOTICE_INTERVAL)
+            return agent
+
+    def _install(self, shell: Shell, program: str, config: Mapping[str, Any]) -> None:
+        job = self._job
+        job.on(shell, [Command.script(
+            f'install -d -m 755 {AGENT_FOLDER}; '
+            f'install -d -m 700 -o {config["user"]} {self.directory}', sudo=True,
+            what="make the agent's folder")])
+        shell.put(agent_source().read_bytes(), program, mode=0o700)
+        # of this launch alone: another robot may be doing the same at this moment
+        shell.put(model.to_json(config).encode(), self._first_config, mode=0o600)
+        try:
+            job.on(shell, [Command.script(
+                f'python3 -IS {program} serve --detach --config {self._first_config} && code=0 '
+                f'|| code=$?\nrm -f {self._first_config}\nexit $code',
+                sudo=True, what='start the agent')])
+        except CommandError as error:
+            if '"kind":"running"' in error.result.stdout:
+                raise AgentError(
+                    f"another robot has just taken the machine '{job.name}' of this computer",
+                    'give the machine another name=') from error
+            raise
+
+    @property
+    def _first_config(self) -> str:
+        return f'{self.directory}/start-{self._job.launch.id}.json'
+
+    def _reach(
+        self, shell: Shell, program: str, config: Mapping[str, Any],
+    ) -> Optional[AgentClient]:
+        """
+        Return a connection to the machine's agent, ours from now on; None while there is none.
+
+        :raises AgentError: another launch has it.
+        """
+        # no cancel: it is needed on the way down as well, and requests have deadlines
+        agent = AgentClient(shell, self.directory, agent_path=program)
+        try:
+            # the record said that the launch before is gone: its agent may not know yet
+            answer = agent.request('configure', timeout=self._job.timeouts.agent,
+                                   force=self._job.former, **config)
+        except FogError as error:
+            agent.close()
+            if isinstance(error, AgentAbsent):
+                return None  # the machine's SSH server may be there before its agent
+            raise
+        self.first_event = int(answer.get('next', 1))
+        return agent
+
+    def _remove(self, shell: Shell) -> None:
+        job = self._job
+        if job.survives:
+            job.tidy(shell, [Command(
+                ('sh', '-ec', _REMOVE, 'sh', self.directory, job.launch.id, self._first_config),
+                sudo=True, what='remove the agent')])
+
+    # -- with nodes -----------------------------------------------------------------------------
+
+    def start(
+        self, agent: AgentClient, interface: VpnInterface, ros: bootstrap.RosInstall,
+        dds: Mapping[str, str],
+    ) -> Heartbeat:
+        """
+        Tell the agent how to run nodes, and send it heartbeats from now on.
+
+        :raises VpnError: nothing comes back through the VPN.
+        """
+        job = self._job
+        robot = job.launch.robot_vpn().interface
+        try:
+            agent.request(
+                'configure', timeout=job.timeouts.agent,
+                heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
+                           'peer': robot.address},
+                environment={**ros.environment, **dds, **job.spec.environment},
+                setup=list(ros.setup), ros_command=list(ros.command))
+        except AgentError as error:
+            if 'in use' in str(error):
+                raise VpnError(
+                    f"UDP port {plan.HEARTBEAT_PORT} of '{job.name}' is in use already",
+                    f"end what listens there: ss -lunp 'sport = :{plan.HEARTBEAT_PORT}'"
+                ) from error
+            raise
+        heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, job.launch.id)
+        job.undo.callback(heartbeat.close)
+        try:
+            wait_until(
+                lambda: heartbeat.round_trip is not None, timeout=job.timeouts.vpn,
+                cancel=job.cancel, what='an answer through the VPN', longest=0.05)
+        except FogError as error:
+            if isinstance(error, Cancelled):
+                raise
+            raise VpnError(
+                f"nothing comes back from '{job.name}' through the VPN",
+                f'is UDP port {interface.port} open on the way there?') from error
+        if self._rearming is not None:
+            self._rearming.close()
+        return heartbeat
+
+    # -- the way down ---------------------------------------------------------------------------
+
+    def undo_nodes(self, agent: AgentClient) -> None:
+        """Push what has to come first on the way down: the nodes end."""
+        self._job.undoing('nodes', lambda: self.release(agent))
+
+    def release(self, agent: AgentClient) -> None:
+        """Have the agent of a computer that stays end the nodes and let go of it; once."""
+        job = self._job
+        if not job.survives or self._released:
+            return
+        self._released = True
+        if self._rearming is not None:
+            self._rearming.close()
+        with contextlib.suppress(AgentAbsent):
+            try:
+                # answers when the nodes are gone; out of reach, its watch gets there by itself
+                agent.request('release', timeout=job.patience(job.timeouts.command),
+                              on_exit=job.spec.on_exit, exit=not job.provider.agent_program)
+            except DeadlineExceeded as error:
+                raise DeadlineExceeded(
+                    f"'{job.name}' does not answer: its agent ends the nodes by itself, "
+                    f'{job.spec.robot_timeout:g} s after it last heard of this launch') from error
+
+
+class _Rearming:
+    """Tells an agent that the launch lives for as long as the VPN has no heartbeat yet."""
+
+    def __init__(self, agent: AgentClient, launch_id: str, interval: float) -> None:
+        self._agent = agent
+        self._launch_id = launch_id
+        self._interval = interval
+        self._done = threading.Event()
+        threading.Thread(target=self._run, name='fog-rearm', daemon=True).start()
+
+    def _run(self) -> None:
+        while not self._done.wait(self._interval):
+            try:
+                self._agent.request('configure', launch=self._launch_id)
+            except FogError:
+                pass  # the next one may get through; the step under way says what is wrong
+
+    def close(self) -> None:
+        """Stop: heartbeats go on in its place."""
+        self._done.set()

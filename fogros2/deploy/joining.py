@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Step 5: the machine's end of the VPN."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fogros2 import plan
+from fogros2.agent_client import AgentClient
+from fogros2.deploy.guarding import Guard
+from fogros2.deploy.job import Job
+from fogros2.deploy.robot_vpn import VpnMember
+from fogros2.errors import CommandError, VpnError
+from fogros2.model import Machine, Peer, VpnInterface
+from fogros2.shell import Shell
+
+
+class Joining:
+    """How one machine becomes part of the launch's VPN, and leaves it."""
+
+    def __init__(self, job: Job, guard: Guard) -> None:
+        self._job = job
+        self._guard = guard
+
+    def interface(self) -> VpnInterface:
+        """Return the machine's interface, decided and written down before it is made."""
+        job = self._job
+        robot = job.launch.robot_vpn().interface
+        port = job.record.vpn.port if job.record.vpn else plan.machine_port(job.launch.id)
+        interface = plan.machine_interface(
+            job.launch.id, robot.network, job.launch.index(job.name), port,
+            f'{self._guard.directory}/vpn.key')
+        job.save(vpn=interface)
+        return interface
+
+    def join(
+        self, machine: Machine, shell: Shell, agent: AgentClient, interface: VpnInterface,
+    ) -> VpnMember:
+        """
+        Bring the machine's interface up, and let the others know of it.
+
+        :raises VpnError: its port is taken, or neither of the two can dial the other.
+        """
+        job = self._job
+        with job.step('VPN') as detail:
+            robot = job.launch.robot_vpn()
+            vpn = robot.vpn
+            job.undoing('VPN', lambda: self._leave(shell, agent, interface))
+            job.undoing('VPN', lambda: robot.remove(job.name))
+            public_key = job.on(shell, [vpn.keys(interface)]).strip()
+            place = plan.place(
+                machine, Peer(job.name, public_key, interface.address), interface.port,
+                robot.interface.port)
+
+            def keep(peers: Sequence[Peer]) -> None:
+                """Have the agent repair the machine's VPN when its program dies."""
+                agent.request(
+                    'keep', timeout=job.timeouts.agent, what='vpn', interval=1.0,
+                    alive=list(vpn.alive(interface).argv),
+                    repair=[list(c.argv) for c in vpn.repair(interface, peers)],
+                    down=[list(c.argv) for c in vpn.down(interface)])
+
+            member = VpnMember(
+                place, interface, lambda commands: job.on(shell, commands), keep)
+            try:
+                # who is dialled has to know the other by then: the next attempt comes after 5 s
+                if place.robot_endpoint is not None:
+                    robot.admit(member)
+                    member.up(robot)
+                else:
+                    member.up(robot)
+                    robot.admit(member)
+            except CommandError as error:
+                if 'Address already in use' in error.result.stderr:
+                    raise VpnError(
+                        f"UDP port {interface.port} of '{job.name}' is in use already",
+                        'launch again: each launch takes another port') from error
+                raise
+            robot.spread(member)
+            detail.append(interface.address)
+            if place.robot_endpoint is not None:
+                detail.append(f'dials {place.robot_endpoint}')
+            return member
+
+    def _leave(self, shell: Shell, agent: AgentClient, interface: VpnInterface) -> None:
+        job = self._job
+        if job.survives:
+            # or the agent would take the interface for a broken one
+            job.launch.attempt(job.name, 'nodes', lambda: self._guard.release(agent))
+            job.tidy(shell, job.launch.robot_vpn().vpn.down(interface))

@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's side of one launch: its machines, its VPN interface, its DDS configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
+from decimal import Decimal
+import os
+from pathlib import Path
+import secrets
+import shutil
+import threading
+import time
+from typing import Optional
+
+from fogros2 import model, plan, plugin_system, process, workspace
+from fogros2 import shell as shells
+from fogros2.dds import DdsVendor
+from fogros2.deploy.deployment import Deployment
+from fogros2.deploy.robot import check_robot, provider
+from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.deploy.running import RunningMachine
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    FogError,
+    PrerequisiteError,
+    StoreError,
+)
+from fogros2.model import Command, MachineSpec
+from fogros2.provider import Provider
+from fogros2.report import Reporter, silent, step, StepFailed
+from fogros2.store import boot_id, check_name, process_start, Store, write_private
+from fogros2.waiting import Timeouts
+
+
+class Launch:
+    """
+    The robot's side of one launch; thread-safe.
+
+    :param report: gets each step as it begins and ends.
+    :param cancel: set to make every wait of the deployment end with Cancelled.
+    :param environment: the environment that the launch was started in.
+    """
+
+    def __init__(
+        self, *, store: Optional[Store] = None, report: Reporter = silent,
+        timeouts: Optional[Timeouts] = None, environment: Optional[Mapping[str, str]] = None,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        self.id = secrets.token_hex(3)
+        self.store = store or Store()
+        self.report = report
+        self.timeouts = timeouts or Timeouts()
+        self.cancel = cancel or threading.Event()
+        self.user_environment = dict(os.environ if environment is None else environment)
+        self._lock = threading.RLock()
+        self.undo = contextlib.ExitStack()
+        self._failures: list[FogError] = []
+        self._indices: dict[str, int] = {}
+        self._ups: dict[str, Future[RunningMachine]] = {}
+        self._resolved: dict[str, MachineSpec] = {}
+        self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
+        self._robot: Optional[RobotVpn] = None
+        self._rmw = ''
+        self._robot_environment: Optional[dict[str, str]] = None
+        self._closed = False
+
+    # -- before anything is created -------------------------------------------------------------
+
+    def prepare(
+        self, specs: Sequence[MachineSpec],
+        programs: Mapping[str, Sequence[tuple[str, str]]] = {},
+    ) -> None:
+        """
+        Check everything that can be checked at no cost.
+
+        :param programs: per machine name the (package, executable) pairs that will run there.
+        :raises FogError: the first thing that is wrong, with its remedy.
+        """
+        self.dds()
+        check_robot()
+        names = [spec.name for spec in specs]
+        for name in names:
+            check_name(name)
+            if names.count(name) > 1:
+                raise ConfigurationError(f"two machines of this launch are called '{name}'",
+                                         'give each a name= of its own')
+        prefixes = plan.ament_prefixes(self.user_environment)
+        for spec in specs:
+            machines = provider(spec.provider)
+            shells.warm(machines.shell_kind)
+            machines.check(spec)
+            if spec.on_exit == 'stop' and not machines.owned:
+                raise ConfigurationError(
+                    f"'{spec.name}' is a computer that exists already: no launch switches it off",
+                    "use on_exit='delete' to leave nothing there, or 'keep'")
+            if spec.workspace is not None:
+                workspace.inspect(Path(spec.workspace))
+            for package, executable in programs.get(spec.name, ()):
+                if not spec.options.get('image'):
+                    plan.check_program(package, executable, prefixes)
+        choosing = [spec for spec in specs if not self._may_be_kept(spec)]
+        with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
+            for choice in [pool.submit(self.resolved, spec) for spec in choosing]:
+                choice.result()
+
+    def _may_be_kept(self, spec: MachineSpec) -> bool:
+        """Return whether a machine of an earlier launch may be taken, whose choices hold."""
+        folder = self.store.machine(spec.name)
+        try:
+            before = folder.load() if folder.exists() else None
+        except StoreError:
+            return False
+        return before is not None and before.machine_id is not None \
+            and before.provider == spec.provider
+
+    def resolved(self, spec: MachineSpec) -> MachineSpec:
+        """
+        Return a spec with every open choice made, once in a launch.
+
+        :raises FogError: nothing fits.
+        """
+        with self._lock:
+            known = self._resolved.get(spec.name)
+        if known is not None:
+            return known
+        machines = provider(spec.provider)
+        if type(machines).resolve is Provider.resolve:
+            return spec
+        with step(self.report, spec.name, 'choices') as detail:
+            chosen = machines.resolve(spec)
+            detail += [f'{key} {value}' for key, value in sorted(chosen.options.items())
+                       if spec.options.get(key) != value]
+            price = self.price(chosen)
+            if price is not None:
+                detail.append(plan.price(price))
+        with self._lock:
+            self._resolved[spec.name] = chosen
+        return chosen
+
+    def price(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return what a machine of a resolved spec costs an hour (US dollars), None if unknown."""
+        try:
+            return provider(spec.provider).cost_per_hour(spec)
+        except FogError:
+            return None  # a price is for people to read; what limits it was checked
+
+    def begin_cost(self, name: str, price: Decimal) -> None:
+        """Take it that a machine costs money from now on."""
+        with self._lock:
+            self._costs[name] = (price, time.monotonic(), None)
+
+    def end_cost(self, name: str) -> None:
+        """Take it that a machine costs this launch nothing more; harmless twice."""
+        with self._lock:
+            known = self._costs.get(name)
+            if known is not None and known[2] is None:
+                self._costs[name] = (known[0], known[1], time.monotonic())
+
+    def cost(self) -> list[tuple[str, Decimal, float]]:
+        """
+        Return each machine of the launch whose price is known, those that have ended too.
+
+        Name, US dollars per hour, and the seconds that this launch has had it.
+        """
+        now = time.monotonic()
+        with self._lock:
+            return [(name, price, (now if end is None else end) - begin)
+                    for name, (price, begin, end) in sorted(self._costs.items())]
+
+    def dds(self) -> DdsVendor:
+        """
+        Return the DDS vendor of the launch.
+
+        :raises DdsError: the user's RMW_IMPLEMENTATION is one without a plugin.
+        """
+        if not self._rmw:
+            self._rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
+        vendor: DdsVendor = plugin_system.load('fogros2.dds', self._rmw)(domain=self.domain)
+        return vendor
+
+    @property
+    def domain(self) -> int:
+        """
+        The ROS domain of all nodes of the launch.
+
+        :raises ConfigurationError: ROS_DOMAIN_ID is no number.
+        """
+        text = self.user_environment.get('ROS_DOMAIN_ID') or '0'
+        try:
+            return int(text)
+        except ValueError:
+            raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
+                                     'use 0 to 101') from None
+
+    def underlay(self, workspace_root: Optional[str]) -> plan.Underlay:
+        """
+        Return the robot's own ROS 2 as paths.
+
+        :raises PrerequisiteError: there is none.
+        """
+        ros2 = shutil.which('ros2', path=self.user_environment.get('PATH'))
+        if ros2 is None:
+            raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
+        return plan.underlay(self.user_environment, workspace_root, ros2)
+
+    def robot_environment(self) -> dict[str, str]:
+        """
+        Return the variables that the robot's nodes need, with the VPN's interface there.
+
+        A node takes the interfaces that it finds when it starts, so this one has to be there
+        before the first of them, well before any machine is. It takes a tenth of a second, once.
+
+        :raises FogError: this computer can't have it.
+        """
+        with self._lock:
+            if self._robot_environment is None:
+                check_robot()
+                vendor = self.dds()
+                lan = vendor.parse_lan(self.robot([vendor.ask_lan()]))
+                robot = self.robot_vpn()
+                interfaces = vendor.robot_interfaces(
+                    robot.interface.name, lan, self.user_environment)
+                path = self.store.launch(self.id) / 'dds.xml'
+                # no peers: the machines announce themselves
+                write_private(path, vendor.render(interfaces, ()).encode())
+                robot.ensure()
+                self._robot_environment = dict(
+                    vendor.environment(str(path), self.user_environment))
+            return dict(self._robot_environment)
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Give machines their addresses ahead, so that nodes started meanwhile know them."""
+        with self._lock:
+            for name in names:
+                self._indices.setdefault(name, len(self._indices))
+
+    def index(self, name: str) -> int:
+        """Return a machine's number in the VPN."""
+        return self._indices[name]
+
+    def addresses_but(self, name: str) -> list[str]:
+        """Return the VPN addresses of all machines that are known of, but one."""
+        network = self.robot_vpn().interface.network
+        with self._lock:
+            indices = [index for other, index in self._indices.items() if other != name]
+        return [plan.machine_interface('', network, index, 0, '').address for index in indices]
+
+    # -- up -------------------------------------------------------------------------------------
+
+    def up(self, spec: MachineSpec) -> RunningMachine:
+        """
+        Bring a machine up and return it; a second call for the same name joins the first.
+
+        Blocks for as long as it takes: call it in a thread.
+
+        :raises FogError: what failed; nothing of the machine is left then.
+        :raises Cancelled: the launch is ending.
+        """
+        with self._lock:
+            if self._closed or self.cancel.is_set():
+                raise Cancelled(f"machine '{spec.name}'")
+            known = self._ups.get(spec.name)
+            if known is None:
+                self.expect([spec.name])
+                mine: Future[RunningMachine] = Future()
+                self._ups[spec.name] = mine
+        if known is not None:
+            return known.result()
+        try:
+            machine = Deployment(self, spec).run()
+        except BaseException as error:
+            mine.set_exception(error)
+            raise
+        mine.set_result(machine)
+        self._warm()
+        return machine
+
+    def _warm(self) -> None:
+        """
+        Start the machines' launch processes once all machines are up.
+
+        Nodes start sooner by what that takes; before, it would take the processors from machines
+        on the same computer that are still coming up.
+        """
+        ups = list(self._ups.values())
+        if self.ending or not all(up.done() for up in ups):
+            return  # one that is kept would be left with the process
+        for machine in self.machines():
+            with contextlib.suppress(FogError):  # the first start would say the same
+                machine.warm()
+
+    def robot_vpn(self) -> RobotVpn:
+        """Return the robot's VPN, chosen but not necessarily up."""
+        with self._lock:
+            if self._robot is None:
+                folder = self.store.launch(self.id)
+                self.undo.callback(self._remove_folder, folder)
+                # by this, `ros2 fog gc` tells the folder of a launch that was killed
+                pid = os.getpid()
+                write_private(folder / 'process.json', model.to_json(
+                    {'pid': pid, 'pid_start': process_start(pid),
+                     'boot': boot_id()}).encode())
+                self._robot = RobotVpn(self, folder)
+            return self._robot
+
+    def _remove_folder(self, folder: Path) -> None:
+        """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
+        if self._robot is None or self._robot.down:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @property
+    def ending(self) -> bool:
+        """Whether the launch is on its way down."""
+        return self._closed
+
+    def machines(self) -> list[RunningMachine]:
+        """Return the machines that are up now."""
+        return [up.result() for up in list(self._ups.values())
+                if up.done() and up.exception() is None]
+
+    # -- down -----------------------------------------------------------------------------------
+
+    def down(self) -> list[FogError]:
+        """
+        End everything, each machine by its ``on_exit``, the VPN's interface last; idempotent.
+
+        Call it when the robot's nodes have exited: they must not lose the interface while they
+        run. Returns the undo steps that failed; the others ran all the same.
+        """
+        with self._lock:
+            self._closed = True
+        self.cancel.set()
+        ups = list(self._ups.values())
+        ended: list[Future[None]] = []
+        with ThreadPoolExecutor(max(1, len(ups)), 'fog-down') as pool:
+            for up in ups:
+                # one that still comes up sees the cancel and takes itself away
+                if up.exception() is None:
+                    ended.append(pool.submit(up.result().close))
+        with self._lock:
+            self._ups.clear()
+            for future in ended:
+                self._note(future.exception())
+            self.undo.close()
+            failures, self._failures = self._failures, []
+        return failures
+
+    def _note(self, error: Optional[BaseException]) -> None:
+        if isinstance(error, FogError):
+            self._failures.append(error)
+        elif error is not None:
+            raise error
+
+    def attempt(self, machine: str, name: str, undo: Callable[[], None]) -> None:
+        """Run an undo step; if it fails, report and remember it, so that the others still run."""
+        begin = time.monotonic()
+        try:
+            undo()
+        except FogError as error:
+            self.report(StepFailed(machine, name, time.monotonic() - begin, str(error)))
+            with self._lock:
+                self._failures.append(error)
+
+    def robot(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
+        """Run commands on the robot, one after the other; return what the last one printed."""
+        output = ''
+        for command in commands:
+            output = process.run(command, timeout=self.timeouts.vpn,
+                                 cancel=self.cancel if cancel else None).stdout
+        return output

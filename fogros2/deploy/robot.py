@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's own part: what it needs to have, and what a dead launch left on it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import shutil
+
+from fogros2 import plugin_system, process
+from fogros2.errors import PrerequisiteError
+from fogros2.provider import Provider
+from fogros2.report import Reporter, silent, step
+from fogros2.store import Record, Store
+from fogros2.vpn import Vpn
+from fogros2.waiting import Timeouts
+
+#: Programs that the robot's side calls, and the Debian packages that have them.
+ROBOT_PROGRAMS = {
+    'ip': 'iproute2', 'wg': 'wireguard-tools', 'nft': 'nftables', 'rsync': 'rsync',
+    'ssh-keygen': 'openssh-client',
+}
+
+
+def provider(name: str) -> Provider:
+    """
+    Return the provider of that name.
+
+    :raises ConfigurationError: there is none.
+    """
+    instance: Provider = plugin_system.load('fogros2.provider', name)()
+    return instance
+
+
+def check_robot() -> None:
+    """
+    Check that this computer can be the robot's end of a VPN.
+
+    :raises PrerequisiteError: a program, a right or a device is missing.
+    """
+    process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
+    if os.geteuid() != 0:
+        check_sudo()
+    if not Path('/dev/net/tun').exists():
+        raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
+
+
+def check_sudo() -> None:
+    """
+    Check that root's commands run without a question in the middle of a launch.
+
+    :raises PrerequisiteError: they don't.
+    """
+    if process.which('sudo') is None:
+        raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
+                                'run the launch as root, or install sudo')
+    if not process.refresh_ticket():
+        raise PrerequisiteError('a VPN interface takes root, and sudo wants a password',
+                                'run `sudo -v` first, then launch again')
+
+
+def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
+    """
+    Take away what a launch that died left on the robot for a machine that is gone.
+
+    Its VPN interface with its program and filter, the launch's folder, the machine's folder with
+    its keys. A launch that still runs keeps its own; idempotent.
+
+    :raises FogError: something could not be taken away; the record stays then.
+    """
+    if record.robot_vpn is not None and record.launch and not record.launch_alive:
+        with step(report, record.name, 'VPN interface'):
+            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+            for command in vpn.down(record.robot_vpn):
+                process.run(command, timeout=Timeouts().vpn)
+            shutil.rmtree(store.launch(record.launch), ignore_errors=True)
+    store.machine(record.name).delete()

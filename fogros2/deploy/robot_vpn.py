@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's VPN interface, one per launch, and the machines that it leads to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+import threading
+import time
+from typing import Optional, TYPE_CHECKING
+
+from fogros2 import plan, plugin_system, process
+from fogros2.errors import FogError
+from fogros2.model import Command, Peer, VpnInterface
+from fogros2.report import step, StepFailed
+from fogros2.vpn import addresses, Vpn
+
+if TYPE_CHECKING:
+    from fogros2.deploy.launch import Launch
+
+#: Seconds between two uses of sudo's ticket, which lives for some minutes after each.
+TICKET_REFRESH = 30.0
+#: Seconds that a new machine waits for the others to have been told of it.
+TELLING = 5.0
+
+
+class RobotVpn:
+    """The robot's VPN interface, one per launch, and the machines that it leads to."""
+
+    #: Whether nothing of it is on this computer.
+    down = True
+    _told_of_sudo = False
+
+    def __init__(self, launch: Launch, folder: Path) -> None:
+        self._launch = launch
+        self._lock = threading.Lock()
+        self._up = False
+        self._members: dict[str, VpnMember] = {}
+        self._public_key = ''
+        self._stop = threading.Event()
+        self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
+            domain=launch.domain)
+        used = addresses.parse_used(launch.robot([addresses.used_networks()]))
+        network = addresses.choose_subnet(
+            used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))
+        self.interface = plan.robot_interface(
+            launch.id, network, addresses.choose_port(), str(folder / 'vpn.key'))
+
+    def ensure(self) -> Peer:
+        """Bring the interface up if it isn't; return the robot as the machines' peer."""
+        with self._lock:
+            if not self._up:
+                launch = self._launch
+                with step(launch.report, '', 'VPN interface') as detail:
+                    launch.undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
+                    self.down = False
+                    self._public_key = launch.robot([self.vpn.keys(self.interface)]).strip()
+                    launch.robot(self.vpn.up(self.interface, []))
+                    detail.append(f'{self.interface.name} {self.interface.address}')
+                self._up = True
+                threading.Thread(target=self._keep, name='fog-vpn', daemon=True).start()
+            return Peer('robot', self._public_key, self.interface.address)
+
+    def peers_of(self, member: VpnMember) -> list[Peer]:
+        """Return the peers of a machine as they are now."""
+        robot = self.ensure()
+        with self._lock:
+            others = [other.place for name, other in sorted(self._members.items())
+                      if name != member.name]
+        return plan.machine_peers(robot, member.place, others)
+
+    def admit(self, member: VpnMember) -> None:
+        """Let the robot know of a new machine."""
+        with self._lock:
+            self._members[member.name] = member
+            self._launch.robot(self.vpn.peers(self.interface, self._sorted()))
+
+    def spread(self, new: VpnMember) -> None:
+        """
+        Let the machines that are there already know of a new one.
+
+        One that can't be told now is told as soon as it can be: the new machine needn't wait.
+        """
+        new.update(self)
+        with self._lock:
+            others = [member for member in self._members.values() if member is not new]
+        threads = [threading.Thread(target=self._tell, args=(other,), name='fog-peers',
+                                    daemon=True) for other in others]
+        for thread in threads:
+            thread.start()
+        until = time.monotonic() + TELLING
+        for thread in threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _tell(self, member: VpnMember) -> None:
+        """Tell a machine its peers, again and again until that works."""
+        pause = 1.0
+        while not self._launch.ending and self._members.get(member.name) is member:
+            try:
+                member.update(self)
+                return
+            except FogError as error:
+                if pause == 1.0 and not self._launch.ending:
+                    self._launch.report(StepFailed(
+                        member.name, 'VPN peers', 0.0,
+                        f'not told of a new machine yet, will be again: {error}', fatal=False))
+            self._stop.wait(pause)
+            pause = min(2 * pause, 15.0)
+
+    def remove(self, name: str) -> None:
+        """Forget a machine; the robot's interface is told unless it goes as well."""
+        with self._lock:
+            gone = self._members.pop(name, None)
+            if gone is not None and self._up and not self._launch.ending:
+                self._launch.robot(
+                    self.vpn.peers(self.interface, self._sorted()), cancel=False)
+
+    def _sorted(self) -> list[Peer]:
+        return [self._members[name].place.peer for name in sorted(self._members)]
+
+    def _keep(self) -> None:
+        """Get the interface's program going again when it died; nodes don't notice."""
+        asked = time.monotonic()
+        while not self._stop.wait(1.0):
+            if time.monotonic() - asked > TICKET_REFRESH:
+                asked = time.monotonic()
+                self._refresh_ticket()
+            with self._lock:
+                if self._stop.is_set():
+                    return
+                try:
+                    alive = process.run(self.vpn.alive(self.interface), check=False,
+                                        timeout=self._launch.timeouts.vpn)
+                    if alive.returncode == 0:
+                        continue
+                    with step(self._launch.report, '', 'VPN repair', fatal=False):
+                        self._launch.robot(
+                            self.vpn.repair(self.interface, self._sorted()), cancel=False)
+                except FogError:
+                    pass  # a repair's is reported by its step; the next round tries again
+
+    def _refresh_ticket(self) -> None:
+        """Keep sudo from wanting a password before all is taken down; say so once if it does."""
+        if process.refresh_ticket():
+            self._told_of_sudo = False
+        elif not self._told_of_sudo:
+            self._told_of_sudo = True
+            self._launch.report(StepFailed(
+                '', 'sudo ticket', 0.0,
+                'sudo wants a password again, so taking this launch down will leave its '
+                'containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; else '
+                '`sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
+
+    def _take_down(self) -> None:
+        self._stop.set()
+        with self._lock:
+            self._up = False
+            self._launch.robot(self.vpn.down(self.interface), cancel=False)
+            self.down = True
+
+
+class VpnMember:
+    """
+    A machine in the VPN: told its peers anew when another joins.
+
+    :param on: runs commands on the machine.
+    :param keep: has its agent repair the interface with these peers.
+    """
+
+    def __init__(
+        self, place: plan.Place, interface: VpnInterface,
+        on: Callable[[Iterable[Command]], str], keep: Callable[[Sequence[Peer]], None],
+    ) -> None:
+        self.place = place
+        self.name = place.peer.name
+        self.interface = interface
+        self._on = on
+        self._keep = keep
+        self._lock = threading.Lock()
+        #: None until the interface is up.
+        self._told: Optional[list[Peer]] = None
+        self._kept: Optional[list[Peer]] = None
+
+    def up(self, robot: RobotVpn) -> None:
+        """Bring the machine's interface up with the peers of this moment."""
+        with self._lock:
+            self._told = robot.peers_of(self)
+            self._on(robot.vpn.up(self.interface, self._told))
+
+    def update(self, robot: RobotVpn) -> None:
+        """Tell the machine and its agent the peers, unless they know them."""
+        with self._lock:
+            if self._told is None:
+                return  # it takes the peers of the moment at which it comes up
+            peers = robot.peers_of(self)
+            if peers != self._told:
+                self._on(robot.vpn.peers(self.interface, peers))
+                self._told = peers
+            if peers != self._kept:
+                self._keep(peers)
+                self._kept = peers

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine of the launch that is up, and the nodes on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import contextlib
+import dataclasses
+import threading
+from typing import Any, Optional, TYPE_CHECKING
+
+from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.deploy.job import Job
+from fogros2.deploy.watching import Watch
+from fogros2.model import Machine, NodeSpec, VpnInterface
+from fogros2.shell import Shell
+
+if TYPE_CHECKING:
+    from fogros2.deploy.launch import Launch
+
+
+class RunningMachine:
+    """
+    A machine of the launch that is up, and the nodes on it.
+
+    :param first_event: number of the agent's first event that is this launch's.
+    """
+
+    def __init__(
+        self, launch: Launch, job: Job, machine: Machine, shell: Shell, agent: AgentClient,
+        heartbeat: Heartbeat, interface: VpnInterface, first_event: int,
+    ) -> None:
+        self.spec = job.spec
+        self.machine = machine
+        self.shell = shell
+        self.agent = agent
+        self.heartbeat = heartbeat
+        self.vpn_address = interface.address
+        self.interface = interface
+        #: The machine's way down.
+        self.undo = contextlib.ExitStack()
+        self._launch = launch
+        self._job = job
+        self._first_event = first_event
+        self._warm = False
+        self._lock = threading.Lock()
+        self._callbacks: list[Callable[[dict[str, Any]], None]] = []
+        self._lost = ''
+        self._watch: Optional[Watch] = None
+        if job.provider.owned:
+            self._watch = Watch(job, agent, heartbeat, self._gone)
+            job.undo.callback(self._watch.close)
+
+    def warm(self) -> None:
+        """Start the process that will run the nodes, unless it runs."""
+        if not self._warm:
+            self._warm = True
+            self.agent.request('launch')
+
+    def start(self, nodes: Sequence[NodeSpec]) -> None:
+        """Start nodes; what becomes of them arrives as events."""
+        self.agent.request('start', nodes=[_json(node) for node in nodes])
+
+    def stop(self, ids: Optional[Sequence[str]] = None) -> None:
+        """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
+        self.agent.request('stop', nodes=None if ids is None else list(ids))
+
+    def signal(self, node: str, name: str) -> None:
+        """Send a node a signal, by its name (``SIGUSR1``)."""
+        self.agent.request('signal', node=node, signal=name)
+
+    def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
+        """
+        Hand every event of the machine since this launch has it to ``callback``.
+
+        It is called from a thread of the connection's, or from one that watches the machine, and
+        must not make requests of the agent. Besides what the agent says (see ``agent.py``):
+
+        ``{'event': 'notice', 'reason': ...}``  the provider is about to take the machine away, by
+            its own words; once. The agent answers requests still, for as long as they say.
+        ``{'event': 'lost', 'reason': ...}``  the machine is gone: ended, stopped, evicted; once,
+            and nothing comes after it. Requests fail from now on.
+        ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``  the connection's changes.
+        ``{'event': 'gap', 'count': n}``  so many events came too late for the agent's log.
+        """
+        def tell(event: dict[str, Any]) -> None:
+            # an agent that leaves at the end as it was told is no news
+            if not self._lost and (
+                    event['event'] != 'connection' or not self._launch.ending):
+                callback(event)
+
+        with self._lock:
+            self._callbacks.append(callback)
+            lost = self._lost
+        if lost:
+            callback({'event': 'lost', 'reason': lost})
+        else:
+            self.agent.subscribe(tell, since=self._first_event)
+
+    def _gone(self, reason: str) -> None:
+        """Tell, once, that the provider has the machine no longer; nobody else asks it."""
+        with self._lock:
+            self._lost = reason
+            callbacks = list(self._callbacks)
+        for callback in callbacks:
+            callback({'event': 'lost', 'reason': reason})
+        self.agent.close()
+
+    def close(self) -> None:
+        """End the machine as its ``on_exit`` says."""
+        self.undo.close()
+
+
+def _json(node: NodeSpec) -> dict[str, Any]:
+    return {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}

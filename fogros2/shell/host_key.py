@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine's host key: one that was handed over gives way to one that never left the machine."""
+
+from __future__ import annotations
+
+import re
+
+from fogros2.errors import HostKeyError
+from fogros2.model import Command
+
+_KEY = re.compile('ssh-ed25519 [A-Za-z0-9+/]+={0,2}')
+
+# The listening server is the outermost sshd above us; its title has its own command line, and so
+# the configuration that names its keys. One that systemd holds the socket for is started anew, as
+# its sessions go on; else SIGHUP makes it read its keys again.
+_RENEW = r"""
+listener= server=sshd config= pid=$$
+PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+while [ "${pid:-0}" -gt 1 ]; do
+    title=$(tr '\0' ' ' </proc/$pid/cmdline)
+    case $title in
+        'sshd: /'*|/*/sshd|/*/sshd\ *) listener=$pid line=${title#sshd: } ;;
+    esac
+    pid=$(sed -n 's/^PPid:[[:space:]]*//p' /proc/$pid/status)
+done
+if [ -n "$listener" ]; then
+    server=${line%% *}
+    case $line in *' -f '*) config=${line#* -f }; config=${config%% *} ;; esac
+fi
+key=
+for each in $("$server" -T ${config:+-f "$config"} 2>/dev/null | sed -n 's/^hostkey //p') \
+        /etc/ssh/ssh_host_ed25519_key; do
+    [ -s "$each" ] || continue
+    case $(ssh-keygen -y -P '' -f "$each" 2>/dev/null) in ssh-ed25519*) key=$each; break ;; esac
+done
+[ -n "$key" ] || { echo 'its SSH server has no Ed25519 host key' >&2; exit 1; }
+umask 077
+rm -f "$key.new" "$key.new.pub"
+ssh-keygen -q -t ed25519 -N '' -C "$(uname -n)" -f "$key.new"
+chmod 644 "$key.new.pub"
+mv -f "$key.new.pub" "$key.pub"
+mv -f "$key.new" "$key"
+cat "$key.pub"
+if systemctl is-active -q ssh.socket 2>/dev/null; then
+    systemctl restart ssh.service
+elif [ -n "$listener" ]; then
+    kill -HUP "$listener"
+fi
+"""
+
+
+def renew() -> Command:
+    """
+    Return the command that gives a machine's SSH server a new Ed25519 host key.
+
+    It prints the public half; the connection that it runs over goes on.
+    """
+    return Command.script(_RENEW, sudo=True, what='make a host key')
+
+
+def parse(output: str) -> str:
+    """
+    Return the public key (``ssh-ed25519 AAAA...``) that :func:`renew` printed.
+
+    :raises HostKeyError: there is none.
+    """
+    for line in output.splitlines():
+        key = ' '.join(line.split()[:2])
+        if _KEY.fullmatch(key):
+            return key
+    raise HostKeyError(f'the machine made no host key, but said {output[:80]!r}')
