@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A real Kubernetes cluster of one node on this computer, for tests of pods as machines.
+
+``tools/kubernetes.sh`` builds its programs from Debian's source package; ``images`` makes what its
+pods run; ``cluster`` runs it. All its processes, mounts, bridges and firewall rules are in
+namespaces of their own and end with them, see ``node``; ``services`` says what it consists of.
+"""
+
+from fogros2.testing.cluster.cluster import Cluster, cluster
+from fogros2.testing.cluster.images import BARE, READY
+from fogros2.testing.cluster.node_process import ClusterError
+
+__all__ = ['BARE', 'Cluster', 'ClusterError', 'READY', 'cluster']

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Machine images for a test's cluster, made on this computer: nothing is downloaded but packages.
+
+``BARE`` is Debian with the few programs that every machine needs, by debootstrap; ``READY`` has
+the embedded default besides, put there by the same bootstrap that a launch uses; ``SANDBOX`` holds
+a pod's namespaces. They are kept, unpacked as containerd does it, in the user's cache folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import contextlib
+import dataclasses
+import hashlib
+import io
+import json
+import os
+from pathlib import Path
+import platform
+import tarfile
+import tempfile
+import threading
+from typing import Any, Optional
+
+from fogros2 import bootstrap, plan, process, wheels
+from fogros2.errors import PrerequisiteError
+from fogros2.model import Command, MachineSpec, Result, SyncReport
+from fogros2.testing.cluster import services
+from fogros2.testing.cluster.node_process import run_node
+
+BARE = 'fogros2.test/machine:bare'
+READY = 'fogros2.test/machine:ready'
+SANDBOX = 'fogros2.test/sandbox:1'
+#: What a machine needs before a launch can begin with it, and what tests look at it with.
+PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
+            'rsync', 'wireguard-go', 'wireguard-tools')
+_ARCHITECTURES = {'x86_64': 'amd64', 'aarch64': 'arm64'}
+#: Takes documentation and apt's lists out: they are half of a small system.
+_SHRINK = ('rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/apt/* "$1"/usr/share/doc/* '
+           '"$1"/usr/share/locale/* "$1"/usr/share/man/* "$1"/var/log/* "$1"/dev/*')
+
+
+@dataclasses.dataclass(frozen=True)
+class Image:
+    """
+    An image to be packed.
+
+    :param layers: tar archives, the lowest first.
+    :param config: its defaults, in OCI's words (``Env``, ``Cmd``).
+    """
+
+    name: str
+    layers: tuple[Path, ...]
+    config: dict[str, Any]
+
+
+def debian() -> tuple[str, str]:
+    """
+    Return this computer's Debian release and the address its packages come from.
+
+    :raises PrerequisiteError: it isn't Debian.
+    """
+    release = platform.freedesktop_os_release()
+    codename = release.get('VERSION_CODENAME', '')
+    targets = process.run(Command(
+        ('apt-get', 'indextargets', '--format', '$(CODENAME) $(COMPONENT) $(REPO_URI)',
+         'Created-By: Packages')), timeout=30.0, check=False).stdout
+    for line in targets.splitlines():
+        suite, component, address = line.split(' ', 2)
+        if release.get('ID') == 'debian' and (suite, component) == (codename, 'main'):
+            return codename, address
+    raise PrerequisiteError('the machine image is made from Debian, which this computer is not')
+
+
+def base(cache: Path, say: Callable[[str], None]) -> Path:
+    """
+    Return the bare system's root folder, made by debootstrap unless it is there.
+
+    :param say: gets a line before something slow begins.
+    """
+    codename, address = debian()
+    recipe = f'{codename} {platform.machine()} {PACKAGES} {_SHRINK}'
+    target = cache / f'root-{_checksum(recipe)}'
+    if not target.is_dir():
+        say('making the machine image by debootstrap (a minute)')
+        cache.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(dir=cache, prefix='new-root-'))
+        with contextlib.ExitStack() as undo:
+            undo.callback(_remove, aside)
+            # in a mount namespace of its own: an interrupted one leaves no mount
+            process.run(Command((
+                'unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec',
+                'debootstrap --variant=minbase --include="$2" "$3" "$1" "$4" >&2; '
+                f'umount "$1/proc" "$1/sys" 2>/dev/null || :; {_SHRINK}; '
+                'mknod -m 666 "$1/dev/null" c 1 3',
+                'sh', str(aside), ','.join(PACKAGES), codename, address),
+                sudo=True, what='make a Debian system'), timeout=900.0)
+            process.run(Command(('mv', '-T', str(aside), str(target)), sudo=True), timeout=10.0)
+    return target
+
+
+class RootShell:
+    """
+    A Shell into a folder with a system: what is written goes to another folder.
+
+    :param root: the system.
+    :param upper: gets what changes.
+    """
+
+    def __init__(self, root: Path, upper: Path) -> None:
+        self._root, self._upper = root, upper
+
+    def run(
+        self, command: Command, *, timeout: float, check: bool = True,
+        cancel: Optional[threading.Event] = None,
+    ) -> Result:
+        """Run a command with the system as its root."""
+        words = [f'{name}={value}' for name, value in command.environment.items()]
+        return self._inside(('chroot', '.', 'env', '-i', 'HOME=/root',
+                             'PATH=/usr/sbin:/usr/bin:/sbin:/bin', *words, *command.argv),
+                            command, timeout, check, cancel)
+
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> SyncReport:
+        """Copy a folder's contents; what was sent isn't counted."""
+        words = [f'--exclude={pattern}' for pattern in excludes]
+        done = self._inside(('rsync', '-a', '--chown=0:0', *words, f'{source}/', f'.{target}/'),
+                            Command(('rsync',), what='copy files'), timeout, True, cancel)
+        return SyncReport(0, 0, done.seconds)
+
+    def _inside(
+        self, words: Sequence[str], command: Command, timeout: float, check: bool,
+        cancel: Optional[threading.Event],
+    ) -> Result:
+        script = (
+            'mkdir -p "$2/files" "$2/work" "$2/seen"; '
+            'mount -t overlay -o "lowerdir=$1,upperdir=$2/files,workdir=$2/work" fog "$2/seen"; '
+            'mount -t proc proc "$2/seen/proc"; cd "$2/seen"; shift 2; exec "$@"')
+        return process.run(Command(
+            ('unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec', script, 'sh',
+             str(self._root), str(self._upper), *words),
+            sudo=True, input=command.input, what=command.what), timeout=timeout, check=check,
+            cancel=cancel)
+
+
+def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
+    """
+    Return containerd's folder with all images in it, made unless it is there.
+
+    It is named after what is in the images, so the embedded default is always today's.
+
+    :param binaries: the cluster's programs.
+    """
+    root = base(cache, say)
+    packed = wheels.collect()
+    target = cache / f'images-{_checksum(f"3 {root.name} {packed.key}")}'
+    if target.is_dir():
+        os.utime(target)
+        return target
+    say('packing the machine images')
+    with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside, \
+            contextlib.ExitStack() as undo:
+        upper = Path(aside, 'upper')
+        undo.callback(_remove, upper)
+        upper.mkdir()
+        if packed.embedded:
+            _add_embedded(RootShell(root, upper))
+        layers = [Path(aside, name) for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
+        _tar(layers[0], root, ['.'])
+        _tar(layers[1], upper / 'files', ['root'] if packed.embedded else [])
+        sandbox_layer(layers[2])
+        config = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'],
+                  'Cmd': ['/bin/sh']}
+        archive = Path(aside, 'images.tar')
+        write_archive(archive, [
+            Image(BARE, (layers[0],), config),
+            Image(READY, tuple(layers[:2]), config),
+            Image(SANDBOX, (layers[2],),
+                  {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']}),
+        ])
+        run_node(cache / 'runs', {
+            'commands': {'containerd': services.commands(services.NOWHERE)['containerd']},
+            'binaries': str(binaries), 'import': [str(archive)], 'keep': str(target),
+        }, {'containerd.toml': services.containerd(SANDBOX)}).wait()
+    _forget_old(cache, 'images-', keep=target)
+    return target
+
+
+def _add_embedded(shell: RootShell) -> None:
+    """Install the embedded default as a launch would."""
+    ros2 = process.which('ros2')
+    if ros2 is None:
+        raise PrerequisiteError('ros2 is not on PATH', 'run this by tools/run.sh')
+    under = plan.underlay(dict(os.environ), None, ros2)
+    bootstrap.ensure(
+        shell, under,  # type: ignore[arg-type]  # nothing there asks for put, open, interactive
+        MachineSpec(name='image', provider='', bootstrap='embedded'), timeout=300.0)
+
+
+def sandbox_layer(target: Path) -> None:
+    """Write the layer of the image that does nothing: one program that needs no library."""
+    busybox = process.which('busybox')
+    if busybox is None:
+        raise PrerequisiteError('busybox not found', 'sudo apt-get install busybox-static')
+    with tarfile.open(target, 'w') as layer:
+        layer.add(busybox, 'busybox', filter=_root_owned)
+
+
+def _root_owned(info: tarfile.TarInfo) -> tarfile.TarInfo:
+    info.uid = info.gid = 0
+    info.uname = info.gname = ''
+    info.mode = 0o755
+    return info
+
+
+def write_archive(target: Path, images: Iterable[Image]) -> None:
+    """
+    Write images as one OCI archive (image-spec 1.0, image layout, in a tar file).
+
+    Layers stay as they are, uncompressed: they only go from one folder to another.
+    """
+    manifests: list[dict[str, Any]] = []
+    written: set[str] = set()
+    with tarfile.open(target, 'w') as archive:
+        def put(name: str, data: bytes) -> None:
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+
+        def blob(data: bytes, kind: str) -> dict[str, Any]:
+            digest = hashlib.sha256(data).hexdigest()
+            if digest not in written:
+                put(f'blobs/sha256/{digest}', data)
+                written.add(digest)
+            return _descriptor(kind, digest, len(data))
+
+        def layer(path: Path) -> dict[str, Any]:
+            digest = _digest(path)
+            if digest not in written:
+                archive.add(path, f'blobs/sha256/{digest}')
+                written.add(digest)
+            return _descriptor('layer.v1.tar', digest, path.stat().st_size)
+
+        put('oci-layout', b'{"imageLayoutVersion": "1.0.0"}')
+        for image in images:
+            layers = [layer(path) for path in image.layers]
+            config = blob(json.dumps({
+                'architecture': _ARCHITECTURES.get(platform.machine(), platform.machine()),
+                'os': 'linux', 'config': image.config,
+                'rootfs': {'type': 'layers', 'diff_ids': [part['digest'] for part in layers]},
+            }).encode(), 'config.v1+json')
+            manifest = blob(json.dumps({
+                'schemaVersion': 2, 'config': config, 'layers': layers}).encode(),
+                'manifest.v1+json')
+            manifests.append({**manifest, 'annotations': {
+                'io.containerd.image.name': image.name}})
+        put('index.json', json.dumps({'schemaVersion': 2, 'manifests': manifests}).encode())
+
+
+def _descriptor(kind: str, digest: str, size: int) -> dict[str, Any]:
+    return {'mediaType': f'application/vnd.oci.image.{kind}', 'digest': f'sha256:{digest}',
+            'size': size}
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, 'rb') as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _tar(target: Path, folder: Path, names: Sequence[str]) -> None:
+    """Pack what a folder has; much of it is root's alone."""
+    process.run(Command(
+        ('sh', '-ec', 'tar --numeric-owner --one-file-system -C "$1" -cf "$2" -T /dev/null; '
+         'folder=$1 target=$2 owner=$3; shift 3; [ $# = 0 ] || '
+         'tar --numeric-owner --one-file-system -C "$folder" -cf "$target" "$@"; '
+         'chown "$owner" "$target"',
+         'sh', str(folder), str(target), str(os.getuid()), *names),
+        sudo=True, what='pack an image'), timeout=300.0)
+
+
+def _remove(folder: Path) -> None:
+    process.run(Command(('rm', '-rf', '--one-file-system', '--', str(folder)), sudo=True),
+                timeout=120.0)
+
+
+def _forget_old(cache: Path, prefix: str, *, keep: Path, number: int = 2) -> None:
+    """Remove all but the last used."""
+    others = [path for path in cache.glob(f'{prefix}*') if path != keep]
+    for path in sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
+        _remove(path)
+
+
+def _checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
