@@ -64,7 +64,12 @@ setup(
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',
         ],
+        'fogros2.configured': [
+            'aws = fogros2.provider.aws.clients:configured',
+            'kubernetes = fogros2.kubernetes_api:configured',
+        ],
         'fogros2.shell': [
+            'kubernetes = fogros2.shell.kubernetes:KubernetesShell',
             'ssh = fogros2.shell.ssh:SSHShell',
             'local = fogros2.shell.local:LocalShell',
         ],

@@ -12,18 +12,40 @@ import socket
 import struct
 import sys
 import threading
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from fogros2.errors import FogError
-
-if TYPE_CHECKING:
-    import paramiko
 
 _HELPER = Path(__file__).with_name('rsh.py')
 
 
+class Channel(Protocol):
+    """A program on a machine, as paramiko's channels have it."""
+
+    def sendall(self, data: bytes, /) -> None:
+        """Send to its standard input."""
+
+    def shutdown_write(self) -> None:
+        """End its standard input."""
+
+    def recv(self, size: int, /) -> bytes:
+        """Return some of its standard output, b'' at the end."""
+
+    def recv_stderr(self, size: int, /) -> bytes:
+        """Return some of its standard error, b'' at the end."""
+
+    def recv_exit_status(self) -> int:
+        """Wait for it to exit; -1 where that is never to be known."""
+
+    def settimeout(self, timeout: float | None, /) -> None:
+        """Take how long a read may last, None for ever."""
+
+    def close(self) -> None:
+        """Let it go."""
+
+
 @contextlib.contextmanager
-def remote_shell(start: Callable[[str], paramiko.Channel]) -> Iterator[tuple[str, list[FogError]]]:
+def remote_shell(start: Callable[[str], Channel]) -> Iterator[tuple[str, list[FogError]]]:
     """
     Yield the value of rsync's ``-e``, and a list that takes what fails on our side.
 
@@ -47,7 +69,7 @@ def remote_shell(start: Callable[[str], paramiko.Channel]) -> Iterator[tuple[str
 
 
 def _serve(
-    listener: socket.socket, start: Callable[[str], paramiko.Channel], failures: list[FogError],
+    listener: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
 ) -> None:
     try:
         link, _ = listener.accept()
@@ -70,7 +92,7 @@ def _serve(
                 os.close(stream)
 
 
-def _relay(channel: paramiko.Channel, stdin: int, stdout: int, stderr: int) -> int:
+def _relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
     """Move bytes until the machine's side ends; return its exit status (255: lost)."""
 
     def up() -> None:

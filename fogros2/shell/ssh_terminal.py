@@ -12,12 +12,19 @@ import termios
 import threading
 import tty
 from types import FrameType
-from typing import Optional, TYPE_CHECKING
+from typing import Optional, Protocol, TYPE_CHECKING
 
 from fogros2.errors import ConnectError
 
 if TYPE_CHECKING:
     import paramiko
+
+
+class Resizable(Protocol):
+    """A terminal somewhere else."""
+
+    def resize_pty(self, width: int, height: int, /) -> None:
+        """Take a new size."""
 
 
 def attach(channel: paramiko.Channel, line: Optional[str], name: str) -> int:
@@ -47,8 +54,8 @@ def attach(channel: paramiko.Channel, line: Optional[str], name: str) -> int:
     with contextlib.ExitStack() as undo:
         undo.callback(channel.close)
         if terminal:
-            undo.enter_context(_raw())
-            undo.enter_context(_following_size(channel))
+            undo.enter_context(raw())
+            undo.enter_context(following_size(channel))
         _relay(channel)
         channel.settimeout(None)
         status = channel.recv_exit_status()
@@ -56,7 +63,8 @@ def attach(channel: paramiko.Channel, line: Optional[str], name: str) -> int:
 
 
 @contextlib.contextmanager
-def _raw() -> Iterator[None]:
+def raw() -> Iterator[None]:
+    """Hand keys over as they are pressed, as long as the block runs."""
     before = termios.tcgetattr(0)
     tty.setraw(0, termios.TCSADRAIN)  # what was typed ahead is kept
     try:
@@ -66,7 +74,8 @@ def _raw() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _following_size(channel: paramiko.Channel) -> Iterator[None]:
+def following_size(channel: Resizable) -> Iterator[None]:
+    """Tell a terminal over there each new size of this one, as long as the block runs."""
     def resized(number: int, frame: Optional[FrameType]) -> None:
         columns, rows = os.get_terminal_size(0)
         channel.resize_pty(columns, rows)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: Bytes from which a connection of OpenSSH's own pays.
 BULK = 64 << 20
 #: Exit status of rsync for source files that vanished meanwhile: editors and compilers do that.
-_VANISHED = 24
+VANISHED = 24
 #: Errors in the socket or in the protocol's stream, and the remote shell's own.
 _LOST = (10, 12, 255)
 
@@ -90,7 +90,7 @@ def to_machine(
             on_output=None if on_progress is None else Progress(on_progress))
     if failures:
         raise failures[0]
-    if result.returncode not in (0, _VANISHED):
+    if result.returncode not in (0, VANISHED):
         raise explained(result, source, where)
     return report(result.stdout, time.monotonic() - begin)
 
@@ -111,7 +111,7 @@ def to_folder(
               progress=on_progress is not None),
         timeout=timeout, cancel=cancel, check=False,
         on_output=None if on_progress is None else Progress(on_progress))
-    if result.returncode not in (0, _VANISHED):
+    if result.returncode not in (0, VANISHED):
         raise explained(result, source, process.HERE)
     return report(result.stdout, time.monotonic() - begin)
 

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A pod's command line through the API server: no SSH server in the image, no port to reach.
+
+One ``exec`` carries all commands (see ``kubernetes_mux``), so each takes one way there and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import contextlib
+from pathlib import Path
+import threading
+import time
+from typing import Optional
+
+from fogros2 import process
+from fogros2.errors import (
+    Cancelled,
+    CommandError,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+)
+from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
+from fogros2.shell.kubernetes_link import Channel, Link
+from fogros2.waiting import wait_until
+
+#: Seconds after a command's end in which something it left behind may hold its output open.
+_DRAIN = 2.0
+#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
+MAX_LINE = 32 << 20
+#: Input up to this size fits into a channel's window: no thread needed to feed it.
+_INLINE = 1 << 20
+
+
+class KubernetesShell:
+    """
+    A Shell for endpoints of kind 'kubernetes', whose host is ``namespace/pod@context``.
+
+    :param name: the machine's name, for messages.
+    :param timeout: seconds one attempt to connect may take.
+    """
+
+    @staticmethod
+    def warm() -> None:
+        """Begin to import the client; see :func:`fogros2.shell.warm`."""
+        threading.Thread(target=_load, name='fog-load', daemon=True).start()
+
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
+        self.endpoint = endpoint
+        self.name = name
+        self.user = endpoint.user or 'root'
+        self._timeout = timeout
+        self._lock = threading.Lock()
+        self._link: Optional[Link] = None
+
+    # -- connection -----------------------------------------------------------------------------
+
+    def _connected(self, timeout: float) -> Link:
+        """Return the connection, which is opened as needed; waits for an API server's restart."""
+        patience = min(self._timeout, timeout)
+        with self._lock:
+            if self._link is not None and self._link.alive:
+                return self._link
+            last: list[ConnectError] = []
+
+            def attempt() -> Optional[Link]:
+                try:
+                    return Link(self.endpoint, name=self.name, timeout=patience)
+                except ConnectError as error:
+                    last[:] = [error]
+                    return None
+
+            try:
+                self._link = wait_until(attempt, timeout=patience, interval=0.1,
+                                        what=f"a connection to '{self.name}'")
+            except DeadlineExceeded as error:
+                raise last[0] if last else error from error
+            return self._link
+
+    def _open(self, command: Command, timeout: float) -> Channel:
+        for attempt in (1, 2):
+            try:
+                return self._connected(timeout).open(command)
+            except ConnectError:
+                # lost, as we find out only now, and nothing has been begun
+                if attempt == 2:
+                    raise
+        raise AssertionError('the second attempt returns or raises')
+
+    def close(self) -> None:
+        """Drop the connection; the next call would open it again."""
+        with self._lock:
+            link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    # -- commands -------------------------------------------------------------------------------
+
+    def run(
+        self, command: Command, *, timeout: float, check: bool = True,
+        cancel: Optional[threading.Event] = None,
+        on_output: Optional[Callable[[str], None]] = None,
+    ) -> Result:
+        """Run a command there and wait for it; see the protocol."""
+        begin = time.monotonic()
+        what = command.what or command.argv[0]
+        if cancel is not None and cancel.is_set():
+            raise Cancelled(what)
+        output = _Output(on_output)
+        with contextlib.closing(self._open(command, timeout)) as channel:
+            feeder = _feed(channel, command.input)
+            self._collect(channel, output, begin + timeout, cancel, what)
+            returncode = channel.exit_status
+            if feeder is not None:
+                feeder.join(_DRAIN)
+        if returncode is None:
+            raise ConnectError(f"the connection to '{self.name}' was lost while {what} ran there",
+                               "check the robot's network")
+        result = Result(returncode, *output.text(), time.monotonic() - begin)
+        if check and returncode != 0:
+            raise CommandError(
+                command, result, f"'{self.name}'",
+                command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
+        return result
+
+    def _collect(
+        self, channel: Channel, output: _Output, deadline: float,
+        cancel: Optional[threading.Event], what: str,
+    ) -> None:
+        """Read until both streams have ended and the command too, or the time is up."""
+        quiet_since = 0.0
+        while True:
+            now = time.monotonic()
+            if cancel is not None and cancel.is_set():
+                raise Cancelled(what)
+            if now >= deadline:
+                raise DeadlineExceeded(f"{what} took too long on '{self.name}'")
+            try:
+                out, err, ended = channel.read(min(0.05, deadline - now))
+            except ConnectError as error:
+                raise ConnectError(
+                    f"the connection to '{self.name}' was lost while {what} ran there: "
+                    f'{error.args[0]}', error.hint or "check the robot's network") from error
+            output.add(out, err)
+            if ended:
+                if channel.wait_exit(min(0.05, deadline - now)):
+                    return
+            elif out or err:
+                quiet_since = 0.0
+            elif channel.exit_status is not None:
+                # it has ended; what it left in the background holds its output open
+                quiet_since = quiet_since or now
+                if now - quiet_since >= _DRAIN:
+                    return
+
+    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
+        """Write a file there (folders made as needed): aside first, then moved into place."""
+        script = command_line.write_script(target, mode)
+        self.run(
+            Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
+            timeout=timeout)
+
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
+        on_progress: Optional[Callable[[int, int], None]] = None,
+    ) -> SyncReport:
+        """Make the folder ``target`` there equal ``source`` here; see the protocol."""
+        begin = time.monotonic()
+        process.require(['rsync'])
+        sync.check_source(source)
+        path = command_line.remote_path(target)
+        there = self.run(
+            Command.script(f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync',
+                           what=f'making {target}'), timeout=timeout, cancel=cancel).stdout
+        if 'no-rsync' in there:
+            raise sync.missing_there(f"'{self.name}'")
+        with relay.remote_shell(self.start) as (rsh, failures):
+            result = process.run(
+                sync.rsync(source, f'machine:{sync.remote_folder(target)}', excludes=excludes,
+                           includes=includes, rsh=rsh, progress=on_progress is not None),
+                timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
+                check=False,
+                on_output=None if on_progress is None else sync.Progress(on_progress))
+        if failures:
+            raise failures[0]
+        if result.returncode not in (0, sync.VANISHED):
+            raise sync.explained(result, source, f"'{self.name}'")
+        return sync.report(result.stdout, time.monotonic() - begin)
+
+    def start(self, line: str) -> Channel:
+        """
+        Start a command line there and return its channel.
+
+        :raises ConnectError: the machine can't be reached.
+        """
+        return self._open(Command(('sh', '-c', line)), self._timeout)
+
+    def open(self, command: Command) -> Stream:
+        """Start a program there and return its streams; it ends with the stream."""
+        stream = KubernetesStream(self._open(command, self._timeout), self.name)
+        if command.input:
+            stream.write(command.input)
+        return stream
+
+    def interactive(self, command: Optional[Command] = None) -> int:
+        """Give the user's terminal to the login shell there, or to ``command``."""
+        return kubernetes_terminal.attach(self._connected(self._timeout), command)
+
+
+class KubernetesStream:
+    """Both ends of a program that runs in a pod, line by line."""
+
+    def __init__(self, channel: Channel, name: str) -> None:
+        self._channel = channel
+        self._name = name
+        self._buffer = b''
+
+    def write(self, data: bytes) -> None:
+        """Send to its standard input."""
+        try:
+            self._channel.sendall(data)
+        except OSError as error:
+            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
+
+    def readline(self) -> bytes:
+        """Return its next line of output with the newline, b'' at the end."""
+        parts = [self._buffer]
+        size = len(self._buffer)
+        while b'\n' not in parts[-1]:
+            if size > MAX_LINE:
+                self.close()
+                self._buffer = b''
+                return b''
+            data = b''
+            with contextlib.suppress(FogError):
+                data = self._channel.recv(1 << 16)
+                self._channel.discard_errors()
+            if not data:
+                self._buffer = b''
+                return b''.join(parts)
+            parts.append(data)
+            size += len(data)
+        line, _, self._buffer = b''.join(parts).partition(b'\n')
+        return line + b'\n'
+
+    def close(self) -> None:
+        """End it; a ``readline`` in another thread returns b''."""
+        self._channel.close()
+
+
+class _Output:
+    """What a command wrote, and its lines as they become whole."""
+
+    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
+        self._on_output = on_output
+        self._out: list[bytes] = []
+        self._err: list[bytes] = []
+        self._rest = b''
+
+    def add(self, out: bytes, err: bytes) -> None:
+        """Take what has arrived."""
+        self._out.append(out)
+        self._err.append(err)
+        if self._on_output is not None and out:
+            *lines, self._rest = (self._rest + out).split(b'\n')
+            for line in lines:
+                self._on_output(line.decode(errors='replace'))
+
+    def text(self) -> tuple[str, str]:
+        """Return standard output and standard error; the last line goes out, if not whole."""
+        if self._on_output is not None and self._rest:
+            self._on_output(self._rest.decode(errors='replace'))
+            self._rest = b''
+        return (b''.join(self._out).decode(errors='replace'),
+                b''.join(self._err).decode(errors='replace'))
+
+
+def _load() -> None:
+    with contextlib.suppress(FogError, ImportError):
+        from fogros2 import kubernetes_api
+        kubernetes_api.connect()
+        import websocket  # noqa: F401
+
+
+def _feed(channel: Channel, data: bytes) -> Optional[threading.Thread]:
+    def send() -> None:
+        with contextlib.suppress(OSError, FogError):
+            # it may end without reading; its exit status says why
+            channel.sendall(data)
+            channel.shutdown_write()
+
+    if len(data) <= _INLINE:
+        send()
+        return None
+    thread = threading.Thread(target=send, name='fog-feed', daemon=True)
+    thread.start()
+    return thread

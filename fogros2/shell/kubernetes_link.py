@@ -1,0 +1,515 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot's end of a pod's multiplexer: one ``exec``, many channels, resumed after a loss.
+
+What was sent and not confirmed is kept, so a connection that breaks (an API server that restarts,
+a cut of some seconds) costs nothing but time: the next one goes on where the last one was.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+import contextlib
+import functools
+import json
+from pathlib import Path
+import secrets
+import select
+import ssl
+import struct
+import threading
+import time
+from typing import Optional, TYPE_CHECKING
+
+from fogros2 import kubernetes_api
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
+from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.model import Command, Endpoint
+from fogros2.shell import kubernetes_mux as mux
+
+if TYPE_CHECKING:
+    import websocket
+
+#: Seconds for which a lost connection is tried again, less than commands outlive it there.
+RESUME = 45.0
+#: Seconds of silence after which the pod is asked for a word.
+ASK = 15.0
+_STDIN, _STDOUT, _STDERR, _ERROR = range(4)
+#: Reads the program from its standard input, of which it is the beginning.
+_LOADER = ('import os,sys;n={size};s=b""\n'
+           'while len(s)<n:\n'
+           ' d=os.read(0,n-len(s))\n'
+           ' if not d:sys.exit(1)\n'
+           ' s+=d\n'
+           'exec(compile(s,"fogros2","exec"))')
+
+
+class Channel:
+    """One command in the pod; the methods are those of paramiko's that are used here."""
+
+    def __init__(self, link: Link, number: int) -> None:
+        self._link = link
+        self._number = number
+        self._changed = threading.Condition()
+        self._waiting = {mux.OUT: bytearray(), mux.ERR: bytearray()}
+        self._open = {mux.OUT, mux.ERR}
+        self._status: Optional[int] = None
+        self._credit = mux.CREDIT
+        self._owed = 0
+        self._closed = False
+        self._lost: Optional[FogError] = None
+
+    # -- from the link --------------------------------------------------------------------------
+
+    def take(self, kind: int, payload: bytes) -> None:
+        """Take a frame."""
+        with self._changed:
+            if kind == mux.EXIT:
+                self._status, = struct.unpack('>i', payload)
+            elif kind == mux.WINDOW:
+                self._credit += struct.unpack('>I', payload)[0]
+            elif payload:
+                self._waiting[kind] += payload
+            else:
+                self._open.discard(kind)
+            self._changed.notify_all()
+
+    def lose(self, error: FogError) -> None:
+        """Note that nothing more will come."""
+        with self._changed:
+            self._lost = error
+            self._changed.notify_all()
+
+    # -- for whoever has it ---------------------------------------------------------------------
+
+    @property
+    def exit_status(self) -> Optional[int]:
+        """The command's exit status, None while it runs."""
+        return self._status
+
+    def read(self, timeout: Optional[float]) -> tuple[bytes, bytes, bool]:
+        """
+        Wait for output, and return it: standard output, standard error, whether both have ended.
+
+        :raises ConnectError: the pod was lost, and all that came before has been returned.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: any(self._waiting.values()) or not self._open or self._over(), timeout)
+            out, err = (self._pop(kind, 0) for kind in (mux.OUT, mux.ERR))
+            if not out and not err and self._lost is not None:
+                raise self._lost
+            ended = not self._open
+        self._pay(len(out) + len(err))
+        return out, err, ended
+
+    def recv(self, size: int) -> bytes:
+        """Return some of its standard output, b'' at the end."""
+        return self._receive(mux.OUT, size)
+
+    def recv_stderr(self, size: int) -> bytes:
+        """Return some of its standard error, b'' at the end."""
+        return self._receive(mux.ERR, size)
+
+    def _receive(self, kind: int, size: int) -> bytes:
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._waiting[kind] or kind not in self._open or self._over())
+            data = self._pop(kind, size)
+        self._pay(len(data))
+        return data
+
+    def discard_errors(self) -> None:
+        """Drop what it wrote to standard error: unread, it would stop the program."""
+        with self._changed:
+            size = len(self._pop(mux.ERR, 0))
+        self._pay(size)
+
+    def _pop(self, kind: int, size: int) -> bytes:
+        waiting = self._waiting[kind]
+        data = bytes(waiting[:size] if size else waiting)
+        del waiting[:len(data)]
+        return data
+
+    def _pay(self, size: int) -> None:
+        self._owed += size
+        if self._owed >= mux.CREDIT // 4:
+            owed, self._owed = self._owed, 0
+            self._link.send(mux.WINDOW, self._number, struct.pack('>I', owed))
+
+    def _over(self) -> bool:
+        return self._closed or self._lost is not None
+
+    def wait_exit(self, timeout: float) -> bool:
+        """Return whether the command has exited, or is lost, after so many seconds at most."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._status is not None or self._over(), timeout)
+
+    def recv_exit_status(self) -> int:
+        """Wait for it to exit and return its status; -1 if that is never to be known."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._status is not None or self._over())
+            return -1 if self._status is None else self._status
+
+    def sendall(self, data: bytes) -> None:
+        """
+        Send to its standard input, as fast as it reads.
+
+        :raises OSError: it is lost or closed.
+        """
+        rest = memoryview(data)
+        while rest:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._credit > 0 or self._status is not None or self._over())
+                if self._over() or self._status is not None:
+                    raise BrokenPipeError('the command has ended')
+                piece = bytes(rest[:min(mux.CHUNK, self._credit)])
+                self._credit -= len(piece)
+            self._link.send(mux.IN, self._number, piece)
+            rest = rest[len(piece):]
+
+    def shutdown_write(self) -> None:
+        """End its standard input."""
+        self._link.send(mux.IN, self._number)
+
+    def resize_pty(self, columns: int, rows: int) -> None:
+        """Tell it the terminal's size."""
+        self._link.send(mux.RESIZE, self._number, struct.pack('>HH', rows, columns))
+
+    def settimeout(self, timeout: Optional[float]) -> None:
+        """Take the one that there is: none."""
+
+    def close(self) -> None:
+        """Let it go; it ends if it runs still."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._changed.notify_all()
+        self._link.forget(self._number)
+
+
+class Link:
+    """
+    A connection to a pod's multiplexer; thread-safe.
+
+    :param name: the machine's name, for messages.
+    :param timeout: seconds in which it has to stand.
+    :raises ConnectError: it doesn't.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float) -> None:
+        self._name = name
+        self._user = endpoint.user or 'root'
+        self._context, self._namespace, self._pod = parse_host(endpoint.host)
+        self._session = secrets.token_hex(16)
+        self._lock = threading.Lock()
+        self._channels: dict[int, Channel] = {}
+        self._next = 1
+        self._kept: deque[bytes] = deque()
+        self._sent = self._received = self._unconfirmed = 0
+        self._incoming = bytearray()
+        self._socket: Optional[websocket.WebSocket] = None
+        self._closed = False
+        self._error: Optional[FogError] = None
+        self._heard = 0.0
+        self._connect(timeout, resume=False)
+        threading.Thread(target=self._run, name='fog-pod', daemon=True).start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether commands can be begun, at once or when the connection is back."""
+        return not self._closed and self._error is None
+
+    def open(self, command: Command, *, terminal: Optional[tuple[int, int, str]] = None,
+             login: bool = False) -> Channel:
+        """
+        Begin a command in the pod.
+
+        :param terminal: rows, columns and kind of the terminal it gets.
+        :param login: the user's login shell in place of the command.
+        :raises ConnectError: the connection is gone for good.
+        """
+        what = {
+            'argv': [] if login else list(command.argv), 'env': dict(command.environment),
+            'root': command.sudo, 'user': self._user, 'pty': terminal}
+        with self._lock:
+            number, self._next = self._next, self._next + 1
+            channel = Channel(self, number)
+            self._channels[number] = channel
+        self.send(mux.OPEN, number, json.dumps(what).encode())
+        return channel
+
+    def send(self, kind: int, number: int, payload: bytes = b'') -> None:
+        """
+        Send a frame, now or as soon as the connection is back.
+
+        :raises ConnectError: it is gone for good.
+        """
+        data = mux.frame(kind, number, payload)
+        with self._lock:
+            if self._error is not None:
+                raise self._error
+            if self._closed:
+                raise ConnectError(f"the connection to '{self._name}' was closed")
+            self._sent += 1
+            self._kept.append(data)
+            self._write(data)
+
+    def _write(self, data: bytes) -> None:
+        """Write to the connection, if there is one; the lock is held."""
+        if self._socket is None:
+            return
+        try:
+            self._socket.send_binary(bytes([_STDIN]) + data)
+        except _websocket_errors():
+            self._drop()
+
+    def forget(self, number: int) -> None:
+        """Let a command go."""
+        with self._lock:
+            known = self._channels.pop(number, None)
+        if known is not None:
+            with contextlib.suppress(ConnectError):
+                self.send(mux.CLOSE, number)
+
+    def close(self) -> None:
+        """End the connection and what runs over it."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._write(mux.frame(mux.GONE, 0, b''))
+            link = self._socket
+        if link is not None and link.sock is not None:
+            with contextlib.suppress(*_websocket_errors()):
+                link.sock.shutdown(2)  # wakes the reader, which closes it
+        self._lose(ConnectError(f"the connection to '{self._name}' was closed"))
+
+    # -- the connection -------------------------------------------------------------------------
+
+    def _connect(self, timeout: float, *, resume: bool) -> None:
+        """Begin an ``exec``, and wait for the multiplexer's first word."""
+        source = _source()
+        words = ['python3', '-ISc', _LOADER.format(size=len(source)), self._session,
+                 'resume' if resume else 'new']
+        try:
+            api = kubernetes_api.connect(self._context)
+            link = api.websocket(
+                kubernetes_api.path('pods', self._namespace, self._pod, 'exec'),
+                {'container': 'machine', 'command': words, 'stdin': 'true', 'stdout': 'true',
+                 'stderr': 'true', 'tty': 'false'}, timeout=timeout)
+        except ApiError as error:
+            raise self._refused(error) from error
+        except Unreachable as error:
+            raise ConnectError(f"'{self._name}' can't be reached: {error.args[0]}", error.hint) \
+                from error
+        try:
+            # in pieces: some API servers take small frames alone
+            hello = source + mux.frame(mux.HELLO, 0, struct.pack('>Q', self._received))
+            for begin in range(0, len(hello), mux.CHUNK):
+                link.send_binary(bytes([_STDIN]) + hello[begin:begin + mux.CHUNK])
+            self._incoming.clear()
+            count = self._greeting(link, time.monotonic() + timeout)
+        except _websocket_errors() as error:
+            link.close(timeout=0.1)
+            raise ConnectError(f"the connection to '{self._name}' was lost at once: {error}",
+                               'is its pod running?') from error
+        except FogError:
+            link.close(timeout=0.1)
+            raise
+        link.settimeout(None)
+        with self._lock:
+            self._confirmed(count)
+            self._socket = link
+            for data in list(self._kept):
+                self._write(data)
+
+    def _greeting(self, link: websocket.WebSocket, deadline: float) -> int:
+        """Return how many frames the multiplexer has had; what came with it is kept."""
+        errors = b''
+        while True:
+            link.settimeout(max(0.1, deadline - time.monotonic()))
+            data = _bytes(link.recv())
+            kind, data = (data[0], data[1:]) if data else (_ERROR, b'')
+            if kind == _STDERR:
+                errors += data
+            elif kind == _ERROR:
+                raise self._no_program(errors + data)
+            elif kind == _STDOUT:
+                self._incoming += data
+                frame = self._pop_frame()
+                if frame is not None and frame[0] == mux.GONE:
+                    raise ShellError(
+                        f"what ran on '{self._name}' ended when the connection was lost")
+                if frame is not None:
+                    return int(json.loads(frame[2])['received'])
+            if time.monotonic() > deadline:
+                raise DeadlineExceeded(f"'{self._name}' doesn't answer")
+
+    def _no_program(self, said: bytes) -> FogError:
+        text = said.decode(errors='replace')
+        if 'python3' in text and ('not found' in text or 'no such file' in text.lower()):
+            return ShellError(
+                f"the image of '{self._name}' has no python3",
+                'take one that has, such as ros:jazzy-ros-base; `ros2 fog image create` makes one')
+        with contextlib.suppress(ValueError):
+            text = json.loads(text).get('message', text)
+        return ConnectError(f"'{self._name}' can not begin a command: {' '.join(text.split())}")
+
+    def _refused(self, error: ApiError) -> FogError:
+        message = str(error.args[0])
+        if error.status == 404:
+            return ShellError(f"the pod of '{self._name}' is gone: {message}")
+        if error.status == 403:
+            return ShellError(
+                f"this user may not run commands on '{self._name}': {message}",
+                'let it create and get pods/exec: deploy/kubernetes/role.yaml has all that a '
+                'robot needs')
+        if 'not found' in message or 'completed' in message or error.status in (400, 401):
+            return ShellError(f"'{self._name}' takes no commands: {message}", error.hint)
+        return ConnectError(f"'{self._name}' can't be reached: {message}", error.hint)
+
+    # -- reading --------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._closed:
+            try:
+                self._serve()
+            except FogError:
+                pass
+            except _websocket_errors():
+                pass  # whatever it was, the next connection shows whether it can be mended
+            with self._lock:
+                self._drop()
+            if self._closed or not self._resume():
+                return
+
+    def _drop(self) -> None:
+        link, self._socket = self._socket, None
+        if link is not None:
+            with contextlib.suppress(*_websocket_errors()):
+                link.close(timeout=0)
+
+    def _resume(self) -> bool:
+        deadline = time.monotonic() + RESUME
+        while not self._closed:
+            try:
+                self._connect(min(10.0, RESUME), resume=True)
+                return True
+            except (ConnectError, DeadlineExceeded) as error:
+                if time.monotonic() > deadline:
+                    self._lose(error)
+                    return False
+                threading.Event().wait(0.2)
+            except FogError as error:
+                self._lose(ConnectError(
+                    f"the connection to '{self._name}' was lost: {error.args[0]}", error.hint))
+                return False
+        return False
+
+    def _lose(self, error: FogError) -> None:
+        with self._lock:
+            self._error = self._error or error
+            channels = list(self._channels.values())
+            self._channels.clear()
+            self._kept.clear()
+        for channel in channels:
+            channel.lose(error)
+
+    def _serve(self) -> None:
+        """Hand out what comes, until the connection is lost."""
+        link = self._socket
+        if link is None:
+            return
+        assert link.sock is not None
+        poll = select.poll()
+        poll.register(link.sock, select.POLLIN)
+        self._heard = time.monotonic()
+        while self._socket is link and not self._closed:
+            self._frames()
+            pending = isinstance(link.sock, ssl.SSLSocket) and link.sock.pending()
+            if not pending and not poll.poll(ASK * 1000):
+                if time.monotonic() - self._heard > 3 * ASK:
+                    raise ConnectError(f"'{self._name}' has fallen silent")
+                with self._lock:
+                    self._write(mux.frame(mux.PING, 0, b''))
+                continue
+            with self._lock:
+                # not while another thread writes: TLS keeps one state for both
+                data = _bytes(link.recv())
+            if not data:
+                raise ConnectError(f"'{self._name}' has closed the connection")
+            self._heard = time.monotonic()
+            if data[0] == _STDOUT:
+                self._incoming += data[1:]
+            elif data[0] == _ERROR:
+                raise ConnectError(f"the exec on '{self._name}' has ended")
+
+    def _pop_frame(self) -> Optional[tuple[int, int, bytes]]:
+        if len(self._incoming) < mux.HEADER.size:
+            return None
+        kind, number, size = mux.HEADER.unpack_from(self._incoming)
+        end = mux.HEADER.size + size
+        if size > 1 << 20:
+            raise ConnectError(f"'{self._name}' sends what is no frame")
+        if len(self._incoming) < end:
+            return None
+        payload = bytes(self._incoming[mux.HEADER.size:end])
+        del self._incoming[:end]
+        return kind, number, payload
+
+    def _frames(self) -> None:
+        while (found := self._pop_frame()) is not None:
+            kind, number, payload = found
+            if kind in (mux.ACK, mux.PONG):
+                with self._lock:
+                    self._confirmed(struct.unpack('>Q', payload)[0])
+            if kind >= mux.CONTROL:
+                continue
+            self._received += 1
+            self._unconfirmed += len(payload) + mux.HEADER.size
+            if self._unconfirmed >= mux.ACK_EVERY:
+                self._unconfirmed = 0
+                with self._lock:
+                    self._write(mux.frame(mux.ACK, 0, struct.pack('>Q', self._received)))
+            channel = self._channels.get(number)
+            if channel is not None:
+                channel.take(kind, payload)
+
+    def _confirmed(self, count: int) -> None:
+        while self._kept and self._sent - len(self._kept) < count:
+            self._kept.popleft()
+
+
+def parse_host(host: str) -> tuple[str, str, str]:
+    """
+    Return context, namespace and pod of an endpoint's host.
+
+    :raises ConnectError: it isn't one of a pod.
+
+    >>> parse_host('robots/fogros2-talker-x7c2p@arn:aws:eks:eu-north-1:1:cluster/a')
+    ('arn:aws:eks:eu-north-1:1:cluster/a', 'robots', 'fogros2-talker-x7c2p')
+    """
+    where, _, context = host.partition('@')
+    namespace, _, pod = where.partition('/')
+    if not namespace or not pod:
+        raise ConnectError(f"'{host}' names no pod")
+    return context, namespace, pod
+
+
+@functools.lru_cache(maxsize=1)
+def _source() -> bytes:
+    return Path(mux.__file__).read_bytes()
+
+
+def _bytes(data: str | bytes) -> bytes:
+    return data.encode() if isinstance(data, str) else data
+
+
+def _websocket_errors() -> tuple[type[BaseException], ...]:
+    import websocket
+    return (websocket.WebSocketException, OSError, ValueError, struct.error, IndexError)
+
