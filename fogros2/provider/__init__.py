@@ -58,7 +58,8 @@ class Provider(abc.ABC):
 
         Asked by the command line before anything is loaded: one that isn't set up is left out of
         what goes to all providers, unless a record or an option names it. Files and variables
-        alone; no SDK.
+        alone; no SDK. A provider that takes long to import has it as an entry point of the group
+        ``fogros2.configured`` as well, which is asked in its place.
         """
         return True
 
@@ -130,6 +131,14 @@ class Provider(abc.ABC):
 
         Idempotent: an id that is unknown, or gone already, is no error.
         """
+
+    def tidy(self) -> list[str]:
+        """
+        Delete what machines that ended by themselves left behind, and say what, for people.
+
+        What belongs to a machine that exists, or is being made, stays.
+        """
+        return []
 
     def stop(self, machine_id: str) -> None:
         """

@@ -3,24 +3,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
+import functools
 from importlib import metadata
 import importlib.util
 import os
 from pathlib import Path
+import queue
 import re
 import sys
-from typing import Literal
+import threading
+from typing import Literal, Optional, Union
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import deploy, plan, plugin_system, process
 from fogros2.dds.cyclonedds import RECEIVE_BUFFER
-from fogros2.errors import FogError
+from fogros2.errors import FogError, Unsupported
 from fogros2.host import DISTRO, RMW
 from fogros2.model import Command
-from fogros2.provider import container, container_engine
+from fogros2.provider import container, container_engine, Provider
 from fogros2.store import state_home
 from fogros2.vpn import addresses
 from ros2fog_cli.api import lan
@@ -43,18 +46,67 @@ class Check:
     remedy: str = ''
 
 
-def examine(*, lan_seconds: float = 1.5) -> list[Check]:
+#: Providers that other checks look at.
+_LOOKED_AT = ('container', 'ssh')
+#: Seconds that a provider may take to answer.
+PATIENCE = 8.0
+
+
+def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[Check]:
     """
     Return all checks, in a fixed order.
 
     :param lan_seconds: how long to listen for ROS 2 computers on the networks here, 0 for not.
+    :param providers: those that have to work; others are asked where they are set up.
     """
     checks: list[Callable[[], Check]] = [
         python, programs, root, tun, wireguard, engine, overlay, firewall_program, ros, rmw,
         cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state,
         lambda: lan_peers(lan_seconds)]
+    known = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
+    for name in dict.fromkeys([*known, *providers]):
+        checks.append(functools.partial(provider, name, needed=name in providers))
     with ThreadPoolExecutor(6, 'fog-doctor') as pool:
         return list(pool.map(lambda check: check(), checks))
+
+
+def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> Check:
+    """Look whether a provider's SDK is there, and whether it answers and takes our credentials."""
+    title = f"provider '{name}'"
+    wrong: Verdict = 'failed' if needed else 'warning'
+    try:
+        kind: type[Provider] = plugin_system.load('fogros2.provider', name)
+        if not needed and not kind.configured():
+            return Check(title, 'ok', 'not set up here')
+        said = _in_time(lambda: kind().answers(), patience)
+    except Unsupported:
+        return Check(title, 'ok', 'is there')
+    except FogError as error:
+        return Check(title, wrong, str(error.args[0]), error.hint)
+    if said is None:
+        return Check(title, wrong, f'no answer within {patience:g} s',
+                     'is there a way to the internet, and through a proxy?')
+    return Check(title, 'ok', said)
+
+
+def _in_time(ask: Callable[[], str], patience: float) -> Optional[str]:
+    """Return an answer, None if there is none in time (s); the asking may go on unheard."""
+    answers: queue.SimpleQueue[Union[str, FogError]] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            answers.put(ask())
+        except FogError as error:
+            answers.put(error)
+
+    threading.Thread(target=run, name='fog-doctor-ask', daemon=True).start()
+    try:
+        answer = answers.get(timeout=patience)
+    except queue.Empty:
+        return None
+    if isinstance(answer, FogError):
+        raise answer
+    return answer
 
 
 def python() -> Check:

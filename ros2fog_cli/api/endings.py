@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import as_completed, ThreadPoolExecutor
 import contextlib
 import dataclasses
 import json
@@ -20,10 +21,13 @@ from fogros2.errors import (
     AgentError,
     ConfigurationError,
     DeadlineExceeded,
+    FogError,
+    MachineNotFound,
     NameTaken,
+    ProviderError,
     ShellError,
 )
-from fogros2.model import Command, MachineState, VpnInterface
+from fogros2.model import Command, Machine, MachineState, VpnInterface
 from fogros2.report import Reporter
 from fogros2.store import process_start, Record, Store
 from fogros2.vpn import Vpn
@@ -75,7 +79,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if entry.machine is not None:
             if not entry.machine.owned and entry.record is not None:
                 _leave(entry.record, force=force)
-            machines.load(entry.machine.provider).destroy(entry.machine.id)
+            _destroy(entry.machine)
         record = entry.record
         if record is None:
             return
@@ -86,6 +90,39 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
             # its launch will find the machine gone and take the rest down itself
             return
         deploy.cleanup(record, store, report)
+
+
+def delete_all(
+    entries: Sequence[Entry], store: Store, report: Reporter, *, force: bool = False,
+) -> Iterator[tuple[Entry, Optional[FogError]]]:
+    """Delete several machines at once; yields each as it is gone, or with why it is not."""
+    with ThreadPoolExecutor(min(16, max(1, len(entries))), 'fog-delete') as pool:
+        doing = {pool.submit(delete, entry, store, report, force=force): entry
+                 for entry in entries}
+        for done in as_completed(doing):
+            error = done.exception()
+            if error is not None and not isinstance(error, FogError):
+                raise error
+            yield doing[done], error
+
+
+def _destroy(machine: Machine) -> None:
+    """
+    End a machine, and look that it is gone.
+
+    :raises ProviderError: it is still there.
+    """
+    provider = machines.load(machine.provider)
+    provider.destroy(machine.id)
+    if not machine.owned:
+        return
+    try:
+        state = provider.describe(machine.id).state
+    except MachineNotFound:
+        return
+    if state is not MachineState.DELETED:
+        raise ProviderError(f"'{machine.name}' ({machine.id}) is still there: {state}",
+                            f'ros2 fog delete {machine.name} tries again')
 
 
 @contextlib.contextmanager
@@ -105,7 +142,10 @@ def _leave(record: Record, *, force: bool) -> None:
     timeouts = Timeouts()
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
-        if record.agent and record.agent_program:
+        if record.agent and record.agent_program and shell.run(
+                # an agent that left took its program along, and to ask it would take seconds
+                Command(('test', '-e', record.agent_program), what='look for the agent'),
+                timeout=timeouts.command, check=False).returncode == 0:
             client = AgentClient(shell, record.agent, agent_path=record.agent_program,
                                  python=record.python)
             try:
@@ -159,8 +199,12 @@ def why_end(
     return ''
 
 
-def stopped_at(record: Optional[Record], store: Store) -> Optional[float]:
-    """Return when this robot stopped a machine: its record was written last then."""
+def stopped_at(
+    machine: Optional[Machine], record: Optional[Record], store: Store,
+) -> Optional[float]:
+    """Return when a machine was stopped: the provider's word, else when its record was written."""
+    if machine is not None and machine.stopped is not None:
+        return machine.stopped
     if record is None:
         return None
     try:

@@ -115,9 +115,29 @@ class Entry:
         return self.machine.tags.get(TAG_LAUNCH, '') if self.machine is not None else ''
 
     @property
-    def cost_per_hour(self) -> Optional[Decimal]:
-        """US dollars an hour, None where unknown."""
-        return self.machine.cost_per_hour if self.machine is not None else None
+    def cost(self) -> Optional[Decimal]:
+        """US dollars an hour while it runs; nothing once it has ended; None where unknown."""
+        if self.machine is None or self.machine.state not in (
+                MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING):
+            return None
+        return self.machine.cost_per_hour
+
+    def spent(self, now: float) -> Optional[Decimal]:
+        """Return the US dollars since its creation at today's price, None where unknown."""
+        rate = self.cost
+        if rate is None or self.created is None:
+            return None
+        return rate * Decimal(max(0.0, now - self.created)) / 3600
+
+    @property
+    def place(self) -> str:
+        """Region, context, engine: '' where the provider names none."""
+        return self.machine.place if self.machine is not None else ''
+
+    @property
+    def kind(self) -> str:
+        """What it is, such as an instance type; '' where the provider names none."""
+        return self.machine.kind if self.machine is not None else ''
 
     @property
     def machine_id(self) -> Optional[str]:
@@ -137,7 +157,10 @@ class Entry:
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address, 'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
-            'cost_per_hour': None if self.cost_per_hour is None else str(self.cost_per_hour),
+            'place': self.place, 'kind': self.kind,
+            'cost_per_hour': None if self.cost is None else str(self.cost),
+            'cost': None if (spent := self.spent(now)) is None
+            else str(spent.quantize(Decimal('0.000001'))),
         }
 
 
@@ -149,7 +172,10 @@ def survey(
     Return all machines, or those called ``name``, asking all providers at once.
 
     A provider that can't be asked (no SDK, no credentials, no engine) costs a warning; what the
-    store knows of its machines is returned all the same.
+    store knows of its machines is returned all the same. One that nobody has set up here, and
+    that no record names, is left out: its SDK takes longer to load than all others to answer.
+
+    :param regions: places to ask; a provider that has places is asked then in any case.
     """
     records = {record.name: record for record in (store or Store()).machines()}
     if name is not None:
@@ -176,6 +202,18 @@ def survey(
     return sorted(entries, key=lambda entry: (entry.name, entry.provider))
 
 
+def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
+    """Return whether to ask a provider of whose machines this robot has no record."""
+    if not regions and name in plugin_system.names('fogros2.configured'):
+        # what says so without loading the provider, which takes as long as all the others' answers
+        return bool(plugin_system.load('fogros2.configured', name)())
+    try:
+        kind: type[Provider] = plugin_system.load('fogros2.provider', name)
+    except FogError:
+        return True  # to be told with its name, as any other failure
+    return kind.configured() or bool(regions) and issubclass(kind, HasRegions)
+
+
 def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
     """Return this robot's record of a machine; another robot's of the same name is not it."""
     record = records.get(machine.name or machine.tags.get(TAG_NAME, ''))
@@ -191,6 +229,8 @@ def _ask(
     records: Iterable[Record], warn: Warn,
 ) -> Optional[list[Machine]]:
     """Return a provider's machines, None if it can't be asked."""
+    if not any(record.provider == name for record in records) and not wanted(name, regions):
+        return []
     try:
         provider = load(name, regions)
         try:
@@ -225,6 +265,15 @@ def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
     if regions and isinstance(provider, HasRegions):
         provider.set_regions(['all'] if {'all', '*'} & set(regions) else list(regions))
     return provider
+
+
+def total(entries: Sequence[Entry], now: float) -> Optional[tuple[Decimal, Decimal]]:
+    """Return US dollars an hour and so far, of the machines whose price is known, or None."""
+    rates = [entry.cost for entry in entries if entry.cost is not None]
+    if not rates:
+        return None
+    return sum(rates, Decimal(0)), sum((entry.spent(now) or Decimal(0) for entry in entries),
+                                       Decimal(0))
 
 
 def one(entries: Sequence[Entry], name: str) -> Entry:

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+import contextlib
 import dataclasses
 import os
 import re
+import socket
 import threading
 import time
 from typing import Any, Optional
@@ -62,9 +64,67 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
     return dataclasses.replace(found, user=user) if user else found
 
 
-def shell(entry: Entry, user: Optional[str] = None, timeout: float = 15.0) -> Shell:
-    """Return the machine's shell; connects when first used."""
-    return shells.connect(endpoint(entry, user), name=entry.name, timeout=timeout)
+@contextlib.contextmanager
+def session(
+    entry: Entry, user: Optional[str] = None, timeout: float = 15.0,
+) -> Iterator[Shell]:
+    """
+    Yield the machine's shell, which connects when first used; closed after the block.
+
+    Behind a firewall that the launch has closed, it goes through the VPN while the robot has one
+    to it; else this robot is let in for as long as the block takes.
+
+    :raises FogError: it can't be reached.
+    """
+    to = endpoint(entry, user)
+    with contextlib.ExitStack() as undo:
+        if firewalled(entry):
+            inside = through_vpn(entry, to)
+            if inside is not None:
+                to = inside
+            else:
+                _open(entry, to.port, undo)
+        found = shells.connect(to, name=entry.name, timeout=timeout)
+        undo.callback(found.close)
+        yield found
+
+
+def firewalled(entry: Entry) -> bool:
+    """Return whether the machine's provider decides who reaches it."""
+    return entry.machine is not None and machines.load(entry.provider).firewall
+
+
+def through_vpn(
+    entry: Entry, to: Endpoint, patience: float = 1.5,
+) -> Optional[Endpoint]:
+    """Return an endpoint within the VPN, None where nothing answers there in time (s)."""
+    record = entry.record
+    if record is None or record.vpn is None or not record.launch_alive:
+        return None
+    try:
+        socket.create_connection((record.vpn.address, to.port), timeout=patience).close()
+    except OSError:
+        return None
+    return dataclasses.replace(to, host=record.vpn.address)
+
+
+def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
+    """Let this robot in until ``undo`` runs; under a launch, until that closes it again."""
+    assert entry.machine is not None
+    provider, machine_id = machines.load(entry.provider), entry.machine.id
+    provider.allow(machine_id, port, [provider.robot_address()])
+
+    def close() -> None:
+        # a launch may have begun meanwhile, and be on its way in
+        record = entry.record
+        if record is not None:
+            with contextlib.suppress(FogError):
+                record = Store().machine(entry.name).load()
+        if record is None or not record.launch_alive:
+            with contextlib.suppress(FogError):  # the machine may be gone by now
+                provider.allow(machine_id, port, [])
+
+    undo.callback(close)
 
 
 def agent(entry: Entry, to: Shell) -> AgentClient:

@@ -5,22 +5,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from decimal import Decimal
+import shutil
+import sys
 from typing import Optional
 
+#: What stands for nothing.
+NONE = '-'
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return rows in columns as wide as their longest word, two spaces apart."""
-    lines = [header, *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
-    return '\n'.join(
-        '  '.join(word.ljust(width) for word, width in zip(line, widths)).rstrip()
-        for line in lines)
+
+def table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], *, width: int = 0,
+    optional: Sequence[str] = (),
+) -> str:
+    """
+    Return rows in columns as wide as their longest word, two spaces apart.
+
+    :param width: characters in a line, 0 for as many as it takes.
+    :param optional: columns that are left out, the first one first, until a line is no longer
+        than ``width``; and in any case where no row has anything in them.
+    """
+    empty = {name for column, name in enumerate(header) if name in optional
+             and all(row[column] in ('', NONE) for row in rows)}
+    left = [name for name in optional if name not in empty]
+    while True:
+        keep = [column for column, name in enumerate(header) if name not in empty]
+        text = _columns([[line[column] for column in keep] for line in [header, *rows]])
+        if not width or not left or max(map(len, text)) <= width:
+            return '\n'.join(text)
+        empty.add(left.pop(0))
+
+
+def terminal_width() -> int:
+    """Return how many characters a line of the terminal has, 0 where nobody looks at one."""
+    return shutil.get_terminal_size((0, 0)).columns if sys.stdout.isatty() else 0
+
+
+def _columns(lines: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    return ['  '.join(word.ljust(width) for word, width in zip(line, widths)).rstrip()
+            for line in lines]
 
 
 def duration(seconds: Optional[float]) -> str:
     """Return seconds in at most two units, ``-`` for None."""
     if seconds is None:
-        return '-'
+        return NONE
     if seconds < 0:
         return 'over'
     if seconds < 120:
@@ -42,6 +71,6 @@ def size(number: float) -> str:
     return f'{number:.1f} TB'
 
 
-def cost(dollars: Optional[Decimal]) -> str:
-    """Return US dollars an hour, ``-`` where unknown."""
-    return '-' if dollars is None else f'${dollars.quantize(Decimal("0.0001"))}'
+def cost(dollars: Optional[Decimal], places: int = 4) -> str:
+    """Return US dollars with so many decimal places, ``-`` where unknown."""
+    return NONE if dollars is None else f'${dollars.quantize(Decimal(1).scaleb(-places))}'

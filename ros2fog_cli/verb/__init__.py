@@ -50,8 +50,7 @@ def add_region(parser: argparse.ArgumentParser) -> None:
     """Add FogROS2's own ``--region``."""
     parser.add_argument(
         '--region', nargs='*', metavar='REGION',
-        help="regions to ask providers that have some, 'all' for every one (default: the "
-             "configured region)")
+        help="regions to ask where a provider has some; 'all' for every one")
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -62,3 +61,12 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def warn(text: str) -> None:
     """Print a line that is no result."""
     print(text, file=sys.stderr)
+
+
+def agreed(one: str, several: str, number: int) -> bool:
+    """Ask whether to delete so many; where nobody can be asked the answer is no."""
+    if not sys.stdin.isatty():
+        warn('not deleted: nobody is here to ask (--yes answers)')
+        return False
+    what = one if number == 1 else f'these {number} {several}'
+    return input(f'Delete {what}? [y/N] ').strip().lower() in ('y', 'yes')

@@ -14,8 +14,7 @@ class ConnectVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_name(parser)
-        add_region(parser)
-        parser.add_argument('--user', '-u', help='another user than the one nodes run as')
+        _add_options(parser)
         parser.add_argument('command', nargs=argparse.REMAINDER,
                             help='-- and a command, instead of a login shell')
 
@@ -23,10 +22,20 @@ class ConnectVerb(VerbExtension):
         """Hand the terminal over; the exit status is that of the session."""
         from fogros2.model import Command
         from ros2fog_cli.api import reach
-        words = args.command[1:] if args.command[:1] == ['--'] else args.command
+        words = args.command
+        if words and words[0].startswith('-') and words[0] != '--':
+            # options after the name: argparse takes them for the command's
+            end = words.index('--') if '--' in words else len(words)
+            late = argparse.ArgumentParser(prog='ros2 fog connect NAME', add_help=False)
+            _add_options(late)
+            late.parse_args(words[:end], args)
+            words = words[end:]
+        words = words[1:] if words[:1] == ['--'] else words
         entry = reach.find(args.name, warn, regions=args.region)
-        shell = reach.shell(entry, args.user)
-        try:
+        with reach.session(entry, args.user) as shell:
             return shell.interactive(Command(tuple(words)) if words else None)
-        finally:
-            shell.close()
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add_region(parser)
+    parser.add_argument('--user', '-u', help='another user than the one nodes run as')

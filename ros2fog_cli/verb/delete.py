@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
-from ros2fog_cli.verb import add_region, complete_names, VerbExtension, warn
+from ros2fog_cli.verb import add_region, agreed, complete_names, VerbExtension, warn
 
 
 class DeleteVerb(VerbExtension):
@@ -29,7 +28,6 @@ class DeleteVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete, and return 1 if something is still there."""
-        from fogros2.errors import FogError
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
         store = Store()
@@ -54,23 +52,15 @@ class DeleteVerb(VerbExtension):
             return 0
         for entry in entries:
             endings.check_free(entry, force=args.force)
-        if not args.yes and not _agreed(len(entries)):
+        if not args.yes and not agreed(
+                'this machine', 'machines', len(entries)):
             return 1
         failed = 0
         with progress.shown() as report:
-            for entry in entries:
-                try:
-                    endings.delete(entry, store, report, force=args.force)
+            for entry, error in endings.delete_all(entries, store, report, force=args.force):
+                if error is None:
                     print(f'deleted {entry.name}')
-                except FogError as error:
+                else:
                     warn(f'{entry.name}: {error}')
                     failed = 1
         return failed
-
-
-def _agreed(number: int) -> bool:
-    if not sys.stdin.isatty():
-        warn('not deleted: nobody is here to ask (--yes answers)')
-        return False
-    machines = 'this machine' if number == 1 else f'these {number} machines'
-    return input(f'Delete {machines}? [y/N] ').strip().lower() in ('y', 'yes')

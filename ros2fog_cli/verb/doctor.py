@@ -20,13 +20,15 @@ class DoctorVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_json(parser)
+        parser.add_argument('--provider', nargs='+', default=[], metavar='NAME',
+                            help='has to work; others are asked where they are set up')
         parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
                             help='how long to look for ROS 2 on the LAN (0: not at all)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print each check, failures with their remedy; 1 if one failed."""
         from ros2fog_cli.api import doctor
-        checks = doctor.examine(lan_seconds=args.lan_seconds)
+        checks = doctor.examine(lan_seconds=args.lan_seconds, providers=args.provider)
         if args.json:
             print(json.dumps([dataclasses.asdict(check) for check in checks], indent=2))
         else:

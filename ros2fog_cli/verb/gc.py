@@ -39,7 +39,7 @@ class GcVerb(VerbExtension):
         with progress.shown() as report:
             for entry in machines.survey(warn, regions=args.region, store=store):
                 reason = endings.why_end(entry, now, args.keep_stopped * 86400,
-                                         endings.stopped_at(entry.record, store))
+                                         endings.stopped_at(entry.machine, entry.record, store))
                 record = entry.record
                 lost = not reason and record is not None and record.launch \
                     and not record.launch_alive and not record.damage and entry.asked

@@ -11,7 +11,7 @@ from ros2fog_cli.verb import add_json, add_region, VerbExtension, warn
 
 
 class ListVerb(VerbExtension):
-    """List the cloud machines of all providers."""
+    """List the cloud machines of all providers, and what they cost."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -30,10 +30,17 @@ class ListVerb(VerbExtension):
             print('no machines')
             return 0
         print(table.table(
-            ('NAME', 'PROVIDER', 'STATE', 'AGE', 'ADDRESS', 'TIME LEFT', 'COST/H'),
-            [(entry.name, entry.provider, entry.state,
+            ('NAME', 'PROVIDER', 'PLACE', 'KIND', 'STATE', 'AGE', 'ADDRESS', 'TIME LEFT',
+             'COST/H', 'COST'),
+            [(entry.name, entry.provider, entry.place or '-', entry.kind or '-', entry.state,
               table.duration(None if entry.created is None else max(0.0, now - entry.created)),
               entry.address or '-',
               table.duration(None if entry.expires is None else entry.expires - now),
-              table.cost(entry.cost_per_hour)) for entry in entries]))
+              table.cost(entry.cost), table.cost(entry.spent(now), 2)) for entry in entries],
+            width=table.terminal_width(),
+            optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
+        total = machines.total(entries, now)
+        if total is not None:
+            print(f'{table.cost(total[0])} an hour, {table.cost(total[1], 2)} so far, '
+                  'disks and traffic aside')
         return 0

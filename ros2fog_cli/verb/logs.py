@@ -24,8 +24,7 @@ class LogsVerb(VerbExtension):
         """Print the log."""
         from ros2fog_cli.api import reach
         entry = reach.find(args.name, warn, regions=args.region)
-        shell = reach.shell(entry)
-        try:
+        with reach.session(entry) as shell:
             client = reach.agent(entry, shell)
             try:
                 there = reach.follow(
@@ -34,8 +33,6 @@ class LogsVerb(VerbExtension):
                 return 0
             finally:
                 client.close()
-        finally:
-            shell.close()
         if not there:
             warn(f"the agent of '{args.name}' is gone")
         return 0 if there else 1
@@ -65,6 +62,8 @@ def describe(event: dict[str, Any]) -> Optional[str]:
         return f"could not be started: {event.get('error')}"
     if kind == 'watchdog':
         return f"watchdog: {event.get('reason')}, {event.get('action')}"
+    if kind == 'notice':
+        return f"the provider takes the machine away: {event.get('reason')}"
     if kind == 'gap':
         return f"{event.get('count')} older events are not kept any more"
     return None

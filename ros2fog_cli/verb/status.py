@@ -35,8 +35,7 @@ class StatusVerb(VerbExtension):
             except FogError as error:
                 problems.append(f'VPN: {error}')
             try:
-                shell = reach.shell(entry)
-                try:
+                with reach.session(entry) as shell:
                     client = reach.agent(entry, shell)
                     try:
                         reply = client.request('status', timeout=15.0)
@@ -44,8 +43,6 @@ class StatusVerb(VerbExtension):
                             key: value for key, value in reply.items() if key not in ('id', 'ok')}
                     finally:
                         client.close()
-                finally:
-                    shell.close()
             except FogError as error:
                 problems.append(f'agent: {error}')
         if args.json:
@@ -59,16 +56,22 @@ class StatusVerb(VerbExtension):
 
 def show(status: dict[str, Any]) -> None:
     """Print a status for people."""
-    from ros2fog_cli.api.table import duration, size, table
+    from decimal import Decimal
+
+    from ros2fog_cli.api.table import cost, duration, size, table
     now = time.time()
     lines = [
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
         ('state', status['state']),
         ('address', status['address'] or '-'),
+        *((key, status[key]) for key in ('place', 'kind') if status[key]),
         ('age', duration(status['age'])),
         ('time left', duration(status['time_left'])),
         ('launch', status['launch'] or '-'),
     ]
+    if status['cost'] is not None:
+        lines.append(('cost', f"{cost(Decimal(status['cost_per_hour']))} an hour, "
+                              f"{cost(Decimal(status['cost']), 2)} so far"))
     vpn, agent = status['vpn'], status['agent']
     if vpn is not None:
         latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"

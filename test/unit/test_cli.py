@@ -19,7 +19,7 @@ from ros2cli.cli import main
 
 from fogros2 import plugin_system
 from fogros2.errors import MachineNotFound, PrerequisiteError, ProviderError, Unsupported
-from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, Result
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
@@ -140,11 +140,11 @@ def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
 def test_list_shows_what_providers_and_the_store_know(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    machine('alive', cost_per_hour=Decimal('0.0416'))
+    machine('alive', cost_per_hour=Decimal('0.0416'), place='eu-west-1', kind='t3.medium')
     record('alive', **alive())
-    machine('orphan')
+    machine('orphan', cost_per_hour=Decimal('1.2'))
     machine('other', robot='somebody-7')
-    machine('idle', state=MachineState.STOPPED)
+    machine('idle', state=MachineState.STOPPED, cost_per_hour=Decimal('1.2'))
     record('idle', launch='')
     machine('widow')
     record('widow', **dead())
@@ -156,14 +156,19 @@ def test_list_shows_what_providers_and_the_store_know(
     assert run('list') == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == [
-        'NAME', 'PROVIDER', 'STATE', 'AGE', 'ADDRESS', 'TIME', 'LEFT', 'COST/H']
-    states = {line.split()[0]: line for line in lines[1:]}
+        'NAME', 'PROVIDER', 'PLACE', 'KIND', 'STATE', 'AGE', 'ADDRESS', 'TIME', 'LEFT', 'COST/H',
+        'COST']
+    states = {line.split()[0]: line for line in lines[1:-1]}
     assert list(states) == ['alive', 'broken', 'ghost', 'here', 'idle', 'orphan', 'other', 'widow']
-    assert ' running   ' in states['alive'] and '$0.0416' in states['alive']
+    assert ' running   ' in states['alive'] and '$0.0416  $0.01' in states['alive']
+    assert 'eu-west-1  t3.medium' in states['alive']
+    # what is stopped costs its disk alone; 10 minutes of the others
+    assert '$' not in states['idle']
+    assert lines[-1] == '$1.2416 an hour, $0.21 so far, disks and traffic aside'
     assert '10 min' in states['alive'] and '60 min' in states['alive']
     assert 'unknown (record damaged)' in states['broken']
     assert ' gone ' in states['ghost']
-    assert 'untagged  running' in states['here']
+    assert states['here'].split()[:5] == ['here', 'untagged', '-', '-', 'running']
     assert 'stopped (keeps its disk)' in states['idle']
     assert 'running (orphan)' in states['orphan']
     assert 'running (robot somebody-7)' in states['other']
@@ -177,6 +182,7 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     (entry,) = json.loads(capsys.readouterr().out)
     assert entry['name'] == 'a' and entry['provider'] == 'memory' and entry['id'] == 'id-a'
     assert entry['launch_alive'] is True and entry['cost_per_hour'] == '0.5'
+    assert float(entry['cost']) == pytest.approx(0.5 / 6, rel=0.01)
     assert 595 < entry['age'] < 700 and 3500 < entry['time_left'] < 3600
 
 
@@ -348,13 +354,30 @@ def test_a_computer_that_another_robot_has_by_now_is_left_alone(
                                      'launch': 'theirs'}).encode() + b'\n')
 
     asked: list[str] = []
-    shell = FakeShell(streams=[Agent()])
+    shell = FakeShell(streams=[Agent()], handlers={'test': lambda c: Result(0, '', '')})
     monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
     made = machine('lab', provider='untagged', owned=False)
     record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
            agent_program='/run/fogros2/lab/agent.py', **dead())
     assert run('delete', 'lab', '--yes') == 0
-    assert asked == ['status'] and shell.commands == []
+    assert asked == ['status'] and [c.argv[0] for c in shell.commands] == ['test']
+
+
+def test_an_agent_that_has_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It took its program along: a client would try for seconds to run it."""
+    ran: list[str] = []
+
+    def program(status: int) -> Any:
+        return lambda c: ran.append(' '.join(c.argv)) or Result(status, '', '')
+
+    shell = FakeShell(handlers={'test': program(1), 'rm': program(0)})
+    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    made = machine('lab', provider='untagged', owned=False)
+    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
+           agent_program='/run/fogros2/lab/agent.py', **dead())
+    assert run('delete', 'lab', '--yes') == 0
+    assert ran == ['test -e /run/fogros2/lab/agent.py', 'rm -rf -- /run/fogros2/lab']
+    assert shell.opened == [] and shell.closed == 1
 
 
 def test_a_machine_that_was_reused_lives_from_then_on() -> None:
@@ -443,14 +466,19 @@ def test_sizes_and_costs() -> None:
 def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 0
     said = capsys.readouterr().out
-    for verb in ('connect', 'delete', 'doctor', 'env', 'gc', 'list', 'logs', 'status'):
+    for verb in ('connect', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs', 'price',
+                 'regions', 'status'):
         assert verb in said
 
 
-def test_help_imports_no_core(tmp_path: Path) -> None:
+@pytest.mark.parametrize('words', [
+    [], ['connect'], ['delete'], ['doctor'], ['env'], ['gc'], ['image'], ['list'], ['logs'],
+    ['price'], ['regions'], ['status']], ids=' '.join)
+def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
     code = ('import sys\nfrom ros2cli.cli import main\n'
-            "try:\n    main(argv=['fog', '-h'])\nexcept SystemExit:\n    pass\n"
-            "print([m for m in sys.modules if m.split('.')[0] in ('paramiko', 'boto3', 'yaml')"
+            f"try:\n    main(argv=['fog', *{words!r}, '-h'])\nexcept SystemExit:\n    pass\n"
+            "print([m for m in sys.modules if m.split('.')[0] in "
+            "('paramiko', 'boto3', 'botocore', 'kubernetes', 'requests', 'yaml')"
             " or m in ('fogros2.deploy', 'fogros2.provider')], file=sys.stderr)")
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           cwd=tmp_path, check=True)

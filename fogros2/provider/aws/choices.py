@@ -13,6 +13,7 @@ from typing import Optional, Union
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.provider.aws import regions as places
+from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.prices import cheapest_zone, InstanceType, Market
 
 #: What 'cheapest' means where nothing else is said: as much as the default type t3.medium has.
@@ -181,10 +182,13 @@ def _is_gpu(kind: InstanceType, asked: Wants) -> bool:
     return named is not None and gigabytes >= asked.gpu_memory_gb
 
 
-def offers(region: str, asked: Wants, market: Market) -> list[Offer]:
+def offers(
+    region: str, asked: Wants, market: Market, *, spot_too: bool = False,
+) -> list[Offer]:
     """
     Return what fits in one region, the cheapest first, whatever its price.
 
+    :param spot_too: look for the spot prices even where they don't count.
     :raises FogError: AWS refused, or can't be reached.
     """
     zones = market.zones(region)
@@ -192,7 +196,7 @@ def offers(region: str, asked: Wants, market: Market) -> list[Offer]:
     if not kinds:
         return []
     prices = market.prices(region)
-    spot = market.spot(region, [kind.name for kind in kinds]) if asked.spot else {}
+    spot = market.spot(region, [kind.name for kind in kinds]) if asked.spot or spot_too else {}
     found = [Offer(region, kind, prices.get(kind.name),
                    cheapest_zone(spot.get(kind.name, {}), zones[kind.name]),
                    tuple(zones[kind.name])) for kind in kinds]
@@ -208,7 +212,10 @@ def ranked(found: Iterable[Offer], asked: Wants) -> list[Offer]:
         pair[1].region))]
 
 
-def choose(regions: Sequence[str], asked: Wants, market: Optional[Market] = None) -> Choice:
+def choose(
+    regions: Sequence[str], asked: Wants, market: Optional[Market] = None, *,
+    spot_too: bool = False,
+) -> Choice:
     """
     Return what fits in some regions, the cheapest of all first.
 
@@ -223,7 +230,7 @@ def choose(regions: Sequence[str], asked: Wants, market: Optional[Market] = None
 
     def ask(region: str) -> Union[list[Offer], FogError]:
         try:
-            return offers(region, asked, market)
+            return offers(region, asked, market, spot_too=spot_too)
         except FogError as error:
             return error
 
@@ -324,3 +331,29 @@ def price_of(
         raise ProviderError(f"AWS tells no {'spot ' if spot else ''}price of {name} in {region}",
                             'ros2 fog price --region shows the types that a region has')
     return price
+
+
+def regions_named(names: Optional[Sequence[str]], account: Optional[Account] = None) -> list[str]:
+    """
+    Return the regions that somebody means: 'all', 'nearest', their names; none is the usual one.
+
+    :raises FogError: AWS can't be asked, or no region answers.
+    """
+    names = [name for name in names or () if name]
+    if not names:
+        return [(account or Account()).region() or nearest_region()]
+    if {'all', '*'} & set(names):
+        return enabled_regions(account)
+    return list(dict.fromkeys(nearest_region() if name == 'nearest' else name for name in names))
+
+
+def enabled_regions(account: Optional[Account] = None) -> list[str]:
+    """
+    Return the regions that the account may use; one request.
+
+    :raises FogError: AWS refused, or can't be reached.
+    """
+    account = account or Account()
+    answer = account.call('ec2', account.region() or 'us-east-1', 'describe_regions',
+                          'asking for the regions of the account', hasty=True)
+    return sorted(region['RegionName'] for region in answer['Regions'])

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog image``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+from ros2fog_cli.verb import (
+    add_json,
+    add_region,
+    agreed,
+    complete_names,
+    VerbExtension,
+    warn,
+)
+
+_USAGE = """\
+ros2 fog image [OPTIONS] NAME [NAME ...]
+       ros2 fog image list [OPTIONS]
+       ros2 fog image delete [OPTIONS] IMAGE [IMAGE ...]"""
+
+
+class ImageVerb(VerbExtension):
+    """Make images of machines that are set up, list and delete them."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        parser.usage = _USAGE
+        words = parser.add_argument(
+            'words', nargs='+', metavar='...',
+            help="'list', 'delete' with ids or names of images, or machines to make images of")
+        words.completer = (  # type: ignore[attr-defined]
+            lambda prefix, **more: [
+                *complete_names(prefix, **more),
+                *(word for word in ('list', 'delete') if word.startswith(prefix))])
+        add_region(parser)
+        parser.add_argument('--dry-run', action='store_true', help='only say what would be done')
+        parser.add_argument('--image-name', metavar='NAME',
+                            help="the image's name (default: the machine's, and the time)")
+        parser.add_argument('--no-wait', action='store_true',
+                            help="don't wait until the image is ready")
+        parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
+        add_json(parser)
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Do what the first word says."""
+        from fogros2.errors import ConfigurationError
+        first, rest = args.words[0], args.words[1:]
+        if first == 'list':
+            if rest:
+                raise ConfigurationError("'ros2 fog image list' takes no names")
+            return _list(args)
+        if first == 'delete':
+            if not rest:
+                raise ConfigurationError("'ros2 fog image delete' takes ids or names of images",
+                                         'ros2 fog image list shows them')
+            return _delete(args, rest)
+        if args.image_name and rest:
+            raise ConfigurationError('--image-name names the image of one machine alone')
+        return max(_make(args, name) for name in args.words)
+
+
+def _list(args: argparse.Namespace) -> int:
+    from ros2fog_cli.api import images, table
+    found = images.survey(warn, regions=args.region)
+    if args.json:
+        print(json.dumps([images.to_json(image) for image in found], indent=2))
+    elif not found:
+        print('no images')
+    else:
+        now = time.time()
+        print(table.table(
+            ('NAME', 'IMAGE', 'PROVIDER', 'PLACE', 'STATE', 'AGE', 'SIZE', 'DEPENDENCIES'),
+            [(image.name, image.id, image.provider, image.place or table.NONE,
+              image.state or table.NONE,
+              table.duration(None if image.created is None else max(0.0, now - image.created)),
+              table.NONE if image.size_gb is None else f'{image.size_gb} GB',
+              image.dependencies or table.NONE) for image in found],
+            width=table.terminal_width(),
+            optional=('DEPENDENCIES', 'PROVIDER', 'SIZE', 'PLACE', 'AGE')))
+    return 0
+
+
+def _make(args: argparse.Namespace, name: str) -> int:
+    from fogros2.errors import FogError
+    from ros2fog_cli.api import images, progress, reach
+    entry = reach.find(name, warn, regions=args.region)
+    print(f"{'would make' if args.dry_run else 'make'} an image of {entry.name}: "
+          f"{entry.provider} {entry.machine_id or '-'}, {entry.state}", file=sys.stderr)
+    if args.dry_run:
+        return 0
+    baking = images.bake(entry, args.image_name or '')
+    if not baking.dependencies:
+        warn('what is installed on the machine is not known: no launch takes the image by '
+             f'itself, but each that names it does ({baking.id})')
+    try:
+        if not args.no_wait:
+            with progress.line() as show:
+                images.wait(baking, look=lambda state, seconds: show(
+                    f'{baking.name}: {state}, {seconds:.0f} s'))
+    except KeyboardInterrupt:
+        warn(f'the image goes on being made: {baking.id} (ros2 fog image list shows it)')
+        return 130
+    except FogError as error:
+        warn(f'{baking.name}: {error}')
+        return 1
+    if args.json:
+        print(json.dumps({'id': baking.id, 'name': baking.name, 'provider': baking.provider,
+                          'dependencies': baking.dependencies}, indent=2))
+    else:
+        print(f"{'making' if args.no_wait else 'made'} {baking.name} ({baking.id})")
+    return 0
+
+
+def _delete(args: argparse.Namespace, words: list[str]) -> int:
+    from fogros2.errors import FogError
+    from ros2fog_cli.api import images
+    found = images.named(images.survey(warn, regions=args.region), words)
+    for image in found:
+        print(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
+              f'{image.provider} {image.id}, {image.state}')
+    if args.dry_run:
+        return 0
+    if not args.yes and not agreed('this image', 'images', len(found)):
+        return 1
+    failed = 0
+    for image in found:
+        try:
+            images.delete(image)
+            print(f'deleted {image.name}')
+        except FogError as error:
+            warn(f'{image.name}: {error}')
+            failed = 1
+    return failed

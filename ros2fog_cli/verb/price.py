@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog price``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from ros2fog_cli.verb import add_json, VerbExtension, warn
+
+
+class PriceVerb(VerbExtension):
+    """List the EC2 types that fit, the cheapest first: what 'cheapest' chooses from."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        parser.add_argument('--min-cpu', type=int, metavar='N', help='vCPUs (default: 2)')
+        parser.add_argument('--min-memory', type=float, metavar='GB', help='default: 4')
+        parser.add_argument('--gpu', nargs='?', const='1', metavar='N|NAME',
+                            help="how many GPUs of NVIDIA's, or one of this name, such as L4")
+        parser.add_argument('--gpu-memory', type=float, metavar='GB', help='of each GPU')
+        parser.add_argument('--arch', help="x86_64, arm64 or any (default: this computer's)")
+        parser.add_argument('--cpu-type', choices=('intel', 'amd', 'aws'),
+                            help="the processor's maker")
+        parser.add_argument('--max-price', metavar='DOLLARS', help='an hour, at the most')
+        parser.add_argument('--spot', action='store_true', help='spot prices count')
+        parser.add_argument(
+            '--region', nargs='*', metavar='REGION',
+            help="'all' for every one, 'nearest' for that (default: the configured region)")
+        parser.add_argument('--limit', type=int, default=10, metavar='N',
+                            help='rows to show, 0 for all (default: 10)')
+        parser.add_argument('--refresh', action='store_true',
+                            help='ask AWS, also where it was asked within a day')
+        add_json(parser)
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Print the table; the first row is what a launch would take."""
+        from fogros2.provider.aws import choices
+        from fogros2.provider.aws.prices import Market
+        from ros2fog_cli.api import table
+        asked = choices.wants(
+            arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
+            cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
+            max_price=args.max_price, spot=args.spot)
+        regions = choices.regions_named(args.region)
+        choice = choices.choose(regions, asked, Market(refresh=args.refresh),
+                                spot_too=True)
+        for region, reason in choice.left_out:
+            warn(f'{region}: {reason}')
+        shown = choice.offers[:args.limit or None]
+        if args.json:
+            print(json.dumps([{
+                'region': one.region, 'type': one.type.name, 'vcpus': one.type.vcpus,
+                'memory_gb': one.type.memory_gb, 'arch': one.type.arch, 'cpu': one.type.cpu,
+                'gpus': one.type.gpus, 'gpu': one.type.gpu,
+                'gpu_memory_gb': one.type.gpu_memory_gb, 'zones': one.zones,
+                'price': None if one.price is None else str(one.price),
+                'spot_price': None if one.spot_price is None else str(one.spot_price),
+            } for one in shown], indent=2))
+            return 0
+        where = ', '.join(regions) if len(regions) < 4 else f'{len(regions)} regions'
+        print(f'{asked}, in {where}')
+        print(table.table(
+            ('TYPE', 'REGION', 'CPUS', 'MEMORY', 'GPU', 'ARCH', 'CPU', 'PRICE/H', 'SPOT/H'),
+            [(one.type.name, one.region, str(one.type.vcpus), f'{one.type.memory_gb:g} GB',
+              _gpus(one.type.gpus, one.type.gpu, one.type.gpu_memory_gb), one.type.arch,
+              one.type.cpu or table.NONE, table.cost(one.price), table.cost(one.spot_price))
+             for one in shown], width=table.terminal_width(),
+            optional=('GPU', 'CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()))))
+        left = len(choice.offers) - len(shown)
+        if left:
+            print(f"{left} more {'cost' if left > 1 else 'costs'} as much or more (--limit 0)")
+        return 0
+
+
+def _gpus(number: int, name: str, memory: float) -> str:
+    return f'{number} x {name} {memory:g} GB' if number else '-'

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog regions``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from ros2fog_cli.verb import add_json, VerbExtension
+
+
+class RegionsVerb(VerbExtension):
+    """List the AWS regions by how long a connection from here takes."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        parser.add_argument('region', nargs='*', help='these alone')
+        parser.add_argument('--all', action='store_true',
+                            help='also those that an account has to enable first')
+        add_json(parser)
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Print the table."""
+        from fogros2.errors import ConfigurationError
+        from fogros2.provider.aws import regions
+        from ros2fog_cli.api import table
+        unknown = [name for name in args.region if name not in regions.REGIONS]
+        if unknown:
+            raise ConfigurationError(f"AWS has no region {', '.join(unknown)}",
+                                     'ros2 fog regions --all shows them')
+        found = regions.table(args.region or (regions.REGIONS if args.all else regions.ENABLED))
+        if args.json:
+            print(json.dumps([{'region': one.region, 'place': one.place,
+                               'median_ms': one.milliseconds, 'distance_km': one.distance_km}
+                              for one in found], indent=2))
+            return 0
+        measured = any(one.milliseconds is not None for one in found)
+        print(table.table(
+            ('REGION', 'PLACE', 'MEDIAN' if measured else 'DISTANCE'),
+            [(one.region, one.place, _far(one.milliseconds, one.distance_km)) for one in found]))
+        if not measured:
+            print('no region answers: these are distances from where this computer seems to be')
+        return 0
+
+
+def _far(milliseconds: float | None, kilometres: float | None) -> str:
+    if milliseconds is not None:
+        return f'{milliseconds:.0f} ms'
+    return 'no answer' if kilometres is None else f'{kilometres:.0f} km'

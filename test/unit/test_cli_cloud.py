@@ -1,0 +1,528 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog`` with a provider that has places, a firewall, images and prices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import dataclasses
+from decimal import Decimal
+import json
+import os
+import socket
+import threading
+import time
+from typing import Any, Optional
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import plugin_system
+from fogros2.errors import DeadlineExceeded, MachineNotFound, ProviderError, Unsupported
+from fogros2.model import (
+    CreateRequest,
+    Endpoint,
+    Image,
+    Machine,
+    MachineSpec,
+    MachineState,
+    VpnInterface,
+)
+from fogros2.provider import Provider, TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
+from fogros2.provider.aws import choices, prices, regions
+from fogros2.provider.aws.prices import InstanceType
+from fogros2.provider.aws.regions import Latency
+from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.testing.fakes import FakeShell
+from ros2fog_cli.api import doctor, endings, images, reach, table
+from ros2fog_cli.api.machines import Entry
+
+NOW = 1_800_000_000.0
+
+
+class Cloud(Provider):
+    """A cloud in memory."""
+
+    name = 'cloud'
+    firewall = True
+    machines: dict[str, Machine] = {}
+    baked: list[Image] = []
+    calls: list[tuple[Any, ...]] = []
+    up = True
+    lingering = False
+    states: list[str] = []
+
+    @classmethod
+    def configured(cls) -> bool:
+        return cls.up
+
+    def set_regions(self, regions: Sequence[str]) -> None:
+        self.calls.append(('regions', *regions))
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        raise ProviderError('not in these tests')
+
+    def describe(self, machine_id: str) -> Machine:
+        if machine_id not in self.machines:
+            raise MachineNotFound(machine_id)
+        return self.machines[machine_id]
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        self.calls.append(('find',))
+        return [one for one in self.machines.values() if tags.items() <= one.tags.items()]
+
+    def destroy(self, machine_id: str) -> None:
+        if not self.lingering:
+            self.machines.pop(machine_id, None)
+
+    def robot_address(self) -> str:
+        return '198.51.100.9/32'
+
+    def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        self.calls.append(('allow', machine_id, port, *sources))
+
+    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
+        self.calls.append(('bake', machine_id, name, dependencies))
+        self.baked.append(Image(f'img-{len(self.baked)}', name, 'cloud', 'here', time.time(), 30,
+                                'pending', dependencies))
+        return self.baked[-1].id
+
+    def images(self) -> Iterable[Image]:
+        if self.states:
+            self.baked[-1] = dataclasses.replace(self.baked[-1], state=self.states.pop(0))
+        return list(self.baked)
+
+    def delete_image(self, image_id: str) -> None:
+        if not self.lingering:
+            self.baked[:] = [image for image in self.baked if image.id != image_id]
+
+
+class Plain(Cloud):
+    """One that keeps no images and has no places."""
+
+    name = 'plain'
+    set_regions = None  # type: ignore[assignment]
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        return []
+
+    def images(self) -> Iterable[Image]:
+        raise Unsupported('no images')
+
+
+@pytest.fixture(autouse=True)
+def cloud(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Cloud]]:
+    Cloud.machines, Cloud.baked, Cloud.calls, Cloud.states = {}, [], [], []
+    Cloud.up, Cloud.lingering = True, False
+    names, load = plugin_system.names, plugin_system.load
+    known = {'cloud': Cloud, 'plain': Plain}
+    monkeypatch.setattr(plugin_system, 'names', lambda group: (
+        list(known) if group == 'fogros2.provider' else names(group)))
+    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
+        known[name] if group == 'fogros2.provider' else load(group, name)))
+    yield Cloud
+
+
+def machine(name: str, **changes: Any) -> Machine:
+    tags = {TAG_NAME: name, TAG_ROBOT: robot_name(), TAG_DEPENDENCIES: '0123456789abcdef',
+            TAG_EXPIRES: str(int(changes.pop('expires', time.time() + 3600)))}
+    made = Machine(f'id-{name}', name, 'cloud', MachineState.RUNNING, time.time() - 3600,
+                   Endpoint('ssh', '198.51.100.7', 22, 'ubuntu', 'ssh-ed25519 AAAA'),
+                   place='eu-west-1', kind='t3.medium', tags=tags,
+                   cost_per_hour=Decimal('0.0456'))
+    Cloud.machines[made.id] = dataclasses.replace(made, **changes)
+    return Cloud.machines[made.id]
+
+
+def record(name: str, *, alive: bool = False, **changes: Any) -> Record:
+    process = (os.getpid(), process_start(os.getpid()) or 0) if alive else (0, 0)
+    made = Record(name, 'cloud', MachineSpec(name, 'cloud'), machine_id=f'id-{name}',
+                  created=time.time() - 600, launch='abc123' if alive else '',
+                  pid=process[0], pid_start=process[1],
+                  shell=Endpoint('ssh', '198.51.100.7', 22, 'ubuntu', 'ssh-ed25519 BBBB',
+                                 '/keys/id_ed25519'))
+    return Store().machine(name).save(dataclasses.replace(made, **changes))
+
+
+def run(*words: str) -> Any:
+    return main(argv=['fog', *words])
+
+
+# -- which providers are asked ------------------------------------------------------------
+
+
+def test_a_provider_that_is_not_set_up_is_not_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    Cloud.up = False
+    machine('slam')
+    assert run('list') == 0
+    assert capsys.readouterr().out == 'no machines\n' and Cloud.calls == []
+    # a record of this robot's, or a region, names it all the same
+    assert run('list', '--region', 'eu-west-1') == 0
+    assert Cloud.calls == [('regions', 'eu-west-1'), ('find',)]
+    record('slam')
+    assert run('list') == 0
+    assert 'slam' in capsys.readouterr().out
+
+
+def test_what_is_not_set_up_says_so_without_being_loaded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    names, load = plugin_system.names, plugin_system.load
+    asked: list[str] = []
+
+    def loaded(group: str, name: str) -> Any:
+        asked.append(f'{group} {name}')
+        return (lambda: False) if group == 'fogros2.configured' else load(group, name)
+
+    monkeypatch.setattr(plugin_system, 'names', lambda group: (
+        ['cloud'] if group == 'fogros2.configured' else names(group)))
+    monkeypatch.setattr(plugin_system, 'load', loaded)
+    assert run('list') == 0
+    assert capsys.readouterr().out == 'no machines\n'
+    assert 'fogros2.provider cloud' not in asked and 'fogros2.configured cloud' in asked
+
+
+# -- what a user sees ---------------------------------------------------------------------
+
+
+def test_a_narrow_terminal_loses_the_least_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine('a-machine-with-a-long-name')
+    for width, missing in ((200, ()), (120, ('KIND',)), (110, ('KIND', 'PLACE')),
+                           (80, ('KIND', 'PLACE', 'ADDRESS'))):
+        monkeypatch.setattr(table, 'terminal_width', lambda width=width: width)
+        assert run('list') == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= width
+        for name in ('NAME', 'STATE', 'TIME LEFT', 'KIND', 'PLACE', 'ADDRESS'):
+            assert (name in lines[0]) == (name not in missing), (width, lines[0])
+
+
+def test_columns_that_nobody_fills_are_left_out() -> None:
+    rows = [('a', '-', 'x'), ('b', '', 'y')]
+    assert table.table(('NAME', 'KIND', 'C'), rows, optional=('KIND',)).splitlines() == [
+        'NAME  C', 'a     x', 'b     y']
+    assert table.table(('NAME', 'KIND', 'C'), rows).splitlines()[0] == 'NAME  KIND  C'
+    assert table.table(('NAME', 'C'), [('abcdef', 'x')], width=3,
+                       optional=('C',)).splitlines() == ['NAME', 'abcdef']
+
+
+def test_status_tells_place_and_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('slam')
+    assert run('status', 'slam') == 1
+    said = capsys.readouterr().out
+    assert 'eu-west-1' in said and 't3.medium' in said and '$0.0456 an hour, $0.05 so far' in said
+
+
+# -- ending -------------------------------------------------------------------------------
+
+
+def test_a_machine_that_is_still_there_was_not_deleted(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('slam')
+    record('slam')
+    Cloud.lingering = True
+    assert run('delete', 'slam', '--yes') == 1
+    assert "'slam' (id-slam) is still there: running" in capsys.readouterr().err
+    assert Store().machine('slam').exists()
+    machine('slam', state=MachineState.DELETED)
+    assert run('delete', 'slam', '--yes') == 0
+    assert not Store().machine('slam').exists()
+
+
+def test_machines_are_deleted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    together = threading.Barrier(8, timeout=20)
+    destroy = Cloud.destroy
+
+    def slow(self: Cloud, machine_id: str) -> None:
+        together.wait()
+        destroy(self, machine_id)
+
+    monkeypatch.setattr(Cloud, 'destroy', slow)
+    for number in range(8):
+        machine(f'm{number}')
+    assert run('delete', 'all', '--yes') == 0
+    assert not Cloud.machines
+
+
+@pytest.mark.parametrize(('stopped', 'ends'), [(NOW - 3600, False), (NOW - 30 * 86400, True),
+                                                (None, True)])
+def test_gc_goes_by_when_the_provider_says_it_was_stopped(
+    stopped: Optional[float], ends: bool,
+) -> None:
+    made = machine('slam', state=MachineState.STOPPED, created=NOW - 60 * 86400,
+                   stopped=stopped, expires=NOW - 59 * 86400)
+    entry = Entry('slam', 'cloud', made, None)
+    since = endings.stopped_at(made, None, Store())
+    assert bool(endings.why_end(entry, NOW, endings.KEEP_STOPPED, since)) is ends
+
+
+# -- the firewall -------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shells(monkeypatch: pytest.MonkeyPatch) -> list[Endpoint]:
+    """Return where shells were opened to; they lead nowhere."""
+    opened: list[Endpoint] = []
+
+    def connect(to: Endpoint, **_: Any) -> FakeShell:
+        opened.append(to)
+        Cloud.calls.append(('connect', to.host))
+        return FakeShell()
+
+    monkeypatch.setattr(reach.shells, 'connect', connect)
+    return opened
+
+
+def test_a_session_lets_this_robot_in_and_closes_again(shells: list[Endpoint]) -> None:
+    machine('slam')
+    record('slam')
+    assert run('connect', 'slam') == 0
+    assert Cloud.calls == [('allow', 'id-slam', 22, '198.51.100.9/32'),
+                           ('connect', '198.51.100.7'), ('allow', 'id-slam', 22)]
+    # the key that the record has: the machine has made it after the provider's one-time key
+    assert shells[0].host_key == 'ssh-ed25519 BBBB' and shells[0].key_file == '/keys/id_ed25519'
+    assert run('connect', 'slam', '--user', 'root', '--', 'true') == 0
+    assert shells[1].user == 'root'
+
+
+def test_a_session_without_a_store(shells: list[Endpoint]) -> None:
+    machine('slam')
+    assert run('connect', 'slam') == 0
+    assert shells[0].host_key == 'ssh-ed25519 AAAA' and shells[0].key_file is None
+
+
+def test_a_session_leaves_the_door_open_for_a_launch(
+    shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine('slam')
+    record('slam', alive=True)
+    assert run('connect', 'slam') == 0
+    assert [call[0] for call in Cloud.calls] == ['allow', 'connect']
+
+
+def test_a_session_goes_through_the_vpn_while_there_is_one(shells: list[Endpoint]) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        port = server.getsockname()[1]
+        machine('slam', shell=Endpoint('ssh', '198.51.100.7', port, 'ubuntu'))
+        record('slam', alive=True, vpn=VpnInterface('fog', '127.0.0.1', '127.0.0.0/8', 1, ''),
+               shell=Endpoint('ssh', '198.51.100.7', port, 'ubuntu', 'ssh-ed25519 BBBB'))
+        assert run('connect', 'slam') == 0
+    assert [call[0] for call in Cloud.calls] == ['connect']
+    assert shells[0].host == '127.0.0.1' and shells[0].host_key == 'ssh-ed25519 BBBB'
+    # it answers no more: the way round, through the firewall
+    assert run('connect', 'slam') == 0
+    assert shells[1].host == '198.51.100.7'
+
+
+def test_no_firewall_no_rule(shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Cloud, 'firewall', False)
+    machine('slam')
+    assert run('connect', 'slam') == 0
+    assert [call[0] for call in Cloud.calls if call[0] != 'find'] == ['connect']
+
+
+# -- images -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, 'LOOK', 0.01)
+
+
+def test_an_image_is_made_and_waited_for(
+    quick: None, capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('slam')
+    Cloud.states = ['pending', 'pending', 'available']
+    assert run('image', 'slam', '--dry-run') == 0
+    assert 'would make an image of slam: cloud id-slam, running' in capsys.readouterr().err
+    assert not Cloud.baked
+    assert run('image', 'slam') == 0
+    (_, machine_id, name, dependencies), = [c for c in Cloud.calls if c[0] == 'bake']
+    assert machine_id == 'id-slam' and dependencies == '0123456789abcdef'
+    assert name.startswith('slam-image-20')
+    said = capsys.readouterr()
+    assert said.out == f'made {name} (img-0)\n'
+    # into a file: each state once
+    assert said.err.splitlines()[1:] == [f'{name}: pending', f'{name}: available']
+
+
+def test_an_image_that_fails(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
+    machine('slam')
+    Cloud.states = ['pending', 'failed']
+    assert run('image', 'slam', '--image-name', 'mine') == 1
+    assert "the image 'mine' (img-0) is failed" in capsys.readouterr().err
+
+
+def test_an_image_that_is_not_known_by_what_it_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('slam', tags={TAG_NAME: 'slam', TAG_ROBOT: robot_name()})
+    assert run('image', 'slam', '--no-wait', '--json') == 0
+    said = capsys.readouterr()
+    assert 'no launch takes the image by itself' in said.err
+    assert json.loads(said.out)['id'] == 'img-0'
+
+
+def test_no_image_of_what_does_not_run(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('slam', state=MachineState.PENDING)
+    assert 'it is pending' in str(run('image', 'slam'))
+    assert 'there is no machine' in str(run('image', 'nowhere'))
+    assert not Cloud.baked
+
+
+def test_waiting_for_an_image_ends(quick: None) -> None:
+    machine('slam')
+    baking = images.bake(Entry('slam', 'cloud', Cloud.machines['id-slam']), 'mine')
+    with pytest.raises(DeadlineExceeded, match="the image 'mine'"):
+        images.wait(baking, timeout=0.2)
+    Cloud.baked.clear()
+    with pytest.raises(DeadlineExceeded):
+        images.wait(baking, timeout=0.2)
+
+
+def test_images_are_listed_and_deleted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('image', 'list') == 0
+    assert capsys.readouterr().out == 'no images\n'
+    for name in ('one', 'two', 'two'):
+        Cloud.baked.append(Image(f'img-{len(Cloud.baked)}', name, 'cloud', 'eu-west-1',
+                                 time.time() - 7200, 30, 'available', 'abcd'))
+    assert run('image', 'list') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ['NAME', 'IMAGE', 'PROVIDER', 'PLACE', 'STATE', 'AGE', 'SIZE',
+                                'DEPENDENCIES']
+    assert lines[1].split() == ['one', 'img-0', 'cloud', 'eu-west-1', 'available', '2', 'h', '00',
+                                'min', '30', 'GB', 'abcd']
+    assert run('image', 'list', '--json') == 0
+    assert [i['id'] for i in json.loads(capsys.readouterr().out)] == ['img-0', 'img-1', 'img-2']
+    assert run('image', 'delete', 'two', '--dry-run') == 0
+    assert capsys.readouterr().out.count('would delete two') == 2
+    assert run('image', 'delete', 'two') == 1
+    assert 'nobody is here to ask' in capsys.readouterr().err
+    assert run('image', 'delete', 'two', 'img-0', '--yes') == 0
+    assert not Cloud.baked
+    assert 'there is no image two' in str(run('image', 'delete', 'two', '--yes'))
+
+
+def test_an_image_that_is_still_there_was_not_deleted(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Cloud.baked.append(Image('img-0', 'one', 'cloud'))
+    Cloud.lingering = True
+    assert run('image', 'delete', 'one', '--yes') == 1
+    assert 'img-0 is still there' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('words', [('list', 'x'), ('delete',), ('a', 'b', '--image-name', 'c')])
+def test_image_with_wrong_words(words: tuple[str, ...]) -> None:
+    assert run('image', *words) not in (0, None)
+
+
+# -- prices and regions -------------------------------------------------------------------
+
+
+@pytest.fixture
+def market(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offer two types in two regions."""
+    kinds = [InstanceType('g6.2xlarge', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4', 22.4, True),
+             InstanceType('m6i.2xlarge', 8, 4, 32.0, 'x86_64', 'Intel', spot=True)]
+    dollars = {'g6.2xlarge': Decimal('9.4'), 'm6i.2xlarge': Decimal('10.46')}
+
+    def prices_of(self: prices.Market, region: str) -> dict[str, Decimal]:
+        if region == 'me-south-1':
+            raise ProviderError('not enabled')
+        more = Decimal('0.5') if region == 'eu-west-1' else Decimal(0)
+        return {name: price + more for name, price in dollars.items()}
+
+    monkeypatch.setattr(prices.Market, 'types', lambda self, region: kinds)
+    monkeypatch.setattr(prices.Market, 'zones', lambda self, region: {
+        kind.name: [f'{region}a'] for kind in kinds})
+    monkeypatch.setattr(prices.Market, 'prices', prices_of)
+    monkeypatch.setattr(prices.Market, 'spot', lambda self, region, names=None: {
+        'm6i.2xlarge': {f'{region}a': Decimal('0.1')}})
+    monkeypatch.setattr(choices, 'enabled_regions', lambda account=None: [
+        'eu-west-1', 'me-south-1', 'us-west-1'])
+    monkeypatch.setenv('AWS_REGION', 'eu-west-1')
+
+
+def test_prices(market: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('price', '--min-cpu', '8', '--min-memory', '32', '--arch', 'x86_64') == 0
+    assert capsys.readouterr().out.splitlines() == [
+        '8 CPUs, 32 GB, x86_64, in eu-west-1',
+        'TYPE         REGION     CPUS  MEMORY  GPU                    ARCH    CPU    PRICE/H  '
+        ' SPOT/H',
+        'g6.2xlarge   eu-west-1  8     32 GB   1 x NVIDIA L4 22.4 GB  x86_64  AMD    $9.9000  '
+        ' -',
+        'm6i.2xlarge  eu-west-1  8     32 GB   -                      x86_64  Intel  $10.9600 '
+        ' $0.1000']
+    assert run('price', '--spot', '--arch', 'x86_64', '--json') == 0
+    (only,) = json.loads(capsys.readouterr().out)
+    assert only['type'] == 'm6i.2xlarge' and only['spot_price'] == '0.1'
+
+
+def test_prices_of_all_regions(market: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run('price', '--region', 'all', '--arch', 'any', '--limit', '1') == 0
+    said = capsys.readouterr()
+    assert said.err == 'me-south-1: not enabled\n'
+    lines = said.out.splitlines()
+    assert lines[0] == '2 CPUs, 4 GB, in eu-west-1, me-south-1, us-west-1'
+    assert lines[2].split()[:2] == ['g6.2xlarge', 'us-west-1']
+    assert lines[3] == '3 more cost as much or more (--limit 0)'
+    assert run('price', '--gpu', '--max-price', '5', '--arch', 'x86_64') not in (0, None)
+
+
+def test_regions(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(regions, 'measure', lambda names, connect: [
+        Latency('us-west-1', 'San Francisco', 12.34), Latency('eu-west-1', 'Dublin', None)])
+    assert run('regions') == 0
+    assert capsys.readouterr().out.splitlines() == [
+        'REGION     PLACE          MEDIAN', 'us-west-1  San Francisco  12 ms',
+        'eu-west-1  Dublin         no answer']
+    assert run('regions', 'us-west-1', 'eu-west-1', '--json') == 0
+    assert json.loads(capsys.readouterr().out)[0] == {
+        'region': 'us-west-1', 'place': 'San Francisco', 'median_ms': 12.34, 'distance_km': None}
+    assert 'AWS has no region mars-1' in str(run('regions', 'mars-1'))
+
+
+def test_regions_by_distance(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(regions, 'measure', lambda names, connect: [
+        Latency(name, '') for name in names])
+    monkeypatch.setattr(regions, 'geolocate', lambda: (37.8, -122.3))
+    assert run('regions') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ['us-west-1', 'San', 'Francisco', '9', 'km']
+    assert lines[-1].startswith('no region answers')
+
+
+# -- doctor -------------------------------------------------------------------------------
+
+
+def test_doctor_asks_a_provider_that_is_set_up() -> None:
+    machine('slam')
+    assert doctor.provider('cloud') == doctor.Check(
+        "provider 'cloud'", 'ok', 'answers, 1 machine')
+    Cloud.up = False
+    Cloud.calls.clear()
+    assert doctor.provider('cloud').detail == 'not set up here' and not Cloud.calls
+    assert doctor.provider('cloud', needed=True).detail == 'answers, 1 machine'
+
+
+def test_doctor_tells_what_a_provider_says_against_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Cloud) -> str:
+        raise ProviderError('the token has expired', 'log in again')
+
+    monkeypatch.setattr(Cloud, 'answers', refuse)
+    assert doctor.provider('cloud') == doctor.Check(
+        "provider 'cloud'", 'warning', 'the token has expired', 'log in again')
+    assert doctor.provider('cloud', needed=True).verdict == 'failed'
+
+
+def test_doctor_waits_for_no_provider(monkeypatch: pytest.MonkeyPatch) -> None:
+    over = threading.Event()
+    monkeypatch.setattr(Cloud, 'answers', lambda self: str(over.wait(30)))
+    begin = time.monotonic()
+    assert 'no answer within 0.1 s' in doctor.provider('cloud', patience=0.1).detail
+    assert time.monotonic() - begin < 5
+    over.set()
