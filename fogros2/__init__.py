@@ -12,40 +12,70 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fogros2.actions.choices import (
+        find_cheapest,
+        find_cheapest_ec2_instance_type,
+        find_nearest_aws_region,
+    )
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.cloud_node import CloudNode
+    from fogros2.actions.interruption import MachineInterrupted
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.machines import CloudInstance, ContainerInstance, SSHInstance
+    from fogros2.actions.machines_cloud import AWSCloudInstance, KubeInstance
     from fogros2.errors import FogError
     from fogros2.image_transport.streams import StreamTopic
 
 __all__ = [
+    'AWSCloudInstance',
     'CloudGroup',
     'CloudInstance',
     'CloudNode',
     'ContainerInstance',
     'FogError',
     'FogROSLaunchDescription',
+    'KubeInstance',
+    'MachineInterrupted',
     'SSHInstance',
     'StreamTopic',
+    'ec2_instance_type_selection',
+    'find_cheapest',
+    'find_cheapest_ec2_instance_type',
+    'find_nearest_aws_region',
+    'region_ami_selection',
 ]
 
 _MODULES = {
+    'AWSCloudInstance': 'fogros2.actions.machines_cloud',
     'CloudGroup': 'fogros2.actions.cloud_group',
     'CloudInstance': 'fogros2.actions.machines',
     'CloudNode': 'fogros2.actions.cloud_node',
     'ContainerInstance': 'fogros2.actions.machines',
     'FogError': 'fogros2.errors',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
+    'KubeInstance': 'fogros2.actions.machines_cloud',
+    'MachineInterrupted': 'fogros2.actions.interruption',
     'SSHInstance': 'fogros2.actions.machines',
     'StreamTopic': 'fogros2.image_transport.streams',
+    'find_cheapest': 'fogros2.actions.choices',
+    'find_cheapest_ec2_instance_type': 'fogros2.actions.choices',
+    'find_nearest_aws_region': 'fogros2.actions.choices',
+}
+
+#: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
+_FORMERLY_UTILS = {
+    'ec2_instance_type_selection': 'fogros2.actions.choices',
+    'region_ami_selection': 'fogros2.actions.choices',
 }
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULES:
+    if name in _FORMERLY_UTILS:
+        value = importlib.import_module(_FORMERLY_UTILS[name])
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(importlib.import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 

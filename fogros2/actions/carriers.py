@@ -48,6 +48,8 @@ class RobotCarrier(Carrier):
 
     def __init__(self, spec: NodeSpec, up: asyncio.Future[bool]) -> None:
         super().__init__(spec)
+        #: The id of what it carries out.
+        self.node = spec.id
         self._up = up
 
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:

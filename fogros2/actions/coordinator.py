@@ -14,6 +14,7 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import difflib
+import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -29,10 +30,12 @@ from launch.event_handlers import OnShutdown
 from launch.events.process import ShutdownProcess
 import launch.logging
 
-from fogros2.actions import private, signals, streaming
+from fogros2.actions import cost, private, signals, streaming
+from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.console import Console
+from fogros2.actions.interruption import MachineInterrupted
 from fogros2.actions.session import Session
-from fogros2.errors import Cancelled, ConfigurationError, FogError
+from fogros2.errors import Cancelled, ConfigurationError, FogError, ProviderError
 
 if TYPE_CHECKING:
     from fogros2.actions.machines import CloudInstance
@@ -115,6 +118,10 @@ class Coordinator:
             EventHandler(
                 matcher=lambda event: isinstance(event, Failed),
                 entities=OpaqueFunction(function=self._on_failed)),
+            # handlers that come later are asked earlier: those of launch files
+            EventHandler(
+                matcher=lambda event: isinstance(event, MachineInterrupted),
+                entities=OpaqueFunction(function=self._on_interrupted)),
             OnShutdown(on_shutdown=self._on_shutdown),
         ):
             context.register_event_handler(handler)
@@ -171,13 +178,13 @@ class Coordinator:
         if session is None:
             session = Session(
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
-                changed=self._open_gate)
+                changed=self._open_gate, taken_away=self._taken_away)
             self._sessions[spec.name] = session
             self._new.append(session)
             self.launch.expect([spec.name])
             self._set_dds_environment()
             self.begin()
-        elif session.spec != spec:
+        elif session.asked != spec:
             raise ConfigurationError(f"two machines of this launch are called '{spec.name}'",
                                      'give each a name= of its own')
         session.add(machine)
@@ -277,6 +284,7 @@ class Coordinator:
 
     async def _bring_up(self, sessions: list[Session]) -> None:
         try:
+            await asyncio.gather(*(session.choose() for session in sessions))
             await self._in_thread(
                 self.launch.prepare, [session.spec for session in sessions],
                 {session.spec.name: session.programs for session in sessions})
@@ -306,6 +314,31 @@ class Coordinator:
             return
         if not self._new and all(session.ready for session in self._sessions.values()):
             self.gate.set_result(True)
+
+    # -- a machine is taken away ----------------------------------------------------------------
+
+    def _taken_away(self, session: Session, reason: str) -> None:
+        if not self._context.is_shutdown:
+            self._context.emit_event_sync(
+                MachineInterrupted(session.spec.name, reason, session.lost))
+
+    def _on_interrupted(self, context: LaunchContext) -> None:
+        event: MachineInterrupted = context.locals.event
+        session = self._sessions.get(event.machine)
+        if session is None or context.is_shutdown:
+            return
+        what = (f"the machine '{event.machine}' "
+                f'{"is gone" if event.lost else "is being taken away"}: {event.reason}')
+        if session.spec.on_interrupt == 'robot':
+            self._logger.warning(f'{what}; its nodes go on on the robot')
+            for carrier in self._streams.remove(event.machine):
+                context.emit_event_sync(ShutdownProcess(
+                    process_matcher=functools.partial(_carries, carrier)))
+            session.move_all()
+            return
+        if session.lost:
+            session.end_all()
+        raise ProviderError(what, "on_interrupt='robot' would have its nodes go on on the robot")
 
     # -- going down -----------------------------------------------------------------------------
 
@@ -339,6 +372,8 @@ class Coordinator:
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)
+        for line in cost.lines(self.launch.cost()):
+            self._logger.info(line)
 
     def _taken_down(self, task: asyncio.Task[None]) -> None:
         self._raise_in_launch(task)
@@ -378,6 +413,10 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
     waits = {future for future in futures if future is not None}
     if waits:
         await asyncio.wait(waits)
+
+
+def _carries(node: str, action: ExecuteLocal) -> bool:
+    return isinstance(action, RobotCarrier) and action.node == node
 
 
 def _nothing() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import re
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
-from fogros2.actions import words
+from fogros2.actions import names, words
 from fogros2.errors import ConfigurationError
 from fogros2.model import (
     Bootstrap,
@@ -19,6 +19,7 @@ from fogros2.model import (
     DEFAULT_ROBOT_TIMEOUT,
     MachineSpec,
     OnExit,
+    OnInterrupt,
 )
 from fogros2.store import check_name
 
@@ -54,6 +55,8 @@ class CloudInstance:
         seconds or as above.
     :param bootstrap: how ROS 2 gets there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine.
+    :param on_interrupt: when the provider takes the machine away while its nodes run: 'shutdown'
+        ends the launch, with an exit status other than zero; 'robot' runs them on the robot.
     :param options: the provider's own settings, for subclasses to give.
     :raises ConfigurationError: an unknown keyword (with the nearest one), or a wrong value.
     """
@@ -70,6 +73,7 @@ class CloudInstance:
         robot_timeout: Value = DEFAULT_ROBOT_TIMEOUT,
         bootstrap: SomeSubstitutionsType = 'auto',
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        on_interrupt: SomeSubstitutionsType = 'shutdown',
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -78,14 +82,14 @@ class CloudInstance:
         if not self.provider:
             raise ConfigurationError(
                 f'{type(self).__name__} is no machine yet',
-                'use one of its kinds, such as ContainerInstance or SSHInstance')
+                'use one of its kinds, such as ContainerInstance or AWSCloudInstance')
         self._made_up = name is None
-        self._name = _two_words() if name is None else name
+        self._name = names.two_words() if name is None else name
         self._workspace = ros_workspace
         self._working_dir_base = working_dir_base
         self._values: dict[str, Any] = {
             'on_exit': on_exit, 'lifetime': lifetime, 'robot_timeout': robot_timeout,
-            'bootstrap': bootstrap,
+            'bootstrap': bootstrap, 'on_interrupt': on_interrupt,
         }
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
@@ -187,7 +191,8 @@ class CloudInstance:
                 name=check_name(name),
                 provider=self.provider,
                 options={
-                    key: words.resolve(context, value) for key, value in self._options.items()},
+                    key: words.resolve_later(context, value)
+                    for key, value in self._options.items()},
                 workspace=workspace or None,
                 environment={
                     key: words.resolve(context, value)
@@ -196,6 +201,13 @@ class CloudInstance:
                 launch_foxglove=self._foxglove,
                 **values)
         return self._spec
+
+    def _option(self, name: str) -> Any:
+        """Return an option: as it was resolved, or what is to be read of it until then."""
+        if self._running is not None:
+            return self._running.spec.options.get(name)
+        value = (self._spec.options if self._spec else self._options).get(name)
+        return words.plain(value)
 
 
 class ContainerInstance(CloudInstance):
@@ -320,23 +332,7 @@ def _choice(kind: Any) -> Any:
 _CHECKS: dict[str, Any] = {
     'on_exit': _choice(OnExit),
     'bootstrap': _choice(Bootstrap),
+    'on_interrupt': _choice(OnInterrupt),
     'lifetime': parse_duration,
     'robot_timeout': parse_duration,
 }
-
-_ADJECTIVES = (
-    'amber', 'bold', 'brisk', 'calm', 'clear', 'cloudy', 'crisp', 'dewy', 'early', 'fresh',
-    'gentle', 'golden', 'hazy', 'keen', 'light', 'lofty', 'lucid', 'mellow', 'misty', 'nimble',
-    'quiet', 'rapid', 'rosy', 'silver', 'steady', 'still', 'sunny', 'swift', 'tidy', 'vivid',
-    'warm', 'windy')
-_NOUNS = (
-    'badger', 'beaver', 'bison', 'crane', 'curlew', 'dipper', 'eagle', 'egret', 'falcon',
-    'finch', 'gannet', 'heron', 'ibex', 'kestrel', 'lark', 'lynx', 'marten', 'merlin', 'osprey',
-    'otter', 'petrel', 'plover', 'puffin', 'raven', 'robin', 'sable', 'seal', 'skylark', 'swift',
-    'tern', 'walrus', 'wren')
-
-
-def _two_words() -> str:
-    first, second, *number = os.urandom(4)
-    return (f'{_ADJECTIVES[first % len(_ADJECTIVES)]}-{_NOUNS[second % len(_NOUNS)]}-'
-            f'{bytes(number).hex()}')

@@ -12,7 +12,7 @@ from typing import Optional
 from launch import LaunchContext, Substitution
 from launch.actions import ExecuteLocal
 from launch.conditions import evaluate_condition_expression
-from launch.substitutions import FindExecutable
+from launch.substitutions import FindExecutable, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.substitutions import ExecutableInPackage
 
@@ -35,8 +35,12 @@ LOCAL_VARIABLES = frozenset({
 class ProgramName(Substitution):
     """Stands for a program that is looked up where it will run, so here it is just a name."""
 
-    def __init__(self, name: list[Substitution], package: list[Substitution]) -> None:
+    def __init__(
+        self, name: list[Substitution], package: list[Substitution], here: Substitution,
+    ) -> None:
         super().__init__()
+        #: What looks it up on the robot.
+        self.here = here
         self.name = name
         self.package = package
 
@@ -54,9 +58,31 @@ def use_names_of_programs(action: ExecuteLocal) -> None:
     for word in action.process_description.cmd:
         for index, part in enumerate(word):
             if isinstance(part, ExecutableInPackage):
-                word[index] = ProgramName(part.executable, part.package)
+                word[index] = ProgramName(part.executable, part.package, part)
             elif isinstance(part, FindExecutable):
-                word[index] = ProgramName(normalize_to_list_of_substitutions(part.name), [])
+                word[index] = ProgramName(normalize_to_list_of_substitutions(part.name), [], part)
+
+
+def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
+    """
+    Return the command of a prepared action as it is on the robot.
+
+    :raises ConfigurationError: the robot lacks the program.
+    """
+    description = action.process_description
+    command = list(description.final_cmd or ())
+    first = len(command) - len(description.cmd)  # launch puts a prefix's words before
+    for index, word in enumerate(description.cmd, first):
+        if any(isinstance(part, ProgramName) for part in word):
+            try:
+                command[index] = perform_substitutions(context, [
+                    part.here if isinstance(part, ProgramName) else part for part in word])
+            except (LookupError, SubstitutionFailure) as error:
+                raise ConfigurationError(
+                    f"{description.final_name} can't run on the robot, as on_interrupt='robot' "
+                    f'wants it to: {error}',
+                    "install it here too, or say on_interrupt='shutdown'") from error
+    return command
 
 
 def from_action(

@@ -59,6 +59,13 @@ def prefix_output(action: ExecuteLocal, machine: str) -> None:
     vars(action)['_ExecuteLocal__output_format'] = before.replace(name, f'{machine}.{name}')
 
 
+def unprefix_output(action: ExecuteLocal, machine: str) -> None:
+    """Take the machine's name away again."""
+    name = '{this.process_description.final_name}'
+    before: str = _private(action, 'output_format')
+    vars(action)['_ExecuteLocal__output_format'] = before.replace(f'{machine}.{name}', name)
+
+
 def _private(action: ExecuteLocal, name: str) -> Any:
     return getattr(action, f'_ExecuteLocal__{name}')
 

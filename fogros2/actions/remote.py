@@ -3,30 +3,23 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
-import signal
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Optional, TYPE_CHECKING, Union
 
 from launch import LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 from launch.event_handlers import OnProcessIO
-from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
-import launch.logging
 
 from fogros2.actions import carriers, node_spec, private
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
+from fogros2.actions.remote_run import RemoteRun
 from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
 
 if TYPE_CHECKING:
     from fogros2.actions.session import Session
     from fogros2.image_transport.streams import Entry
-
-#: Seconds beyond a process's own time-outs that its machine has to report the end of it.
-GRACE = 10.0
-
 
 class RemoteProcess(ExecuteLocal):
     """
@@ -41,6 +34,10 @@ class RemoteProcess(ExecuteLocal):
     _fogros2_streams: Sequence[Entry] = ()
     _fogros2_session: Session
     _fogros2_node: NodeSpec
+    #: The command on the robot, where it may have to go on.
+    _fogros2_command: Optional[list[str]] = None
+    #: Whether the process is on the robot: its machine was taken away.
+    _fogros2_here = False
 
     @property
     def machine(self) -> Union[CloudInstance, str]:
@@ -56,6 +53,8 @@ class RemoteProcess(ExecuteLocal):
         private.prefix_output(self, session.spec.name)
         self._fogros2_node = node_spec.from_action(
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id)
+        if session.spec.on_interrupt == 'robot' and not isinstance(self, carriers.Carrier):
+            self._fogros2_command = node_spec.robot_command(self, context)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action: its process is started as soon as its machine is up."""
@@ -72,9 +71,9 @@ class RemoteProcess(ExecuteLocal):
 
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return the processes that carry the streams asked for here and nowhere before."""
-        if isinstance(self, carriers.Carrier):
-            return []
         session = self._fogros2_session
+        if isinstance(self, carriers.Carrier) or session.interrupted:
+            return []
         found: list[ExecuteLocal] = []
         for machine, spec in Coordinator.of(context).stream(self._fogros2_streams, session):
             if machine is None:
@@ -84,150 +83,37 @@ class RemoteProcess(ExecuteLocal):
                 send(found[-1], self._fogros2_machine)
         return found
 
+    @property
+    def can_come_here(self) -> bool:
+        """Whether the process can go on here, on the robot."""
+        return self._fogros2_command is not None
+
+    def come_here(self, context: LaunchContext) -> None:
+        """Start the process here, as launch starts any; its machine has it no longer."""
+        assert self.process_details is not None and self._fogros2_command is not None
+        self._fogros2_here = True
+        self.process_details.pop('pid', None)
+        self.process_details['cmd'] = self._fogros2_command
+        private.unprefix_output(self, self._fogros2_session.spec.name)
+        private.set_transport(self, None)
+        context.asyncio_loop.create_task(private.execute_process(self)(context))
+
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
         """Do nothing: the session starts the process and hands over what happens to it."""
+        if self._fogros2_here:
+            await getattr(super(), private.EXECUTE_PROCESS)(context)
 
     def _shutdown_process(
         self, context: LaunchContext, *, send_sigint: bool,
     ) -> Optional[list[LaunchDescriptionEntity]]:
+        if self._fogros2_here:
+            return super()._shutdown_process(context, send_sigint=send_sigint)
         # launch leaves SIGINT to the terminal where that sends it to the nodes too; not here.
         # The machine itself goes on to SIGTERM and SIGKILL, so a lost link can't keep it from it
         run: Optional[RemoteRun] = private.transport(self)
         if run is not None:
             run.stop()
         return None
-
-
-class RemoteRun:
-    """
-    One process on a machine, from its execution to its end.
-
-    To launch's ExecuteLocal it is the subprocess's transport and protocol in one.
-    """
-
-    def __init__(
-        self, action: ExecuteLocal, context: LaunchContext, session: Session, node: NodeSpec,
-        completed: asyncio.Future[None],
-    ) -> None:
-        self.node = node
-        self.action = action
-        self.complete = completed
-        self.started = False
-        self.stopping = False
-        #: It exited, and its machine will start it again.
-        self.respawning = False
-        self._context = context
-        self._session = session
-        self._details: dict[str, Any] = dict(action.process_details or {})
-        self._returncode: Optional[int] = None
-        self._logger = launch.logging.get_logger(f'{session.spec.name}.{node.name}')
-        if private.options(action).log_cmd:
-            self._logger.info(f"process details: cmd='{' '.join(self._details['cmd'])}'")
-
-    # -- what launch asks of a transport --------------------------------------------------------
-
-    def get_pid(self) -> Optional[int]:
-        """Return the process's id on its machine, None before it started."""
-        return self._details.get('pid')
-
-    def get_returncode(self) -> Optional[int]:
-        """Return the exit status, None while there is none."""
-        return self._returncode
-
-    def send_signal(self, number: Union[int, str]) -> None:
-        """Send the process a signal, by its number or its name."""
-        name = number if isinstance(number, str) else signal.Signals(number).name
-        if self.started:
-            self._session.signal(self, name)
-        else:
-            self._logger.warning(f"'{name}' not sent: the process hasn't started yet")
-
-    def kill(self) -> None:
-        """End the process at once."""
-        self.send_signal(signal.SIGKILL)
-
-    def close(self) -> None:
-        """Let go of the process; nothing is held here."""
-
-    # -- ending ---------------------------------------------------------------------------------
-
-    def stop(self) -> None:
-        """End the process in order: SIGINT, SIGTERM and SIGKILL as its time-outs say."""
-        if self.complete.done() or self.stopping:
-            return
-        self.stopping = True
-        if not self._session.stop(self) or self.respawning:
-            # nothing runs, so there is no end of it to be reported
-            self.end()
-            return
-        patience = self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
-        self._context.asyncio_loop.call_later(patience, self.give_up)
-
-    def give_up(self) -> None:
-        """Stop waiting for a process that should have ended long ago."""
-        if not self.complete.done():
-            self._logger.error(
-                f"machine '{self._session.spec.name}' doesn't say that the process ended; "
-                f'its agent will end it')
-            self.end()
-
-    def end(self) -> None:
-        """Tell launch that nothing more will happen."""
-        if not self.complete.done():
-            self.complete.set_result(None)
-        self._session.forget(self)
-
-    # -- what the agent says --------------------------------------------------------------------
-
-    def on_event(self, event: dict[str, Any]) -> None:
-        """Turn an event of the agent into launch's."""
-        handler = getattr(self, f"_on_{event['event']}", None)
-        if handler is not None and not self.complete.done():
-            handler(event)
-
-    def _on_started(self, event: dict[str, Any]) -> None:
-        self.started = True
-        self.respawning = False
-        details = self.action.process_details
-        assert details is not None
-        details['pid'] = event['pid']
-        if event.get('cmd'):
-            details['cmd'] = list(event['cmd'])
-        self._details = dict(details)
-        self._logger.info(f"process started with pid [{event['pid']}]")
-        self._context.emit_event_sync(ProcessStarted(**self._details))
-        if self.stopping:
-            self._session.stop(self)
-
-    def _on_output(self, event: dict[str, Any]) -> None:
-        kind = ProcessStderr if event.get('stream') == 'stderr' else ProcessStdout
-        self._details.setdefault('pid', 0)
-        self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))
-
-    def _on_exited(self, event: dict[str, Any]) -> None:
-        self._returncode = event['returncode']
-        self._details.setdefault('pid', 0)
-        pid = self._details['pid']
-        if self._returncode == 0:
-            self._logger.info(f'process has finished cleanly [pid {pid}]')
-        else:
-            command = ' '.join(word for word in self._details['cmd'] if word)
-            self._logger.error(
-                f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
-        self._context.emit_event_sync(
-            ProcessExited(returncode=self._returncode, **self._details))
-        self.respawning = bool(event.get('respawns'))
-        if not self.respawning or self.stopping:
-            self.end()
-
-    def _on_refused(self, event: dict[str, Any]) -> None:
-        hint = f" ({event['hint']})" if event.get('hint') else ''
-        self._logger.error(f"process can't be started: {event['error']}{hint}")
-        self.end()
-
-    def on_stdin(self, event: object) -> None:
-        """Refuse input: there is no way for it to the machine."""
-        self._logger.error('a process on a machine takes no input from launch')
 
 
 def send(

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+import dataclasses
 import functools
 import logging
 from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 
 import launch.logging
 
-from fogros2.actions import streaming
+from fogros2.actions import streaming, words
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec, NodeSpec
 
@@ -24,6 +25,7 @@ T = TypeVar('T')
 #: Events of the agent that concern the machine, not one process: level and how they read.
 _NOTICES = {
     'watchdog': (logging.ERROR, 'the agent ends everything: {reason}'),
+    'ending': (logging.WARNING, 'the agent was asked to end: {reason}'),
     'end_failed': (logging.ERROR, 'the machine would not end: exit status {returncode}'),
     'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
     'launch_exited': (
@@ -40,6 +42,10 @@ _SAID: dict[str, dict[str, type]] = {
 }
 #: Exit status of processes whose end nobody saw.
 _UNSEEN = -9
+#: Events after which processes end because their machine does; those that are on their way to the
+#: robot wait so many seconds for the news that it is gone.
+_LAST_EVENTS = ('watchdog', 'ending')
+_HOLD = 60.0
 
 
 class Run(Protocol):
@@ -55,6 +61,9 @@ class Run(Protocol):
     def end(self) -> None:
         """Take it that nothing more will happen."""
 
+    def move(self, *, stop: bool) -> None:
+        """Go on on the robot, once the machine has ended it if it has to ``stop`` it."""
+
 
 class Session:
     """
@@ -63,13 +72,18 @@ class Session:
     :param in_thread: runs a blocking function in a thread.
     :param fail: ends the launch because of an error.
     :param changed: is called when the machine came up or a process started or ended.
+    :param taken_away: is called with the session and a reason when the provider takes the machine
+        away, or has.
     """
 
     def __init__(
         self, spec: MachineSpec, loop: asyncio.AbstractEventLoop, *,
         in_thread: Callable[..., asyncio.Future[Any]],
         fail: Callable[[BaseException], None], changed: Callable[[], None],
+        taken_away: Callable[[Session, str], None],
     ) -> None:
+        #: As the launch file has it; what takes a while to know is open in it.
+        self.asked = spec
         self.spec = spec
         #: What launch files have for the machine; told when it is up.
         self.instances: list[CloudInstance] = []
@@ -83,6 +97,13 @@ class Session:
         self._in_thread = in_thread
         self._fail = fail
         self._changed = changed
+        self._taken_away = taken_away
+        #: The provider takes the machine away; it may still run.
+        self.interrupted = False
+        #: It is gone.
+        self.lost = False
+        self._ending = False
+        self._held: list[tuple[Run, dict[str, Any]]] = []
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
@@ -133,13 +154,16 @@ class Session:
     def submit(self, run: Run) -> None:
         """Start a process as soon as the machine is up."""
         self._runs[run.node.id] = run
+        if self.interrupted:
+            run.move(stop=False)
+            return
         self._waiting.append(run)
         if self.running is not None:
             self._request(self._start_waiting)
 
     def stop(self, run: Run) -> bool:
         """End a process there; False if it isn't there yet and now never will be."""
-        if run in self._waiting or self.running is None:
+        if run in self._waiting or self.running is None or self.lost:
             if run in self._waiting:
                 self._waiting.remove(run)
             return False
@@ -158,6 +182,16 @@ class Session:
         self._changed()
 
     # -- the machine ----------------------------------------------------------------------------
+
+    async def choose(self) -> None:
+        """
+        Ask for what of the machine takes a while to know.
+
+        :raises FogError: it can't be had.
+        """
+        if any(callable(value) for value in self.asked.options.values()):
+            options = await self._in_thread(words.answered, self.asked.options)
+            self.spec = dataclasses.replace(self.asked, options=options)
 
     def up(self, running: RunningMachine) -> None:
         """Take it that the machine is up: what waited for it starts."""
@@ -234,17 +268,55 @@ class Session:
             return
         run = self._runs.get(event.get('node', ''))
         if run is not None:
+            if event['event'] == 'exited' and self._ending and not run.stopping:
+                self._held.append((run, event))
+                return
             run.on_event(event)
             if event['event'] == 'started':
                 self._changed()
+            return
+        if event['event'] in ('notice', 'lost'):
+            self._interrupted(event['event'] == 'lost', str(event.get('reason') or 'no reason'))
             return
         what = ' '.join([event['event'], *([event['state']] if 'state' in event else [])])
         if what in _NOTICES:
             level, text = _NOTICES[what]
             # an agent of another version may say less
             self._logger.log(level, f'{self.spec.name}: ' + text.format_map(_Told(event)))
-        if what in ('launch_exited', 'connection absent'):
+        if what in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
+            self._ending = True
+            self._loop.call_later(_HOLD, self._let_go)
+        elif what in ('launch_exited', 'connection absent') and not self._ending:
             self._end_unseen(event.get('returncode', _UNSEEN))
+
+    def _interrupted(self, lost: bool, reason: str) -> None:
+        first = not self.interrupted
+        self.interrupted, self.lost = True, self.lost or lost
+        self._ending = False
+        if first:
+            self._taken_away(self, reason)
+        elif lost:
+            self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
+            self.move_all()
+
+    def move_all(self) -> None:
+        """Have all that runs there go on on the robot."""
+        ended = [run for run, _ in self._held]
+        self._held.clear()
+        for run in list(self._runs.values()):
+            run.move(stop=not self.lost and run not in ended)
+
+    def end_all(self) -> None:
+        """Take it that all that ran on a machine that is gone has ended."""
+        for run in list(self._runs.values()):
+            run.end()
+
+    def _let_go(self) -> None:
+        """Tell of ends that were held back; the machine is there, or nobody knows."""
+        self._ending = False
+        held, self._held = self._held, []
+        for run, event in held:
+            run.on_event(event)
 
     def _end_unseen(self, returncode: int) -> None:
         for run in list(self._runs.values()):

@@ -87,6 +87,18 @@ class Streams:
         self._handed_out |= {spec.id for _, spec in new}
         return new
 
+    def remove(self, machine: str) -> list[str]:
+        """Forget a machine's streams; return the ids of the robot's nodes that none needs now."""
+        if not self._streams:
+            return []
+        from fogros2.image_transport import streams
+        before = streams.nodes(self._streams).get(None, [])
+        self._streams = [one for one in self._streams if machine not in (one.source, one.target)]
+        needed = {spec.id for spec in streams.nodes(self._streams).get(None, [])}
+        removed = [spec.id for spec in before if spec.id not in needed]
+        self._handed_out -= set(removed)
+        return removed
+
     def remappings(self, machine: str) -> dict[str, str]:
         """Return how the topics of the streams are renamed for nodes on a machine."""
         if not self._streams:

@@ -86,6 +86,7 @@ class FakeLaunch:
         self.errors = {}
         self.prepare_error = None
         self.down_errors = []
+        self.costs = []
 
     def __call__(self, *, report, environment, cancel):
         self.report = report
@@ -129,6 +130,9 @@ class FakeLaunch:
     def down(self):
         self.note('down')
         return self.down_errors
+
+    def cost(self):
+        return self.costs
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from launch_ros.actions import Node
 import pytest
 
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-from fogros2.actions import remote
+from fogros2.actions import remote_run
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, VpnError
 
 
@@ -398,12 +398,12 @@ def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
 
     fake.on_start = refuses
     node = talker(planner)
-    original = remote.RemoteRun._on_started
+    original = remote_run.RemoteRun._on_started
     try:
-        remote.RemoteRun._on_started = lambda self, event: None
+        remote_run.RemoteRun._on_started = lambda self, event: None
         assert run(LaunchDescription([node])) == 0
     finally:
-        remote.RemoteRun._on_started = original
+        remote_run.RemoteRun._on_started = original
     assert "process can't be started: no such program" in capfd.readouterr().out
 
 
@@ -594,7 +594,7 @@ def shutdown_event():
 
 
 def test_a_machine_that_does_not_answer_is_given_up(run, fake, planner, monkeypatch, capfd):
-    monkeypatch.setattr(remote, 'GRACE', 0.0)
+    monkeypatch.setattr(remote_run, 'GRACE', 0.0)
     node = talker(planner, sigterm_timeout='0.05', sigkill_timeout='0.05')
 
     def mute(machine, spec):

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where and on what to run, found out when the launch is executed.
+
+Each function returns launch Substitutions and asks nobody; a machine that has one among its
+options asks in a thread, as it comes up. The names and keywords of FogROS2's package ``utils``
+are among them, which it calls ``region_ami_selection`` and ``ec2_instance_type_selection``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+import threading
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext, Substitution
+
+from fogros2.actions import words
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from decimal import Decimal
+
+    from launch import SomeSubstitutionsType
+
+#: Argument that stands for the region which answers first.
+NEAREST = 'nearest'
+
+
+class Choice(Substitution):
+    """
+    A value that somebody is asked for when the launch is executed, once.
+
+    :param what: what it is, for people.
+    :param ask: returns it for ``arguments`` when these are resolved; may take seconds.
+    """
+
+    def __init__(self, what: str, ask: Callable[..., str], arguments: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._what = what
+        self._ask = ask
+        self._arguments = dict(arguments)
+        self._answer: Optional[str] = None
+        self._lock = threading.Lock()
+
+    def describe(self) -> str:
+        """Return what it will be."""
+        return self._what
+
+    def __repr__(self) -> str:
+        return f'<{self._what}>'
+
+    def later(self, context: LaunchContext) -> words.Later:
+        """Return what asks, in a thread; the arguments are resolved now."""
+        resolved = {
+            key: words.resolve_later(context, value) for key, value in self._arguments.items()}
+        return functools.partial(self._once, resolved)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Ask, and wait for the answer; a machine's options don't come this way."""
+        return self.later(context)()
+
+    def _once(self, arguments: Mapping[str, Any]) -> str:
+        with self._lock:
+            if self._answer is None:
+                self._answer = self._ask(**words.answered(arguments))
+            return self._answer
+
+
+def find_nearest_aws_region(regions: Optional[Sequence[SomeSubstitutionsType]] = None) -> Choice:
+    """
+    Return the AWS region that a connection reaches first.
+
+    :param regions: those to choose among; None for all that every account may use.
+    """
+    return Choice('the nearest AWS region', _nearest, {'regions': words.items(regions)})
+
+
+def find_nearest_region_and_ami(
+    regions: Mapping[str, Mapping[str, str]],
+) -> tuple[Choice, Choice]:
+    """
+    Return the nearest of some regions and the image given for it, as FogROS2 has it.
+
+    :param regions: by region, such as ``{'us-west-1': {'ami_image': 'ami-0123'}}``.
+    """
+    region = find_nearest_aws_region(list(regions))
+    images = {name: about['ami_image'] for name, about in regions.items()}
+    return region, Choice(
+        'the image for that region', lambda region: images[region], {'region': region})
+
+
+def find_cheapest_ec2_instance_type(
+    region_name: SomeSubstitutionsType, cpu_architecture: Optional[str] = None,
+    default_cores: Optional[int] = None, default_threads_per_core: Optional[int] = None,
+    gpu: Union[bool, int, str, None] = None, *, arch: Optional[str] = None,
+    min_cpu: Optional[int] = None, min_memory_gb: Optional[float] = None,
+    cpu_type: Optional[str] = None, gpu_memory_gb: Optional[float] = None,
+    max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
+) -> Choice:
+    """
+    Return the cheapest type of EC2 instance in a region that has what is asked for.
+
+    With FogROS2's keywords, or none, it has exactly so many cores and threads as FogROS2 looks
+    for; with those that AWSCloudInstance has it has at least what they say.
+
+    :param region_name: such as 'eu-central-1', or 'nearest'.
+    :param cpu_architecture: FogROS2's: 'x86_64' unless said.
+    :param default_cores: FogROS2's: 2 unless said.
+    :param default_threads_per_core: FogROS2's: 1 unless said.
+    :param gpu: whether it has one, how many, or part of the name.
+    :raises ConfigurationError: keywords of both kinds.
+    """
+    theirs = _said(cpu_architecture=cpu_architecture, default_cores=default_cores,
+                   default_threads_per_core=default_threads_per_core)
+    ours = _said(arch=arch, min_cpu=min_cpu, min_memory_gb=min_memory_gb, cpu_type=cpu_type,
+                 gpu_memory_gb=gpu_memory_gb, max_price=max_price, spot=spot or None)
+    if theirs and ours:
+        raise ConfigurationError(
+            f"{', '.join(theirs)} can't be combined with {', '.join(ours)}",
+            'say arch, min_cpu, min_memory_gb')
+    if not ours and isinstance(gpu, (bool, type(None))):
+        ask, asked = _type_of_fogros2, {**theirs, **_said(gpu=gpu)}
+    else:
+        ask, asked = _type, {**ours, **_said(gpu=gpu)}
+    return Choice('the cheapest type there', functools.partial(ask, asked=asked),
+                  {'region': region_name})
+
+
+def find_cheapest(
+    regions: Optional[Sequence[SomeSubstitutionsType]] = None, **wanted: Any,
+) -> tuple[Choice, Choice]:
+    """
+    Return the region and the type of the cheapest EC2 instance that has what is asked for.
+
+    :param regions: those to choose among; None for all that every account may use.
+    :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
+        ``gpu_memory_gb``, ``max_price``, ``spot``, as AWSCloudInstance has them.
+    :raises ConfigurationError: another keyword.
+    """
+    for name in wanted:
+        if name not in _WANTED:
+            raise ConfigurationError(f"find_cheapest takes no '{name}'",
+                                     f"it takes regions, {', '.join(_WANTED)}")
+    # both are parts of one answer, asked for once
+    both = Choice('the cheapest EC2 instance', functools.partial(_cheapest, asked=wanted),
+                  {'regions': words.items(regions)})
+    return (
+        Choice('the region of the cheapest EC2 instance',
+               lambda both: str(both).partition(' ')[0], {'both': both}),
+        Choice('the type of the cheapest EC2 instance',
+               lambda both: str(both).partition(' ')[2], {'both': both}))
+
+
+_WANTED = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
+           'spot')
+
+
+def _said(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+# The provider is loaded when somebody is asked.
+
+def _nearest(regions: Optional[Sequence[str]]) -> str:
+    from fogros2.provider.aws import choices
+    return choices.nearest_region(regions)
+
+
+def _region(region: str) -> str:
+    return _nearest(None) if region == NEAREST else region
+
+
+def _type(region: str, asked: Mapping[str, Any]) -> str:
+    from fogros2.provider.aws import choices
+    return choices.cheapest_type(_region(region), **asked)
+
+
+def _type_of_fogros2(region: str, asked: Mapping[str, Any]) -> str:
+    from fogros2.provider.aws import choices
+    return choices.find_cheapest_ec2_instance_type(_region(region), **asked)
+
+
+def _cheapest(regions: Optional[Sequence[str]], asked: Mapping[str, Any]) -> str:
+    from fogros2.provider.aws import choices
+    offer = choices.cheapest(regions, **asked)
+    return f'{offer.region} {offer.type.name}'

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One process on a machine, from its execution to its end, or until it goes on on the robot."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext
+from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
+import launch.logging
+
+from fogros2.actions import private
+from fogros2.model import NodeSpec
+
+if TYPE_CHECKING:
+    from fogros2.actions.remote import RemoteProcess
+    from fogros2.actions.session import Session
+
+#: Seconds beyond a process's own time-outs that its machine has to report the end of it.
+GRACE = 10.0
+
+
+class RemoteRun:
+    """
+    One process on a machine, from its execution to its end.
+
+    To launch's ExecuteLocal it is the subprocess's transport and protocol in one.
+    """
+
+    def __init__(
+        self, action: RemoteProcess, context: LaunchContext, session: Session, node: NodeSpec,
+        completed: asyncio.Future[None],
+    ) -> None:
+        self.node = node
+        self.action = action
+        self.complete = completed
+        self.started = False
+        self.stopping = False
+        #: It exited, and its machine will start it again.
+        self.respawning = False
+        #: It is on its way to the robot, then it is there and launch's own.
+        self._moving = self._here = False
+        self._context = context
+        self._session = session
+        self._details: dict[str, Any] = dict(action.process_details or {})
+        self._returncode: Optional[int] = None
+        self._logger = launch.logging.get_logger(f'{session.spec.name}.{node.name}')
+        if private.options(action).log_cmd:
+            self._logger.info(f"process details: cmd='{' '.join(self._details['cmd'])}'")
+
+    # -- what launch asks of a transport --------------------------------------------------------
+
+    def get_pid(self) -> Optional[int]:
+        """Return the process's id on its machine, None before it started."""
+        return self._details.get('pid')
+
+    def get_returncode(self) -> Optional[int]:
+        """Return the exit status, None while there is none."""
+        return self._returncode
+
+    def send_signal(self, number: Union[int, str]) -> None:
+        """Send the process a signal, by its number or its name."""
+        name = number if isinstance(number, str) else signal.Signals(number).name
+        if self.started:
+            self._session.signal(self, name)
+        else:
+            self._logger.warning(f"'{name}' not sent: the process hasn't started yet")
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self.send_signal(signal.SIGKILL)
+
+    def close(self) -> None:
+        """Let go of the process; nothing is held here."""
+
+    # -- ending ---------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """End the process in order: SIGINT, SIGTERM and SIGKILL as its time-outs say."""
+        if self.complete.done() or self.stopping:
+            return
+        self.stopping = True
+        if not self._session.stop(self) or self.respawning:
+            # nothing runs, so there is no end of it to be reported
+            self.end()
+            return
+        self._context.asyncio_loop.call_later(self._patience, self.give_up)
+
+    @property
+    def _patience(self) -> float:
+        """Seconds that the machine has to end it, all means included, and to say so."""
+        return self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
+
+    def give_up(self) -> None:
+        """Stop waiting for a process that should have ended long ago."""
+        if not self.complete.done() and not self._here:
+            self._logger.error(
+                f"machine '{self._session.spec.name}' doesn't say that the process ended; "
+                f'its agent will end it')
+            self.end()
+
+    # -- on the robot instead -------------------------------------------------------------------
+
+    def move(self, *, stop: bool) -> None:
+        """
+        Have the process go on on the robot; launch sees it start again, and no exit before.
+
+        One that can't, as it carries a stream, ends.
+
+        :param stop: whether the machine has to end it first; False for a machine that is gone.
+        """
+        if self.complete.done() or self._here or (self._moving and stop):
+            return
+        if not self.action.can_come_here or self.stopping:
+            if stop:
+                self.stop()
+            else:
+                self.end()
+            return
+        self._moving = True
+        if stop and self._session.stop(self) and not self.respawning:
+            self._context.asyncio_loop.call_later(self._patience, self._arrive)
+        else:
+            self._arrive()
+
+    def _arrive(self) -> None:
+        if not self._moving or self.complete.done():
+            return
+        if self.stopping or self._context.is_shutdown:
+            self.end()
+            return
+        self._moving = False
+        self._here = True
+        self._session.forget(self)
+        self.action.come_here(self._context)
+
+    def end(self) -> None:
+        """Tell launch that nothing more will happen."""
+        if not self.complete.done():
+            self.complete.set_result(None)
+        self._session.forget(self)
+
+    # -- what the agent says --------------------------------------------------------------------
+
+    def on_event(self, event: dict[str, Any]) -> None:
+        """Turn an event of the agent into launch's."""
+        handler = getattr(self, f"_on_{event['event']}", None)
+        if handler is not None and not self.complete.done() and not self._here:
+            handler(event)
+
+    def _on_started(self, event: dict[str, Any]) -> None:
+        self.started = True
+        self.respawning = False
+        details = self.action.process_details
+        assert details is not None
+        details['pid'] = event['pid']
+        if event.get('cmd'):
+            details['cmd'] = list(event['cmd'])
+        self._details = dict(details)
+        self._logger.info(f"process started with pid [{event['pid']}]")
+        self._context.emit_event_sync(ProcessStarted(**self._details))
+        if self.stopping:
+            self._session.stop(self)
+
+    def _on_output(self, event: dict[str, Any]) -> None:
+        kind = ProcessStderr if event.get('stream') == 'stderr' else ProcessStdout
+        self._details.setdefault('pid', 0)
+        self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))
+
+    def _on_exited(self, event: dict[str, Any]) -> None:
+        if self._moving and not self.stopping:
+            self._arrive()
+            return
+        self._returncode = event['returncode']
+        self._details.setdefault('pid', 0)
+        pid = self._details['pid']
+        if self._returncode == 0:
+            self._logger.info(f'process has finished cleanly [pid {pid}]')
+        else:
+            command = ' '.join(word for word in self._details['cmd'] if word)
+            self._logger.error(
+                f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
+        self._context.emit_event_sync(
+            ProcessExited(returncode=self._returncode, **self._details))
+        self.respawning = bool(event.get('respawns'))
+        if not self.respawning or self.stopping:
+            self.end()
+
+    def _on_refused(self, event: dict[str, Any]) -> None:
+        if self._moving:
+            self._arrive()
+            return
+        hint = f" ({event['hint']})" if event.get('hint') else ''
+        self._logger.error(f"process can't be started: {event['error']}{hint}")
+        self.end()
+
+    def on_stdin(self, event: object) -> None:
+        """Refuse input: there is no way for it to the machine."""
+        if self._here:
+            return
+        self._logger.error('a process on a machine takes no input from launch')
