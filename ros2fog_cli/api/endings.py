@@ -213,6 +213,27 @@ def stopped_at(
         return None
 
 
+def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Iterator[str]:
+    """
+    Have all providers delete what machines that ended by themselves left there.
+
+    Yields words for people; a provider that can't be asked is a warning.
+    """
+    names = [name for name in plugin_system.names('fogros2.provider')
+             if machines.wanted(name, regions)]
+
+    def ask(name: str) -> list[str]:
+        try:
+            return machines.load(name, regions).tidy()
+        except FogError as error:
+            warn(f'{name}: {error}')
+            return []
+
+    with ThreadPoolExecutor(max(1, len(names)), 'fog-tidy') as pool:
+        for said in pool.map(ask, names):
+            yield from said
+
+
 def let_go(record: Record, store: Store) -> None:
     """
     Take away what a dead launch left for a machine that is kept; the machine stays.

@@ -11,10 +11,10 @@ from typing import Any, Optional
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, FogError, ProviderError, Unsupported
-from fogros2.model import Image, MachineState
+from fogros2.model import Command, Image, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.waiting import wait_until
-from ros2fog_cli.api import machines
+from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
 
 #: Seconds that an image of a large disk may take.
@@ -32,6 +32,17 @@ class Baking:
     name: str
     provider: str
     dependencies: str
+
+
+def flush(entry: Entry, warn: Warn) -> None:
+    """Have a machine write what is in its memory to its disk, as an image is made of the disk."""
+    if entry.machine is None or entry.machine.state is not MachineState.RUNNING:
+        return
+    try:
+        with reach.session(entry) as shell:
+            shell.run(Command(('sync',), what='write everything to the disk'), timeout=60.0)
+    except FogError as error:
+        warn(f"{entry.name}: what isn't on the disk yet may be missing in the image: {error}")
 
 
 def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:

@@ -73,6 +73,8 @@ class GcVerb(VerbExtension):
                 note('leftovers of launch', leftover.launch, 'the launch is gone', error)
             if not args.dry_run:
                 store.sweep()
+                for what in endings.tidy(warn, regions=args.region):
+                    note('what was left at the provider:', what, 'its machine ended by itself')
         if args.json:
             print(json.dumps(done, indent=2))
         elif not done:

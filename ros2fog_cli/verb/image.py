@@ -92,6 +92,7 @@ def _make(args: argparse.Namespace, name: str) -> int:
           f"{entry.provider} {entry.machine_id or '-'}, {entry.state}", file=sys.stderr)
     if args.dry_run:
         return 0
+    images.flush(entry, warn)
     baking = images.bake(entry, args.image_name or '')
     if not baking.dependencies:
         warn('what is installed on the machine is not known: no launch takes the image by '

@@ -17,7 +17,13 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import plugin_system
-from fogros2.errors import DeadlineExceeded, MachineNotFound, ProviderError, Unsupported
+from fogros2.errors import (
+    ConnectError,
+    DeadlineExceeded,
+    MachineNotFound,
+    ProviderError,
+    Unsupported,
+)
 from fogros2.model import (
     CreateRequest,
     Endpoint,
@@ -25,6 +31,7 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     MachineState,
+    Result,
     VpnInterface,
 )
 from fogros2.provider import Provider, TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
@@ -258,6 +265,26 @@ def test_gc_goes_by_when_the_provider_says_it_was_stopped(
     assert bool(endings.why_end(entry, NOW, endings.KEEP_STOPPED, since)) is ends
 
 
+def test_gc_has_providers_clear_up_as_well(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def tidy(self: Cloud) -> list[str]:
+        self.calls.append(('tidy',))
+        return [f"security group of 'old' ({self.name})"] if type(self) is Cloud else []
+
+    monkeypatch.setattr(Cloud, 'tidy', tidy)
+    assert run('gc', '--dry-run') == 0
+    assert ('tidy',) not in Cloud.calls
+    capsys.readouterr()
+    assert run('gc') == 0
+    assert capsys.readouterr().out == "cleared what was left at the provider: security group " \
+        "of 'old' (cloud): its machine ended by itself\n"
+    Cloud.up = False
+    Cloud.calls.clear()
+    assert run('gc') == 0
+    assert not Cloud.calls
+
+
 # -- the firewall -------------------------------------------------------------------------
 
 
@@ -331,15 +358,25 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(images, 'LOOK', 0.01)
 
 
+@pytest.fixture(autouse=True)
+def disk(monkeypatch: pytest.MonkeyPatch) -> FakeShell:
+    """Return the shell of every machine that no other fixture leads elsewhere."""
+    shell = FakeShell(handlers={'sync': lambda c: Result(0, '', '')})
+    monkeypatch.setattr(reach.shells, 'connect', lambda *_, **__: shell)
+    return shell
+
+
 def test_an_image_is_made_and_waited_for(
-    quick: None, capsys: pytest.CaptureFixture[str],
+    quick: None, disk: FakeShell, capsys: pytest.CaptureFixture[str],
 ) -> None:
     machine('slam')
     Cloud.states = ['pending', 'pending', 'available']
     assert run('image', 'slam', '--dry-run') == 0
     assert 'would make an image of slam: cloud id-slam, running' in capsys.readouterr().err
-    assert not Cloud.baked
+    assert not Cloud.baked and not disk.commands
     assert run('image', 'slam') == 0
+    # what is in memory alone would not be in the image
+    assert [command.argv for command in disk.commands] == [('sync',)]
     (_, machine_id, name, dependencies), = [c for c in Cloud.calls if c[0] == 'bake']
     assert machine_id == 'id-slam' and dependencies == '0123456789abcdef'
     assert name.startswith('slam-image-20')
@@ -362,6 +399,18 @@ def test_an_image_that_is_not_known_by_what_it_holds(capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     assert 'no launch takes the image by itself' in said.err
     assert json.loads(said.out)['id'] == 'img-0'
+
+
+def test_an_image_of_a_machine_out_of_reach(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def lost(*_: Any, **__: Any) -> FakeShell:
+        raise ConnectError('no route')
+
+    monkeypatch.setattr(reach.shells, 'connect', lost)
+    machine('slam')
+    assert run('image', 'slam', '--no-wait') == 0
+    assert 'may be missing in the image: no route' in capsys.readouterr().err
 
 
 def test_no_image_of_what_does_not_run(capsys: pytest.CaptureFixture[str]) -> None:
