@@ -35,7 +35,7 @@ it: the VPN's, and the one that ends the machine.
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
-``notice`` (see ``watch``), and ``launch_exited`` where the nodes' launch process ended without
+``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where the nodes' launch process ended without
 having been told to.
 """
 
@@ -648,6 +648,8 @@ class Agent:
             if self.ending and self.stopping:
                 self.done = True  # asked twice
             say('asked to end')
+            if not self.ending:
+                self.emit('ending', reason='asked to end by a signal')
             self.ending = True
             self.at(1.8, self._leave_now)
             self.stop_nodes(lambda: self.take_down(self._leave_now), quickly=True)

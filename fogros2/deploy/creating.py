@@ -91,16 +91,7 @@ class Creation:
                         job.record = dataclasses.replace(before, spec=job.spec)
                         job.former = before.last or before.launch
                         return machine
-        try:
-            found = list(job.provider.find({TAG_NAME: job.name}))
-        except Unsupported:
-            return None
-        for machine in found:
-            owner = machine.tags.get(TAG_ROBOT, '?')
-            whose = 'this robot' if owner == robot_name() else f"the robot '{owner}'"
-            raise NameTaken(
-                f"{whose} has a machine '{job.name}' that this launch has no key for",
-                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        # one that this robot doesn't know of is found, and refused, by ``create``
         return None
 
     def _check_alike(self, before: Any, machine: Machine) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
+from decimal import Decimal
 import fnmatch
 from pathlib import Path
 import queue
@@ -64,16 +65,27 @@ class FakeProvider(Provider):
     :param polls: how often ``describe`` says that a new machine isn't running yet.
     :param shell: endpoint of every machine that runs.
     :param failures: per method name the error that its next call raises.
+    :param prices: US dollars an hour of each size that costs money; 'cheapest' stands for the one
+        that costs least.
+
+    Attributes that a test may set: ``allowed``, per machine and TCP port who is let in;
+    ``address``, the robot's; ``host_keys``, per machine the key that was pinned.
     """
 
     name: ClassVar[str] = 'fake'
+    shell_kind: ClassVar[str] = 'fake'
     look_interval: ClassVar[float] = 0.05
 
     def __init__(
         self, *, polls: int = 0, shell: Endpoint = FAKE_ENDPOINT,
         failures: Optional[dict[str, FogError]] = None,
+        prices: Optional[Mapping[str, Decimal]] = None,
     ) -> None:
         self.calls: list[str] = []
+        self.allowed: dict[tuple[str, int], list[str]] = {}
+        self.address = '198.51.100.9/32'
+        self.host_keys: dict[str, str] = {}
+        self.prices = dict(prices or {})
         self.failures = failures if failures is not None else {}
         self._polls = polls
         self._shell = shell
@@ -89,6 +101,18 @@ class FakeProvider(Provider):
             if name != 'size':
                 raise ConfigurationError(f"a fake machine has no option '{name}'",
                                          "did you mean 'size'?")
+
+    def resolve(self, spec: MachineSpec) -> MachineSpec:
+        """Choose the size that costs least for 'cheapest'."""
+        self._called('resolve')
+        if spec.options.get('size') != 'cheapest':
+            return spec
+        size = min(self.prices, key=lambda size: self.prices[size], default='small')
+        return dataclasses.replace(spec, options={**spec.options, 'size': size})
+
+    def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return the price of a size."""
+        return self.prices.get(str(spec.options.get('size')))
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Make an entry."""
@@ -119,6 +143,10 @@ class FakeProvider(Provider):
                         machine, state=MachineState.RUNNING, shell=self._shell,
                         vpn_host=self._shell.host)
                     self._machines[machine_id] = machine
+            key = self.host_keys.get(machine_id)
+            if key is not None and machine.shell is not None:
+                return dataclasses.replace(
+                    machine, shell=dataclasses.replace(machine.shell, host_key=key))
             return machine
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
@@ -148,6 +176,27 @@ class FakeProvider(Provider):
             self._machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.PENDING)
             self._waits[machine_id] = self._polls
+
+    def robot_address(self) -> str:
+        """Return ``address``."""
+        if not self.firewall:
+            return super().robot_address()
+        self._called('robot_address')
+        return self.address
+
+    def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        """Note who is let in."""
+        if not self.firewall:
+            super().allow(machine_id, port, sources)
+        self._called('allow')
+        self.allowed[machine_id, port] = list(sources)
+
+    def pin(self, machine_id: str, host_key: str) -> None:
+        """Note the key."""
+        if not self.one_time_host_key:
+            super().pin(machine_id, host_key)
+        self._called('pin')
+        self.host_keys[machine_id] = host_key
 
     def _found(self, machine_id: str) -> Machine:
         if machine_id not in self._machines:

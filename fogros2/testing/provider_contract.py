@@ -7,16 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
+import dataclasses
+import ipaddress
 import secrets
+import threading
 import time
 from typing import Any, ClassVar, Optional
 import uuid
 
-from fogros2.errors import ConfigurationError, MachineNotFound, NameTaken, Unsupported
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    MachineNotFound,
+    NameTaken,
+    ProviderError,
+    Unsupported,
+)
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_NAME
 from fogros2.testing.shell_contract import raised
-from fogros2.waiting import wait_until
 
 #: A key whose private half nobody has; providers look whether it is one.
 PUBLIC_KEY = ('ssh-ed25519 '
@@ -34,10 +43,9 @@ class ProviderContract:
     """
     What every provider has to do; subclass it, and let pytest collect the subclass.
 
-    A provider whose computers exist already sets ``owned`` to False.
+    What depends on a class attribute (``owned``, ``firewall``, ...) is asked of providers with it.
     """
 
-    owned: ClassVar[bool] = True
     #: Seconds until a machine can be reached, and until one is gone.
     patience: ClassVar[float] = 60.0
 
@@ -57,12 +65,10 @@ class ProviderContract:
         finally:
             provider.destroy(machine_id)
 
-    def reached(self, provider: Provider, machine_id: str) -> Machine:
+    def reached(self, provider: Provider, machine_id: str, name: str = 'it') -> Machine:
         """Return a machine as soon as it can be reached."""
-        def look() -> Optional[Machine]:
-            machine = provider.describe(machine_id)
-            return machine if machine.shell is not None else None
-        return wait_until(look, timeout=self.patience, what='the machine to be reachable')
+        return provider.reachable(
+            machine_id, name=name, timeout=self.patience, cancel=threading.Event())
 
     def test_check_accepts_what_create_takes(self) -> None:
         provider, options = self.make()
@@ -82,9 +88,11 @@ class ProviderContract:
             assert machine.name == spec.name
             assert machine.provider == provider.name
             assert machine.state is MachineState.RUNNING
-            assert machine.vpn_host
-            assert machine.owned is self.owned
-            if self.owned:
+            assert machine.vpn_host or machine.robot_host
+            assert machine.shell is not None and machine.shell.kind == provider.shell_kind
+            assert provider.describe(machine_id).shell == machine.shell
+            assert machine.owned is provider.owned
+            if provider.owned:
                 assert machine.end_command
                 assert machine.created is not None
                 assert abs(machine.created - time.time()) < self.patience + 60.0
@@ -92,20 +100,20 @@ class ProviderContract:
     def test_one_token_makes_one_machine(self) -> None:
         with self.machine() as (provider, spec, request, machine_id):
             assert provider.create(spec, request) == machine_id
-            if self.owned:
+            if provider.owned:
                 assert len(list(provider.find({TAG_NAME: spec.name}))) == 1
 
     def test_a_name_is_taken_once(self) -> None:
-        if not self.owned:
-            return
         with self.machine() as (provider, spec, _, machine_id):
+            if not provider.owned:
+                return
             raised(NameTaken, lambda: provider.create(spec, request_for(spec)))
             assert provider.describe(machine_id).state is not MachineState.DELETED
 
     def test_machines_are_found_by_all_their_tags(self) -> None:
         mark = secrets.token_hex(4)
-        if not self.owned:
-            provider, _ = self.make()
+        provider, _ = self.make()
+        if not provider.owned:
             raised(Unsupported, lambda: list(provider.find({})))
             return
         with self.machine(**{'fogros2-test': mark}) as (provider, spec, _, machine_id):
@@ -122,7 +130,7 @@ class ProviderContract:
         with self.machine() as (provider, spec, _, machine_id):
             provider.destroy(machine_id)
             provider.destroy(machine_id)
-            if self.owned:
+            if provider.owned:
                 raised(MachineNotFound, lambda: provider.describe(machine_id))
                 assert not list(provider.find({TAG_NAME: spec.name}))
 
@@ -131,12 +139,62 @@ class ProviderContract:
         raised(MachineNotFound, lambda: provider.describe('no-such-machine'))
 
     def test_a_machine_created_again_after_its_end_is_a_new_one(self) -> None:
-        if not self.owned:
-            return
         with self.machine() as (provider, spec, _, machine_id):
+            if not provider.owned:
+                return
             provider.destroy(machine_id)
             again = provider.create(spec, request_for(spec))
             try:
                 assert again != machine_id
             finally:
                 provider.destroy(again)
+
+    def test_choices_are_made_once_and_create_takes_them(self) -> None:
+        provider, options = self.make()
+        spec = MachineSpec('planner', provider.name, options)
+        chosen = provider.resolve(spec)
+        assert dataclasses.replace(chosen, options=spec.options) == spec
+        provider.check(chosen)
+        assert provider.resolve(chosen) == chosen
+        price = provider.cost_per_hour(chosen)
+        assert price is None or price >= 0
+
+    def test_waiting_for_a_machine_ends_with_the_launch(self) -> None:
+        cancel = threading.Event()
+        cancel.set()
+        with self.machine() as (provider, spec, _, machine_id):
+            raised(Cancelled, lambda: provider.reachable(
+                machine_id, name=spec.name, timeout=self.patience, cancel=cancel))
+
+    def test_waiting_for_a_machine_that_is_gone_ends_at_once(self) -> None:
+        with self.machine() as (provider, spec, _, machine_id):
+            if not provider.owned:
+                return
+            provider.destroy(machine_id)
+            begin = time.monotonic()
+            raised(ProviderError, lambda: provider.reachable(
+                machine_id, name=spec.name, timeout=self.patience, cancel=threading.Event()))
+            assert time.monotonic() - begin < self.patience / 2
+
+    def test_a_firewall_lets_the_robot_in_and_is_closed_again(self) -> None:
+        with self.machine() as (provider, _, _, machine_id):
+            if not provider.firewall:
+                raised(Unsupported, lambda: provider.allow(machine_id, 22, []))
+                raised(Unsupported, provider.robot_address)
+                return
+            robot = provider.robot_address()
+            assert ipaddress.ip_network(robot).num_addresses == 1
+            for sources in ([robot], [robot], [], [], [robot]):
+                provider.allow(machine_id, 22, sources)
+
+    def test_a_host_key_of_the_machine_s_own_is_told_from_then_on(self) -> None:
+        with self.machine() as (provider, _, _, machine_id):
+            key = ' '.join(PUBLIC_KEY.split()[:2])
+            if not provider.one_time_host_key:
+                raised(Unsupported, lambda: provider.pin(machine_id, key))
+                return
+            self.reached(provider, machine_id)
+            provider.pin(machine_id, key)
+            another, _ = self.make()
+            shell = another.describe(machine_id).shell
+            assert shell is not None and shell.host_key == key

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
+
 import pytest
 
 from fogros2.errors import ProviderError
@@ -22,6 +24,23 @@ class TestFakeProvider(ProviderContract):
 
     def make(self):
         return FakeProvider(polls=2), {'size': 'small'}
+
+
+class CloudLike(FakeProvider):
+    """One with a firewall, and with host keys that are handed over."""
+
+    firewall = True
+    one_time_host_key = True
+
+
+class TestFakeCloud(ProviderContract):
+
+    @pytest.fixture(autouse=True)
+    def one(self):
+        self.provider = CloudLike(prices={'large': Decimal(2), 'small': Decimal('0.5')})
+
+    def make(self):
+        return self.provider, {'size': 'cheapest'}
 
 
 class TestFakeShell(ShellContract):

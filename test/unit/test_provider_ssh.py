@@ -21,8 +21,6 @@ def listener():
 
 class TestSSHProvider(ProviderContract):
 
-    owned = False
-
     @pytest.fixture(autouse=True)
     def server(self, listener):
         self.port = listener.getsockname()[1]
