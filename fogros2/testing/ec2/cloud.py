@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Moto's instances, each with a computer behind it: states, addresses, disks and groups follow.
+
+Moto knows what was asked for; what an instance *is* happens here. Its classes are changed in
+this process, which serves one box and nothing else.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping
+import dataclasses
+import sys
+import threading
+from typing import Any, Optional
+
+from fogros2.errors import FogError
+from fogros2.testing.ec2 import cloud_config, computer, guest, metadata, network
+from fogros2.testing.ec2.computer import Boot, Computer
+
+#: Seconds after which an instance that was asked to go down is cut off.
+_PATIENCE = 2.0
+#: Share of the boot delay for which an instance is 'pending'.
+_PENDING = 0.25
+_STATES = {'pending': 0, 'running': 16, 'shutting-down': 32, 'terminated': 48, 'stopping': 64,
+           'stopped': 80}
+#: Of what made an instance end.
+BY_USER = 'Client.UserInitiatedShutdown'
+BY_ITSELF = 'Client.InstanceInitiatedShutdown'
+BY_SPOT = 'Server.SpotInstanceTermination'
+BY_TROUBLE = 'Server.InternalError'
+
+
+@dataclasses.dataclass
+class Machine:
+    """
+    An instance and its computer.
+
+    :param wanted: run, stop or terminate; ``news`` is set when it changes.
+    :param notice: what the metadata service says of an interruption.
+    """
+
+    instance: Any
+    computer: Computer
+    spot: bool
+    disk_of: str
+    wanted: str = 'run'
+    reason: str = BY_USER
+    public: str = ''
+    space: str = ''
+    host: Optional[network.Host] = None
+    notice: str = ''
+    runs: bool = False
+    again: bool = False
+    news: threading.Event = dataclasses.field(default_factory=threading.Event)
+    thread: Optional[threading.Thread] = None
+
+
+class Cloud:
+    """
+    The computers of a box.
+
+    :param mark: the box; on everything that it makes.
+    :param boot_delay: seconds from RunInstances until an instance's first process starts.
+    :param mounts: folders of this computer that every instance sees, read-only.
+    """
+
+    def __init__(
+        self, mark: str, net: network.Network, *, boot_delay: float, mounts: tuple[str, ...],
+    ) -> None:
+        self.mark = mark
+        self.net = net
+        self.boot_delay = boot_delay
+        self.disks = computer.DISKS / mark
+        self.addresses = network.Addresses()
+        self.machines: dict[str, Machine] = {}
+        self._mounts = mounts
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+
+    # -- what callers of the API cause ----------------------------------------------------
+
+    def launch(self, instance: Any, *, spot: bool) -> None:
+        """Give a new instance a computer and start it."""
+        machine = Machine(
+            instance, Computer(self.mark, self.disks / str(instance.id), self._mounts), spot,
+            str(instance.image_id))
+        with self._lock:
+            self.machines[str(instance.id)] = machine
+        self._begin(machine)
+
+    def start(self, instance: Any) -> None:
+        """Start a stopped instance, with another public address as EC2 gives it."""
+        machine = self.machines[str(instance.id)]
+        machine.wanted, machine.reason = 'run', BY_USER
+        machine.news.clear()
+        self._begin(machine)
+
+    def _begin(self, machine: Machine) -> None:
+        _set_state(machine.instance, 'pending')
+        # EC2 tells the address when the instance runs
+        nic = machine.instance.nics[0]
+        machine.public, nic.public_ip = nic.public_ip or '', None
+        machine.thread = threading.Thread(target=self._live, args=(machine,), daemon=True)
+        machine.thread.start()
+
+    def end(self, instance: Any, wanted: str, reason: str = BY_USER) -> None:
+        """Stop or terminate an instance; what waits for it to be over looks at its state."""
+        machine = self.machines[str(instance.id)]
+        with self._lock:
+            if machine.wanted == 'terminate':
+                return
+            stopped = _state(instance) == 'stopped'
+            machine.wanted, machine.reason = wanted, reason
+            machine.again = False
+            machine.news.set()
+            if stopped and wanted == 'stop':
+                return
+            _set_state(instance, 'stopping' if wanted == 'stop' else 'shutting-down')
+            runs = machine.runs
+        if stopped:
+            threading.Thread(target=self._finish, args=(machine,), daemon=True).start()
+        elif runs:
+            self._press(machine)
+
+    def _press(self, machine: Machine) -> None:
+        machine.computer.ask_to_end()
+        timer = threading.Timer(_PATIENCE, machine.computer.cut)
+        timer.daemon = True
+        timer.start()
+
+    def reboot(self, instance: Any) -> None:
+        """Start an instance's computer again."""
+        machine = self.machines[str(instance.id)]
+        machine.again = True
+        self._press(machine)
+
+    def interrupt(self, instance_id: str, *, notice: float, when: str) -> None:
+        """Announce that a spot instance is taken away, and take it ``notice`` seconds later."""
+        machine = self.machines[instance_id]
+        machine.notice = when
+        timer = threading.Timer(
+            notice, self.end, (machine.instance, 'terminate', BY_SPOT))
+        timer.daemon = True
+        timer.start()
+
+    # -- an instance's life ---------------------------------------------------------------
+
+    def _live(self, machine: Machine) -> None:
+        try:
+            while self._boot(machine):
+                self._went_down(machine)
+                if not machine.again or machine.wanted != 'run':
+                    break
+                machine.again = False
+        except (FogError, OSError) as error:
+            print(f'{machine.instance.id}: {error}', file=sys.stderr, flush=True)
+            machine.wanted, machine.reason = 'terminate', BY_TROUBLE
+        self._finish(machine)
+
+    def _boot(self, machine: Machine) -> bool:
+        """Start an instance's computer; False if it isn't wanted any more."""
+        instance = machine.instance
+        private = str(instance.private_ip)
+        if _state(instance) == 'pending':
+            if machine.news.wait(self.boot_delay * _PENDING):
+                return False
+            with self._lock:
+                if machine.wanted == 'run':
+                    instance.nics[0].public_ip = machine.public or None
+                    _set_state(instance, 'running')
+            if machine.news.wait(self.boot_delay * (1 - _PENDING)):
+                return False
+        if not machine.computer.disk.exists():
+            image = self.disks / machine.disk_of
+            if image.exists():
+                computer.copy_disk(image, machine.computer.disk)
+            else:
+                computer.new_disk(machine.computer.disk)
+        machine.space, link = self.net.add()
+        machine.host = network.Host(
+            link, machine.public or private, private, str(instance.vpc_id))
+        self.net.attach(machine.space, machine.host)
+        self.protect()
+        service = metadata.MetadataService(
+            machine.space, lambda: self._metadata(machine),
+            lambda: bool(instance.metadata_options.http_tokens == 'required'))
+        try:
+            machine.computer.start(Boot(
+                f'fogt{self.mark}{link}', f"ip-{private.replace('.', '-')}",
+                machine.space, self._plan(machine)))
+            with self._lock:
+                machine.runs = True
+                asked = machine.wanted != 'run'
+            if asked:
+                self._press(machine)
+            machine.computer.wait()
+        finally:
+            machine.runs = False
+            service.close()
+        return True
+
+    def _went_down(self, machine: Machine) -> None:
+        if machine.wanted == 'run' and machine.computer.exit_status() == guest.REBOOT:
+            machine.again = True
+        if machine.wanted == 'run' and not machine.again:
+            behaviour = machine.instance.instance_initiated_shutdown_behavior
+            with self._lock:
+                if machine.wanted == 'run':
+                    machine.wanted = 'stop' if behaviour == 'stop' and not machine.spot \
+                        else 'terminate'
+                    machine.reason = BY_ITSELF
+                    _set_state(machine.instance, 'stopping' if machine.wanted == 'stop'
+                               else 'shutting-down')
+        self._clear(machine)
+
+    def _clear(self, machine: Machine) -> None:
+        """Take away what a computer that is off doesn't have."""
+        machine.computer.remove()
+        machine.host = None
+        if machine.space:
+            self.net.remove(machine.space)
+            machine.space = ''
+            if not self._closing.is_set():
+                self.protect()
+
+    def _finish(self, machine: Machine) -> None:
+        """Bring an instance to its last state, and give its addresses back."""
+        self._clear(machine)
+        instance = machine.instance
+        private = str(instance.private_ip)
+        if machine.wanted == 'terminate':
+            computer.remove_disk(machine.computer.disk)
+            MOTO['terminate'](instance)
+            self.addresses.give_back([private])
+        else:
+            MOTO['stop'](instance)
+        if machine.public:
+            self.addresses.give_back([machine.public])
+            machine.public = ''
+        text = f'{machine.reason}: {_WORDS[machine.reason]}'
+        instance.state_reason.code, instance.state_reason.message = machine.reason, text
+        if machine.reason != BY_USER:
+            instance._reason = text
+
+    # -- what it is told ------------------------------------------------------------------
+
+    def _plan(self, machine: Machine) -> Mapping[str, Any]:
+        instance = machine.instance
+        plan = dataclasses.asdict(cloud_config.parse(_user_data(instance)))
+        return {**plan, 'instance': instance.id, 'user': computer.USER,
+                'keys': self._public_keys(instance)}
+
+    def _public_keys(self, instance: Any) -> list[str]:
+        pair = instance.ec2_backend.key_pairs.get(instance.key_name)
+        if pair is None:
+            return []
+        material = pair.material_public
+        return [material.decode() if isinstance(material, bytes) else str(material)]
+
+    def _metadata(self, machine: Machine) -> dict[str, bytes]:
+        instance = machine.instance
+        values = {
+            'meta-data/instance-id': instance.id, 'meta-data/ami-id': instance.image_id,
+            'meta-data/instance-type': instance.instance_type,
+            'meta-data/hostname': instance.private_dns_name,
+            'meta-data/local-ipv4': instance.private_ip_address,
+            'meta-data/placement/availability-zone': str(instance.availability_zone),
+            'meta-data/placement/region': instance.region_name,
+            'meta-data/instance-life-cycle': 'spot' if machine.spot else 'on-demand',
+        }
+        if instance.public_ip:
+            values['meta-data/public-ipv4'] = instance.public_ip
+        for key in self._public_keys(instance):
+            values['meta-data/public-keys/0/openssh-key'] = key
+        if machine.notice:
+            values['meta-data/spot/instance-action'] = \
+                f'{{"action": "terminate", "time": "{machine.notice}"}}'
+            values['meta-data/spot/termination-time'] = machine.notice
+        if instance.metadata_options.instance_metadata_tags == 'enabled':
+            for tag in instance.get_tags():
+                values[f"meta-data/tags/instance/{tag['key']}"] = tag['value']
+        values['dynamic/instance-identity/document'] = metadata.document(values)
+        found = {name: value.encode() for name, value in values.items()}
+        if instance.user_data:
+            found['user-data'] = _user_data(instance)
+        return found
+
+    # -- images ---------------------------------------------------------------------------
+
+    def image(self, image: Any, instance: Any, *, reboot: bool) -> None:
+        """Copy an instance's disk; the image is pending until that is done."""
+        image.state = 'pending'
+        threading.Thread(target=self._copy, args=(image, instance, reboot), daemon=True).start()
+
+    def _copy(self, image: Any, instance: Any, reboot: bool) -> None:
+        machine = self.machines[str(instance.id)]
+        try:
+            with machine.computer.still():
+                computer.copy_disk(machine.computer.disk, self.disks / str(image.id))
+            image.state = 'available'
+        except (FogError, OSError) as error:
+            print(f'{image.id}: {error}', file=sys.stderr, flush=True)
+            image.state = 'failed'
+        if reboot and machine.runs:
+            self.reboot(instance)
+
+    def forget_image(self, image_id: str) -> None:
+        """Remove an image's disk."""
+        computer.remove_disk(self.disks / image_id)
+
+    # -- security groups ------------------------------------------------------------------
+
+    def protect(self) -> None:
+        """Bring the router's rules in line with the security groups."""
+        with self._lock:
+            hosts = []
+            for machine in self.machines.values():
+                if machine.host is not None:
+                    hosts.append(dataclasses.replace(
+                        machine.host, allowed=self._allowed(machine.instance)))
+            self.net.protect(hosts)
+
+    def _allowed(self, instance: Any) -> tuple[network.Allowed, ...]:
+        found = []
+        for group in instance.nics[0].group_set:
+            for rule in group.ingress_rules:
+                sources = [rule.ip_range['CidrIp']] if rule.ip_range.get('CidrIp') else []
+                if rule.source_group:
+                    sources += self._members(rule.source_group.get('GroupId', ''))
+                ports = None if rule.from_port in (None, -1) else (
+                    int(rule.from_port), int(rule.to_port))
+                if sources:
+                    found.append(network.Allowed(rule.ip_protocol, ports, tuple(sources)))
+        return tuple(found)
+
+    def _members(self, group_id: str) -> list[str]:
+        found = []
+        for machine in self.machines.values():
+            groups = {group.id for group in machine.instance.nics[0].group_set}
+            if machine.host is not None and group_id in groups:
+                found += [machine.host.public, machine.host.private]
+        return found
+
+    def close(self) -> None:
+        """End every computer at once."""
+        self._closing.set()
+        with self._lock:
+            machines = list(self.machines.values())
+            for machine in machines:
+                machine.wanted = 'terminate'
+                machine.news.set()
+        for machine in machines:
+            machine.computer.cut()
+        for machine in machines:
+            if machine.thread is not None:
+                machine.thread.join(10.0)
+
+
+#: What Moto's own methods do, kept before they are replaced.
+MOTO: dict[str, Callable[..., Any]] = {}
+_WORDS = {
+    BY_USER: 'User initiated shutdown', BY_ITSELF: 'Instance initiated shutdown',
+    BY_SPOT: 'Spot instance termination', BY_TROUBLE: 'Internal error on launch',
+}
+
+
+def _state(instance: Any) -> str:
+    return str(instance._state.name)
+
+
+def _set_state(instance: Any, name: str) -> None:
+    instance._state.name, instance._state.code = name, _STATES[name]
+
+
+def _user_data(instance: Any) -> bytes:
+    return base64.b64decode(instance.user_data.as_bytes()) if instance.user_data else b''

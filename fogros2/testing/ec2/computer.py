@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The computer behind an instance: a container from this computer's root, its disk in folders.
+
+A disk is a folder with the root and what has been written over the system's folders, so that it
+outlives a stop, and an image is a copy of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import signal
+import threading
+from typing import Any, Optional
+
+from fogros2 import process
+from fogros2.errors import CommandError, FogError
+from fogros2.model import Command
+from fogros2.provider import container_engine, container_root
+from fogros2.provider.container_engine import Engine
+from fogros2.testing.ec2 import guest
+
+#: Roots of all boxes; the file systems of /tmp and /run may not take an overlay's layer.
+DISKS = Path('/var/lib/fogros2-ec2')
+#: On every container of a box, with the box's mark.
+LABEL = 'fogros2-ec2'
+USER = 'ubuntu'
+_GUEST = 'opt/ec2/guest.py'
+_ENTRY = ('/usr/bin/python3', '-IS', f'/{_GUEST}')
+#: Programs of an Ubuntu image that end the computer, or stand for systemd and cloud-init.
+_PROGRAMS = ('shutdown', 'poweroff', 'halt', 'reboot', 'systemctl', 'cloud-init')
+_SSHD = """\
+Include /etc/ssh/sshd_config.d/*.conf
+PasswordAuthentication no
+KbdInteractiveAuthentication no
+PermitRootLogin prohibit-password
+UsePAM no
+UseDNS no
+PrintMotd no
+PrintLastLog no
+X11Forwarding yes
+MaxSessions 100
+MaxStartups 100:30:200
+AcceptEnv LANG LC_*
+Subsystem sftp internal-sftp
+SetEnv LANG=C.UTF-8 PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+"""
+
+_NEW = """\
+umask 022
+mkdir -p "$1/root" "$1/layers"
+for layer in $2; do mkdir -p "$1/layers$layer/upper" "$1/layers$layer/work"; done
+tar -xpf - --numeric-owner -C "$1"
+"""
+#: An overlay's work folders belong to a mount; only what was written is a disk.
+_COPY = """\
+umask 022
+mkdir -p "$2"
+cp -a --reflink=auto "$1/root" "$2/root"
+for layer in $3; do
+    mkdir -p "$2/layers$layer/work"
+    cp -a --reflink=auto "$1/layers$layer/upper" "$2/layers$layer/upper"
+done
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Boot:
+    """
+    What a computer starts with.
+
+    :param space: network namespace it lives in.
+    :param plan: what its first process has to do; see ``guest``.
+    """
+
+    name: str
+    hostname: str
+    space: str
+    plan: Mapping[str, Any]
+
+
+def new_disk(folder: Path) -> None:
+    """
+    Make the disk of a fresh Ubuntu-like image.
+
+    :raises FogError: this computer's root doesn't serve.
+    """
+    layers = container_root.system_mounts()
+    archive = container_root.Archive()
+    archive.folder(f'{_root("opt")}/ec2')
+    archive.file(_root(_GUEST), Path(guest.__file__).read_bytes(), 0o755)
+    archive.file(_root('etc/ssh/sshd_config'), _SSHD.encode())
+    archive.folder(_root('etc/ssh/sshd_config.d'))
+    bin_folder = 'usr/sbin' if Path('/sbin').is_symlink() else 'sbin'
+    for program in _PROGRAMS:
+        text = f'#!/bin/sh\nexec {" ".join(_ENTRY)} {program} "$@"\n'
+        for place in dict.fromkeys((bin_folder, 'usr/bin')):
+            top, _, below = place.partition('/')
+            archive.file('/'.join(filter(None, ('layers', top, 'upper', below, program))),
+                         text.encode(), 0o755)
+    skeleton = container_root.skeleton(USER)
+    process.run(
+        Command(('sh', '-ec', _NEW, 'sh', str(folder), ' '.join(layers)), sudo=True,
+                input=archive.data(), what='make a disk'), timeout=60.0)
+    process.run(
+        Command(('tar', '-xpf', '-', '--numeric-owner', '-C', str(folder / 'root')), sudo=True,
+                input=skeleton + container_root.Archive().data(), what='make a disk'),
+        timeout=60.0)
+
+
+def _root(path: str) -> str:
+    return f'root/{path}'
+
+
+def copy_disk(source: Path, target: Path) -> None:
+    """
+    Copy a disk, aside first: ``target`` is there as a whole or not at all.
+
+    :raises FogError: it can't be copied.
+    """
+    aside = target.with_name(f'.{target.name}')
+    process.run(
+        Command(('sh', '-ec', _COPY, 'sh', str(source), str(aside),
+                 ' '.join(container_root.system_mounts())), sudo=True, what='copy a disk'),
+        timeout=300.0)
+    os.rename(aside, target)
+
+
+def remove_disk(folder: Path) -> None:
+    """Remove a disk."""
+    process.run(Command(('rm', '-rf', '--', str(folder)), sudo=True), timeout=120.0, check=False)
+
+
+class Computer:
+    """
+    One instance's computer.
+
+    :param mark: the box it belongs to.
+    :param disk: folder of its disk.
+    :param mounts: folders of this computer that it sees, read-only.
+    """
+
+    def __init__(self, mark: str, disk: Path, mounts: Sequence[str] = ()) -> None:
+        self.disk = disk
+        self._mark = mark
+        self._mounts = mounts
+        self._name = ''
+        self._handle: Optional[int] = None
+        self._lock = threading.Lock()
+
+    @property
+    def _engine(self) -> Engine:
+        return container_engine.named('podman')
+
+    def start(self, boot: Boot) -> None:
+        """
+        Start it; returns when its first process runs.
+
+        :raises FogError: it can't be started.
+        """
+        plan = self.disk / 'root/opt/ec2/plan.json'
+        plan.write_text(json.dumps(boot.plan))
+        plan.chmod(0o600)
+        words = [
+            '--name', boot.name, '--hostname', boot.hostname, '--network',
+            f'ns:/run/netns/{boot.space}', '--no-hosts', '--device', '/dev/net/tun',
+            '--tmpfs', '/run:rw,exec,mode=755',
+            '--label', f'{LABEL}={self._mark}', *container_engine.limits()]
+        for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
+            words += ['--cap-add', right]
+        for path in container_root.system_mounts():
+            layer = f'{self.disk}/layers{path}'
+            words += ['-v', f'{path}:{path}:O,upperdir={layer}/upper,workdir={layer}/work']
+        for path in container_root.outermost(self._mounts):
+            words += ['-v', f'{path}:{path}:ro']
+        self._name = boot.name
+        self._run(words)
+        (entry,) = self._engine.inspect([boot.name])
+        pid = int(entry['State']['Pid'])
+        if pid:
+            with self._lock:
+                self._handle = os.pidfd_open(pid)
+
+    def _run(self, words: Sequence[str]) -> None:
+        ways = container_engine.candidates(self._engine)
+        engine = next(ways)
+        while True:
+            command = Command(
+                engine.argv('run', '-d', *words, '--rootfs', str(self.disk / 'root'), *_ENTRY),
+                sudo=engine.sudo, what='start an instance')
+            try:
+                process.run(command, timeout=60.0)
+            except CommandError as error:
+                trouble = container_engine.translate(error)
+                another = next(ways, None)
+                if another is None or not container_engine.is_runtime_trouble(trouble):
+                    raise trouble from error
+                engine = another
+                engine.call('rm', '-f', self._name, what='remove an instance', check=False)
+                continue
+            container_engine.remember(engine)
+            return
+
+    def wait(self) -> None:
+        """Wait until its first process has ended."""
+        import select
+        with self._lock:
+            handle = self._handle
+        if handle is not None:
+            poll = select.poll()
+            poll.register(handle, select.POLLIN)
+            poll.poll()
+
+    def exit_status(self) -> int:
+        """Return how its first process ended."""
+        found = self._engine.inspect([self._name])
+        return int(found[0]['State']['ExitCode']) if found else 0
+
+    def ask_to_end(self) -> None:
+        """Press its power button: the first process goes down in order."""
+        self._signal(signal.SIGTERM)
+
+    def cut(self) -> None:
+        """Take its power away."""
+        self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
+        with self._lock:
+            if self._handle is not None:
+                try:
+                    signal.pidfd_send_signal(self._handle, number)
+                except ProcessLookupError:
+                    return
+
+    def run(self, script: str, *, check: bool) -> str:
+        """Run a script on it as root, not by SSH, and return what it printed."""
+        return self._engine.call(
+            'exec', self._name, 'sh', '-ec', script, what=f'run {script!r} on an instance',
+            timeout=60.0, check=check).stdout
+
+    @contextlib.contextmanager
+    def still(self) -> Iterator[None]:
+        """Hold it for the time of the block, as a snapshot is of one moment."""
+        held = self._engine.call('pause', self._name, what='hold an instance', check=False)
+        try:
+            yield
+        finally:
+            if held.returncode == 0:
+                self._engine.call('unpause', self._name, what='let an instance go on')
+
+    def console(self) -> str:
+        """Return what its first process has printed."""
+        result = self._engine.call('logs', self._name, what='read the console', check=False)
+        return result.stdout + result.stderr
+
+    def remove(self) -> None:
+        """Remove the container; the disk stays."""
+        with self._lock:
+            if self._handle is not None:
+                os.close(self._handle)
+                self._handle = None
+        if self._name:
+            self._engine.call('rm', '-f', '-t', '0', self._name, what='remove an instance',
+                              check=False)
+
+
+def sweep(mark: str) -> None:
+    """
+    Remove the containers and disks of the box ``mark``.
+
+    :raises FogError: podman doesn't answer.
+    """
+    engine = container_engine.named('podman')
+    found = engine.call('ps', '-aq', f'--filter=label={LABEL}={mark}',
+                        what='list containers', check=False).stdout.split()
+    if found:
+        engine.call('rm', '-f', '-t', '0', *found, what='remove instances', check=False)
+    remove_disk(DISKS / mark)
+
+
+def left_over() -> list[str]:
+    """Return the marks of boxes whose process has gone without a word."""
+    found = []
+    for folder in DISKS.glob('*'):
+        try:
+            pid, _, begun = (folder / 'owner').read_text().partition(' ')
+        except OSError:
+            continue
+        if started(int(pid)) != begun:
+            found.append(folder.name)
+    return found
+
+
+def started(pid: int) -> str:
+    """Return when a process was started, in the kernel's ticks, '' if it has ended."""
+    try:
+        words = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    except OSError:
+        return ''
+    return '' if words[0] in 'ZX' else words[19]
+
+
+__all__ = ['Boot', 'Computer', 'DISKS', 'FogError', 'USER', 'copy_disk', 'left_over', 'new_disk',
+           'remove_disk', 'started', 'sweep']

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an instance runs as its first process: a small cloud-init, an SSH server, and a way to end.
+
+Standard library alone; it is copied into the instance. The order is that of an Ubuntu image
+(``cloud_init_modules`` and so on in its cloud.cfg): bootcmd, then files, accounts and keys, then
+sshd, then packages, deferred files and the scripts. What belongs to the first boot alone is done
+again when the instance's id is another, as after an image was made of it.
+
+With an argument it is a program of the instance: ``status`` as of cloud-init, ``reload``.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+import grp
+import json
+import os
+import pwd
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from typing import Any, Union
+
+PLAN = '/opt/ec2/plan.json'
+STATE = '/var/lib/cloud'
+RUN = '/run/cloud-init'
+SSHD_PID = '/run/sshd.pid'
+PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
+#: Exit status by which the box knows that the instance wants to start again.
+REBOOT = 85
+
+
+def say(text: str) -> None:
+    """Write a line to the instance's console."""
+    print(f'[{time.monotonic():.3f}] {text}', flush=True)
+
+
+def write(path: str, data: bytes, mode: int = 0o644, append: bool = False) -> None:
+    """Write a file and the folders above it."""
+    os.makedirs(os.path.dirname(path) or '/', exist_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_TRUNC)
+    handle = os.open(path, flags, mode)
+    with os.fdopen(handle, 'wb') as file:
+        file.write(data)
+    os.chmod(path, mode)
+
+
+def write_files(files: Iterable[Mapping[str, Any]]) -> None:
+    """Write what the user data holds as files."""
+    for entry in files:
+        write(entry['path'], base64.b64decode(entry['content']), int(entry['mode'], 8),
+              entry['append'])
+        user, _, group = entry['owner'].partition(':')
+        shutil.chown(entry['path'], user or 'root', group or user or 'root')
+
+
+def run(command: Union[str, Sequence[str]], **variables: str) -> None:
+    """Run a command of the user data: words, or a line for the shell; its failure is no end."""
+    words = ['/bin/sh', '-c', command] if isinstance(command, str) else command
+    try:
+        code = subprocess.call(words, stdin=subprocess.DEVNULL, cwd='/',
+                               env={**os.environ, **variables})
+    except OSError as error:
+        say(f'cloud-init: {words[0]}: {error}')
+        return
+    if code != 0:
+        say(f'cloud-init: exit status {code} of {command!r}')
+
+
+def account(entry: Mapping[str, Any]) -> None:
+    """Make an account of the user data."""
+    name = entry['name']
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        run(['useradd', '-m', '-s', entry['shell'], name])
+    for group in entry['groups']:
+        with contextlib.suppress(KeyError):
+            grp.getgrnam(group)
+            run(['usermod', '-aG', group, name])
+    for line in entry['sudo']:
+        with open('/etc/sudoers', 'a') as file:
+            file.write(f'{name} {line}\n')
+    if entry['keys']:
+        authorize(name, entry['keys'])
+
+
+def authorize(user: str, keys: Sequence[str]) -> None:
+    """Let ``keys`` log in as ``user``."""
+    known = pwd.getpwnam(user)
+    folder = os.path.join(known.pw_dir, '.ssh')
+    os.makedirs(folder, mode=0o700, exist_ok=True)
+    path = os.path.join(folder, 'authorized_keys')
+    there = ''
+    with contextlib.suppress(FileNotFoundError), open(path) as file:
+        there = file.read()
+    new = [key.strip() for key in keys if key.strip() and key.strip() not in there]
+    write(path, (there + ''.join(f'{key}\n' for key in new)).encode(), 0o600)
+    for name in (folder, path):
+        os.chown(name, known.pw_uid, known.pw_gid)
+
+
+def host_keys(plan: Mapping[str, Any]) -> None:
+    """Put the host keys of the user data in place, or make some."""
+    if plan['delete_host_keys']:
+        for name in os.listdir('/etc/ssh'):
+            if name.startswith('ssh_host_'):
+                os.unlink(f'/etc/ssh/{name}')
+    for kind, (private, public) in plan['host_keys'].items():
+        write(f'/etc/ssh/ssh_host_{kind}_key', private.encode(), 0o600)
+        write(f'/etc/ssh/ssh_host_{kind}_key.pub', public.encode())
+    if not plan['host_keys']:
+        run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', 'root@instance',
+             '-f', '/etc/ssh/ssh_host_ed25519_key'])
+
+
+def first_stage(plan: Mapping[str, Any], new: bool) -> None:
+    """Do what comes before sshd."""
+    for command in plan['bootcmd']:
+        run(command, INSTANCE_ID=plan['instance'])
+    if not new:
+        return
+    write_files(entry for entry in plan['files'] if not entry['defer'])
+    if plan['hostname']:
+        write('/etc/hostname', plan['hostname'].encode() + b'\n')
+    for entry in plan['users']:
+        account(entry)
+    host_keys(plan)
+    authorize(plan['user'], [*plan['keys'], *plan['authorized_keys']])
+
+
+def last_stage() -> None:
+    """Do what comes after sshd, in a process of its own."""
+    with open(PLAN) as file:
+        plan = json.load(file)
+    if new_instance(plan):
+        for name in plan['packages']:
+            if subprocess.call(['dpkg', '-s', name], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL) != 0:
+                run(['apt-get', 'install', '-y', '-q', name])
+        write_files(entry for entry in plan['files'] if entry['defer'])
+        scripts = f'{STATE}/instance/scripts'
+        if plan['runcmd']:
+            import shlex
+            lines = [c if isinstance(c, str) else shlex.join(c) for c in plan['runcmd']]
+            write(f'{scripts}/runcmd', ('#!/bin/sh\n' + '\n'.join(lines) + '\n').encode(), 0o700)
+            run([f'{scripts}/runcmd'])
+        for number, text in enumerate(plan['scripts'], 1):
+            write(f'{scripts}/part-{number:03}', text.encode(), 0o700)
+            run([f'{scripts}/part-{number:03}'])
+        write(f'{STATE}/data/instance-id', plan['instance'].encode())
+    write(f'{STATE}/instance/boot-finished', b'done\n')
+    write(f'{RUN}/result.json', b'{"v1": {"errors": []}}\n')
+    say('cloud-init: finished')
+
+
+def new_instance(plan: Mapping[str, Any]) -> bool:
+    """Return whether this is the first boot of this instance."""
+    try:
+        with open(f'{STATE}/data/instance-id') as file:
+            return bool(file.read() != plan['instance'])
+    except FileNotFoundError:
+        return True
+
+
+def start_sshd() -> subprocess.Popen[bytes]:
+    """Start the SSH server, whose process id lies where Ubuntu's does."""
+    os.makedirs('/run/sshd', exist_ok=True)
+    return subprocess.Popen(['/usr/sbin/sshd', '-D', '-e'], stdin=subprocess.DEVNULL)
+
+
+def first_process() -> None:
+    """Boot, take in orphans until the instance is told to end, and end it."""
+    code: list[int] = []
+    wake, waker = os.pipe()
+    for end in (wake, waker):
+        os.set_blocking(end, False)
+    signal.set_wakeup_fd(waker)
+    signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
+    signal.signal(signal.SIGTERM, lambda _number, _frame: code.append(0))
+    signal.signal(signal.SIGINT, lambda _number, _frame: code.append(REBOOT))
+
+    def wait(seconds: float) -> None:
+        if select.select([wake], [], [], seconds)[0]:
+            os.read(wake, 4096)
+
+    os.environ.clear()
+    os.environ.update(PATH=PATH, LANG='C.UTF-8', HOME='/root')
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(f'{STATE}/instance/boot-finished')
+    with open(PLAN) as file:
+        plan = json.load(file)
+    write('/etc/hosts', f'127.0.0.1 localhost\n127.0.1.1 {os.uname().nodename}\n'.encode())
+    say('cloud-init: begins')
+    first_stage(plan, new_instance(plan))
+    sshd = start_sshd()
+    say('sshd: started')
+    subprocess.Popen([sys.executable, '-IS', __file__, 'final'], stdin=subprocess.DEVNULL)
+    while not code:
+        try:
+            pid, _ = os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            pid = 0
+        if pid == sshd.pid:
+            sshd = start_sshd()
+        elif pid == 0:
+            wait(5.0)
+    say('going down')
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(-1, signal.SIGTERM)
+    deadline = time.monotonic() + 1.0
+    while time.monotonic() < deadline:
+        try:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                wait(0.05)
+        except ChildProcessError:
+            break
+    sys.exit(code[0])
+
+
+def status(words: Sequence[str]) -> None:
+    """Answer as ``cloud-init status`` does."""
+    while '--wait' in words and not os.path.exists(f'{STATE}/instance/boot-finished'):
+        time.sleep(0.05)
+    print('status: ' + ('done' if os.path.exists(f'{STATE}/instance/boot-finished')
+                        else 'running'))
+
+
+def systemctl(words: Sequence[str]) -> None:
+    """Answer the few orders to systemd that make sense here; others fail as they do without it."""
+    order = [word for word in words if not word.startswith('-')]
+    ssh = {'ssh', 'sshd', 'ssh.service', 'sshd.service'}
+    if order[:1] in (['poweroff'], ['halt'], ['reboot']):
+        os.kill(1, signal.SIGINT if order == ['reboot'] else signal.SIGTERM)
+    elif order[:1] and set(order[1:]) & ssh and order[0] in (
+            'reload', 'restart', 'try-restart', 'reload-or-restart'):
+        with open(SSHD_PID) as file:
+            os.kill(int(file.read()), signal.SIGHUP)
+    elif order[:1] == ['is-active'] and set(order[1:]) <= ssh:
+        print('active')
+    elif order[:1] != ['daemon-reload']:
+        print(f'systemctl of EC2 in a box knows no {" ".join(words)!r}', file=sys.stderr)
+        sys.exit(1)
+
+
+def shutdown(program: str, words: Sequence[str]) -> None:
+    """End the instance, as ``shutdown``, ``poweroff``, ``halt`` and ``reboot`` do."""
+    when = 0.0 if program != 'shutdown' else 60.0
+    again = program == 'reboot'
+    for word in words:
+        if word in ('now', '+0'):
+            when = 0.0
+        elif word[:1] == '+':
+            when = 60.0 * int(word[1:])
+        elif word in ('-r', '--reboot'):
+            again = True
+    if when and os.fork():
+        return
+    time.sleep(when)
+    os.kill(1, signal.SIGINT if again else signal.SIGTERM)
+
+
+def main() -> None:
+    """Be what this is called as."""
+    program = sys.argv[1] if len(sys.argv) > 1 else ''
+    if program == 'final':
+        last_stage()
+    elif program == 'cloud-init':
+        status(sys.argv[2:])
+    elif program == 'systemctl':
+        systemctl(sys.argv[2:])
+    elif program:
+        shutdown(program, sys.argv[2:])
+    else:
+        first_process()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Moto, changed so that a box's instances are real: addresses, starts, ends, images.
+
+Everything here replaces a method of Moto's for the life of this process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import copy
+import threading
+from typing import Any
+
+from moto.ec2 import models
+
+from fogros2.testing.ec2.cloud import Cloud, MOTO
+from fogros2.testing.ec2.market import PublicImage
+
+#: Moto's account.
+ACCOUNT = '123456789012'
+#: What the request that a thread serves asked for beside what Moto's methods are told.
+REQUEST = threading.local()
+
+
+def install(cloud: Cloud) -> None:
+    """Put ``cloud`` behind Moto's EC2, and its addresses in the place of Moto's inventions."""
+    parts: Any = models  # its modules are replaced in part, which no type allows
+    amis, instances = parts.amis, parts.instances
+
+    def public_address() -> str:
+        return cloud.addresses.take()
+
+    def private_address(*_: Any, **__: Any) -> str:
+        return cloud.addresses.take(private=True)
+
+    parts.elastic_network_interfaces.random_public_ip = public_address
+    parts.elastic_network_interfaces.random_private_ip = private_address
+    parts.elastic_ip_addresses.random_ip = public_address
+    instances.random_private_ip = private_address
+    parts.subnets.Subnet.get_available_subnet_ip = private_address
+
+    MOTO.update(
+        start=instances.Instance.start, stop=instances.Instance.stop,
+        terminate=instances.Instance.terminate, run=instances.InstanceBackend.run_instances,
+        image=amis.AmiBackend.create_image, deregister=amis.AmiBackend.deregister_image)
+
+    def run_instances(self: Any, *args: Any, **kwargs: Any) -> Any:
+        reservation = MOTO['run'](self, *args, **kwargs)
+        for instance in reservation.instances:
+            cloud.launch(instance, spot=bool(kwargs.get('instance_market_options')))
+        return reservation
+
+    def start(self: Any) -> Any:
+        before = copy.copy(self._state)
+        if before.name == 'stopped':
+            MOTO['start'](self)
+            cloud.start(self)
+        return before
+
+    def stop(self: Any) -> Any:
+        before = copy.copy(self._state)
+        if before.name in ('pending', 'running'):
+            cloud.end(self, 'stop')
+        return before
+
+    def terminate(self: Any) -> Any:
+        before = copy.copy(self._state)
+        if before.name not in ('shutting-down', 'terminated'):
+            cloud.end(self, 'terminate')
+        return before
+
+    def reboot(self: Any) -> None:
+        cloud.reboot(self)
+
+    def create_image(
+        self: Any, instance_id: str, name: str, description: str,
+        tag_specifications: Sequence[Mapping[str, Any]],
+    ) -> Any:
+        of_snapshot = [spec for spec in tag_specifications if spec['ResourceType'] == 'snapshot']
+        others = [spec for spec in tag_specifications if spec['ResourceType'] != 'snapshot']
+        image = MOTO['image'](self, instance_id, name, description, others)
+        for spec in of_snapshot:
+            image.ebs_snapshot.add_tags({tag['Key']: tag['Value'] for tag in spec['Tags']})
+        cloud.image(image, self.get_instance(instance_id),
+                    reboot=getattr(REQUEST, 'no_reboot', '') != 'true')
+        return image
+
+    def deregister_image(self: Any, ami_id: str) -> Any:
+        answer = MOTO['deregister'](self, ami_id)
+        cloud.forget_image(ami_id)
+        return answer
+
+    for name, method in (('start', start), ('stop', stop), ('terminate', terminate),
+                         ('reboot', reboot)):
+        setattr(instances.Instance, name, method)
+    instances.InstanceBackend.run_instances = run_instances
+    amis.AmiBackend.create_image = create_image
+    amis.AmiBackend.deregister_image = deregister_image
+
+
+def publish(region: str, image: PublicImage) -> None:
+    """Let a region have a published AMI."""
+    backend = backend_of(region)
+    if image.id not in backend.amis:
+        backend.amis[image.id] = models.amis.Ami(
+            backend, image.id, name=image.name, owner_id=image.owner, owner_alias='amazon',
+            public=True, virtualization_type='hvm', architecture=image.architecture,
+            hypervisor='xen', root_device_type='ebs', root_device_name='/dev/sda1',
+            region_name=f'{region}a')
+
+
+def backend_of(region: str) -> Any:
+    """Return Moto's EC2 of a region."""
+    return models.ec2_backends[ACCOUNT][region]

@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""EC2 in a box, by boto3 alone: whether it is what tests of FogROS2 may take for EC2."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from fogros2 import process
+from fogros2.model import Command
+from fogros2.testing.ec2 import Ec2Box
+from fogros2.waiting import wait_until
+
+boto3 = pytest.importorskip('boto3', reason='needs boto3')
+pytest.importorskip('moto', reason='needs moto[server]')
+pytestmark = pytest.mark.usefixtures('engine')
+
+UBUNTU = '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id'
+ROBOT = '198.51.100.2'
+
+
+@pytest.fixture(scope='module')
+def box(engine):
+    with Ec2Box() as box:
+        yield box
+
+
+@pytest.fixture(autouse=True)
+def nothing_goes_on(box):
+    yield
+    box.heal()
+    box.set_boot_delay(0.0)
+    for region in {found.region for found in box.alive()}:
+        client(box, region=region).terminate_instances(
+            InstanceIds=[found.id for found in box.alive() if found.region == region])
+    wait_until(lambda: not box.alive(), timeout=20, what='all instances to end')
+
+
+@pytest.fixture(scope='module')
+def key(tmp_path_factory):
+    path = tmp_path_factory.mktemp('key') / 'id'
+    for name in (path, path.with_name('host')):
+        process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(name))),
+                    timeout=20)
+    return path
+
+
+def client(box, service='ec2', region='us-east-1'):
+    return boto3.client(service, region_name=region, **box.client_arguments)
+
+
+def ubuntu(box, region='us-east-1', name=UBUNTU):
+    return client(box, 'ssm', region).get_parameter(Name=name)['Parameter']['Value']
+
+
+class Launched:
+    """An instance with a key, a group of its own and known host keys."""
+
+    def __init__(self, box, key, *, config=None, region='us-east-1', **words):
+        self.box, self.key = box, key
+        self.ec2 = client(box, region=region)
+        name = f'test-{time.monotonic_ns()}'
+        self.ec2.import_key_pair(KeyName=name, PublicKeyMaterial=key.with_suffix(
+            '.pub').read_bytes())
+        self.group = self.ec2.create_security_group(
+            GroupName=name, Description='test')['GroupId']
+        self.host_key = key.with_name('host.pub').read_text()
+        config = {'ssh_keys': {
+            'ed25519_private': key.with_name('host').read_text(),
+            'ed25519_public': self.host_key}, **(config or {})}
+        words = {'InstanceType': 't3.medium', 'InstanceInitiatedShutdownBehavior': 'terminate',
+                 'MetadataOptions': {'HttpTokens': 'required'}, **words}
+        words.setdefault('ImageId', ubuntu(box, region))
+        self.made = self.ec2.run_instances(
+            MinCount=1, MaxCount=1, KeyName=name, SecurityGroupIds=[self.group],
+            UserData='#cloud-config\n' + json.dumps(config), **words)['Instances'][0]
+        self.id = self.made['InstanceId']
+
+    def allow(self, source=f'{ROBOT}/32'):
+        self.ec2.authorize_security_group_ingress(GroupId=self.group, IpPermissions=[{
+            'IpProtocol': 'tcp', 'FromPort': 22, 'ToPort': 22,
+            'IpRanges': [{'CidrIp': source}]}])
+
+    def described(self):
+        found = self.ec2.describe_instances(InstanceIds=[self.id])
+        return found['Reservations'][0]['Instances'][0]
+
+    def runs(self):
+        self.box.wait_for(self.id, 'running', computer=True)
+        return self
+
+    def ssh(self, script, *, deadline=5.0, seconds=2):
+        """Run a script from the robot, as somebody who knows the host key."""
+        address = self.described()['PublicIpAddress']
+        known = self.key.with_name('known_hosts')
+        known.write_text(f'{address} {" ".join(self.host_key.split()[:2])}\n')
+        words = self.box.on_robot([
+            'ssh', '-i', str(self.key), '-o', f'UserKnownHostsFile={known}',
+            '-o', f'ConnectTimeout={seconds}', '-o', 'BatchMode=yes', f'ubuntu@{address}',
+            script])
+        end = time.monotonic() + deadline
+        while True:
+            result = subprocess.run(words, capture_output=True, text=True, timeout=30)
+            if result.returncode != 255 or time.monotonic() > end:
+                return result
+
+
+def refused(code, action):
+    from botocore.exceptions import ClientError
+    with pytest.raises(ClientError) as caught:
+        action()
+    assert caught.value.response['Error']['Code'] == code, caught.value
+    return str(caught.value)
+
+
+def test_an_instance_is_a_computer(box, key):
+    it = Launched(box, key, config={
+        'bootcmd': ['echo "$INSTANCE_ID" >/boot-id'],
+        'write_files': [{'path': '/etc/told', 'content': 'secret', 'permissions': '0600'}],
+        'runcmd': [['sh', '-c', 'cat /etc/told >/ran']]})
+    assert it.made['State']['Name'] == 'pending'
+    it.runs()
+    # nobody gets in before the group says so
+    assert it.ssh('true', deadline=0, seconds=1).returncode == 255
+    it.allow()
+    done = it.ssh('cloud-init status --wait; cat /boot-id; sudo cat /ran; echo; id -un; hostname')
+    assert done.stdout.split('\n')[:4] == ['status: done', it.id, 'secret', 'ubuntu']
+    # its metadata service wants a token
+    done = it.ssh("""
+        url=http://169.254.169.254/latest
+        curl -s -o /dev/null -w '%{http_code}\\n' $url/meta-data/instance-id
+        token=$(curl -s -X PUT -H 'X-aws-ec2-metadata-token-ttl-seconds: 60' $url/api/token)
+        for what in instance-id spot/instance-action placement/region; do
+            curl -s -w ' %{http_code}\\n' -H "X-aws-ec2-metadata-token: $token" \\
+                $url/meta-data/$what
+        done
+        """)
+    assert done.stdout.split('\n')[:4] == ['401', f'{it.id} 200', ' 404', 'us-east-1 200']
+    # what nobody may reach from here, it can't reach either
+    assert it.ssh('curl -s -m 2 http://192.0.2.1/ || echo none').stdout.strip() == 'none'
+    # and it ends by its own word
+    assert it.described()['State']['Name'] == 'running'
+    it.ssh('sudo shutdown -h now', deadline=0)
+    ended = box.wait_for(it.id, 'terminated')
+    assert ended.reason == 'Client.InstanceInitiatedShutdown'
+    it.ec2.delete_security_group(GroupId=it.group)
+
+
+def test_the_robot_has_no_way_out_and_may_move(box):
+    def on_robot(*words):
+        return subprocess.run(box.on_robot(words), capture_output=True, text=True, timeout=20)
+
+    assert on_robot('curl', '-s', box.checkip).stdout.strip() == ROBOT
+    assert on_robot('curl', '-s', '-m', '2', 'http://192.0.2.1/').returncode != 0
+    connect = ('import socket, sys; socket.create_connection((sys.argv[1], 443), 2).close()')
+    assert on_robot(sys.executable, '-c', connect,
+                    'ec2.eu-central-1.amazonaws.com').returncode == 0
+    assert on_robot(sys.executable, '-c', connect,
+                    'ec2.sa-east-1.amazonaws.com').returncode != 0
+    assert not any(Path('/sys/class/net', name).exists() for name in (box.robot, 'robot'))
+    moved = box.move_robot()
+    try:
+        assert on_robot('curl', '-s', box.checkip).stdout.strip() == moved != ROBOT
+    finally:
+        box.move_robot(back=True)
+
+
+def test_a_disk_outlives_a_stop(box, key):
+    it = Launched(box, key, config={'bootcmd': ['echo boot >>/boots'],
+                                    'runcmd': ['echo first >>/firsts']},
+                  InstanceInitiatedShutdownBehavior='stop').runs()
+    it.allow()
+    first = it.described()['PublicIpAddress']
+    # as the system's package manager would
+    assert it.ssh('cloud-init status --wait; sudo sh -c "echo kept >/usr/local/kept; '
+                  'rm /etc/host.conf"').returncode == 0
+    it.ssh('sudo poweroff', deadline=0)
+    stopped = box.wait_for(it.id, 'stopped')
+    assert stopped.reason == 'Client.InstanceInitiatedShutdown'
+    assert 'PublicIpAddress' not in it.described()
+    it.ec2.start_instances(InstanceIds=[it.id])
+    it.runs()
+    assert it.described()['PublicIpAddress'] != first
+    done = it.ssh('cloud-init status --wait; cat /usr/local/kept /firsts; wc -l </boots; '
+                  'ls /etc/host.conf; ls /run')
+    assert done.stdout.split('\n')[:4] == ['status: done', 'kept', 'first', '2']
+    assert '/etc/host.conf' not in done.stdout
+    # stopped through the API this time
+    it.ec2.stop_instances(InstanceIds=[it.id])
+    assert it.described()['State']['Name'] == 'stopping'
+    refused('IncorrectInstanceState', lambda: it.ec2.start_instances(InstanceIds=[it.id]))
+    box.wait_for(it.id, 'stopped')
+    it.ec2.terminate_instances(InstanceIds=[it.id])
+    box.wait_for(it.id, 'terminated')
+
+
+def test_an_image_remembers_the_files(box, key):
+    it = Launched(box, key).runs()
+    it.allow()
+    it.ssh('cloud-init status --wait; sudo sh -c "echo baked >/opt/baked; sync"')
+    image = it.ec2.create_image(
+        InstanceId=it.id, Name='baked', NoReboot=True, TagSpecifications=[
+            {'ResourceType': kind, 'Tags': [{'Key': 'of', 'Value': kind}]}
+            for kind in ('image', 'snapshot')])['ImageId']
+
+    def described():
+        return it.ec2.describe_images(ImageIds=[image])['Images'][0]
+
+    wait_until(lambda: described()['State'] == 'available', timeout=20, what='the image')
+    assert it.described()['State']['Name'] == 'running'
+    snapshot = described()['BlockDeviceMappings'][0]['Ebs']['SnapshotId']
+    (tags,) = [s['Tags'] for s in it.ec2.describe_snapshots(
+        SnapshotIds=[snapshot])['Snapshots']]
+    assert tags == [{'Key': 'of', 'Value': 'snapshot'}]
+    other = Launched(box, key, config={'runcmd': ['touch /again']}, ImageId=image).runs()
+    other.allow()
+    done = other.ssh('cloud-init status --wait; cat /opt/baked; ls /again')
+    assert done.stdout.split() == ['status:', 'done', 'baked', '/again']
+    refused('InvalidSnapshot.InUse', lambda: it.ec2.delete_snapshot(SnapshotId=snapshot))
+    it.ec2.deregister_image(ImageId=image)
+    it.ec2.delete_snapshot(SnapshotId=snapshot)
+    refused('InvalidAMIID.Unavailable', lambda: Launched(box, key, ImageId=image))
+
+
+def test_a_client_token_makes_one_instance(box):
+    ec2 = client(box)
+    words = {'ImageId': ubuntu(box), 'MinCount': 1, 'MaxCount': 1, 'ClientToken': 'once'}
+
+    def run(kind='t3.medium'):
+        return ec2.run_instances(InstanceType=kind, **words)['Instances'][0]['InstanceId']
+
+    # the answer to the first gets lost
+    box.fail('InternalError', action='RunInstances', after=True)
+    with ThreadPoolExecutor(3) as pool:
+        made = set(pool.map(lambda _: run(), range(3)))
+    assert len(made) == 1
+    assert len(box.alive()) == 1
+    refused('IdempotentParameterMismatch', lambda: run('t3.large'))
+    ec2.terminate_instances(InstanceIds=list(made))
+    refused('IdempotentInstanceTerminated', run)
+
+
+def test_spot_instances_end_and_are_never_stopped(box, key):
+    spot = {'MarketType': 'spot', 'SpotOptions': {'SpotInstanceType': 'one-time'}}
+    low = {**spot, 'SpotOptions': {'MaxPrice': '0.001'}}
+    refused('SpotMaxPriceTooLow', lambda: Launched(box, key, InstanceMarketOptions=low))
+    it = Launched(box, key, InstanceMarketOptions=spot,
+                  InstanceInitiatedShutdownBehavior='stop').runs()
+    assert it.described()['InstanceLifecycle'] == 'spot'
+    refused('UnsupportedOperation', lambda: it.ec2.stop_instances(InstanceIds=[it.id]))
+    box.interrupt(it.id, notice=1.0)
+    told = box.run(it.id, """
+        url=http://169.254.169.254/latest
+        token=$(curl -s -X PUT -H 'X-aws-ec2-metadata-token-ttl-seconds: 60' $url/api/token)
+        curl -s -H "X-aws-ec2-metadata-token: $token" $url/meta-data/spot/instance-action
+        """)
+    assert json.loads(told)['action'] == 'terminate'
+    assert box.wait_for(it.id, 'terminated').reason == 'Server.SpotInstanceTermination'
+    other = Launched(box, key, InstanceMarketOptions=spot,
+                     InstanceInitiatedShutdownBehavior='stop').runs()
+    box.run(other.id, 'shutdown -h now', check=False)
+    assert box.wait_for(other.id, 'terminated').reason == 'Client.InstanceInitiatedShutdown'
+
+
+def test_it_boots_as_slowly_as_it_is_told(box, key):
+    box.set_boot_delay(2.0)
+    begin = time.monotonic()
+    it = Launched(box, key)
+    assert it.described()['State']['Name'] == 'pending'
+    assert 'PublicIpAddress' not in it.described()
+    box.wait_for(it.id, 'running')
+    assert 'PublicIpAddress' in it.described()
+    it.runs()
+    assert time.monotonic() - begin >= 2.0
+    # one that nobody wants any more before its computer is on
+    box.set_boot_delay(60.0)
+    other = Launched(box, key)
+    other.ec2.terminate_instances(InstanceIds=[other.id])
+    box.wait_for(other.id, 'terminated', timeout=5)
+
+
+@pytest.mark.parametrize('code', [
+    'InsufficientInstanceCapacity', 'VcpuLimitExceeded', 'UnauthorizedOperation', 'ExpiredToken',
+    'RequestLimitExceeded'])
+def test_errors_come_to_order(box, code):
+    from botocore.config import Config
+    once = boto3.client('ec2', region_name='us-east-1', **box.client_arguments,
+                        config=Config(retries={'total_max_attempts': 1}))
+    box.forget_calls()
+    box.fail(code, action='DescribeVpcs')
+    once.describe_subnets()
+    refused(code, once.describe_vpcs)
+    once.describe_vpcs()
+    assert [(call.action, call.error) for call in box.calls()] == [
+        ('DescribeSubnets', ''), ('DescribeVpcs', code), ('DescribeVpcs', '')]
+
+
+def test_what_ec2_refuses(box, key):
+    words = {'MinCount': 1, 'MaxCount': 1, 'ImageId': ubuntu(box)}
+    ec2 = client(box)
+    top = '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id'
+    said = refused('InvalidParameterValue', lambda: ec2.run_instances(
+        **{**words, 'ImageId': ubuntu(box, name=top)}, InstanceType='t3.medium'))
+    assert "does not match the architecture 'arm64'" in said
+    refused('InvalidParameterValue', lambda: ec2.run_instances(**words, InstanceType='t9.huge'))
+    zones = {z['ZoneName'] for z in ec2.describe_availability_zones()['AvailabilityZones']}
+    offered = {o['Location'] for o in ec2.describe_instance_type_offerings(
+        LocationType='availability-zone', Filters=[
+            {'Name': 'instance-type', 'Values': ['g5.xlarge']}])['InstanceTypeOfferings']}
+    without = sorted(zones - offered)
+    assert without
+    refused('Unsupported', lambda: ec2.run_instances(
+        **words, InstanceType='g5.xlarge', Placement={'AvailabilityZone': without[0]}))
+    refused('InvalidParameterValue', lambda: ec2.run_instances(
+        **words, InstanceType='t3.medium', UserData='#cloud-config\nruncmds: [x]\n'))
+    refused('InvalidKeyPair.NotFound', lambda: ec2.run_instances(
+        **words, InstanceType='t3.medium', KeyName='nobody'))
+    refused('InvalidAMIID.NotFound', lambda: ec2.run_instances(
+        MinCount=1, MaxCount=1, ImageId='ami-0123456789abcdef0', InstanceType='t3.medium'))
+    it = Launched(box, key)
+    refused('DependencyViolation', lambda: it.ec2.delete_security_group(GroupId=it.group))
+    assert len(box.alive()) == 1
+
+
+def test_prices_are_there(box):
+    filters = [{'Type': 'TERM_MATCH', 'Field': field, 'Value': value} for field, value in {
+        'regionCode': 'eu-central-1', 'operatingSystem': 'Linux', 'tenancy': 'Shared',
+        'preInstalledSw': 'NA', 'capacitystatus': 'Used'}.items()]
+    pages = client(box, 'pricing').get_paginator('get_products').paginate(
+        ServiceCode='AmazonEC2', Filters=filters, PaginationConfig={'PageSize': 10})
+    entries = [json.loads(text) for page in pages for text in page['PriceList']]
+    kinds = [entry['product']['attributes']['instanceType'] for entry in entries]
+    assert len(kinds) == len(set(kinds)) > 10
+    assert 't3.medium' in kinds
+    history = client(box, region='eu-central-1').describe_spot_price_history(
+        InstanceTypes=['t3.medium'], ProductDescriptions=['Linux/UNIX'])['SpotPriceHistory']
+    assert len({entry['AvailabilityZone'] for entry in history}) >= 2
+    assert all(0 < float(entry['SpotPrice']) < 0.05 for entry in history)
+
+
+def test_two_regions_are_two_places(box, key):
+    one, two = (Launched(box, key, region=region).runs()
+                for region in ('us-east-1', 'eu-central-1'))
+    assert one.described()['PublicIpAddress'] != two.described()['PublicIpAddress']
+    found = one.ec2.describe_instances(Filters=[
+        {'Name': 'instance-state-name', 'Values': ['running']}])['Reservations']
+    assert [i['InstanceId'] for r in found for i in r['Instances']] == [one.id]
+
+
+STARTER = """
+import sys, time, boto3
+from fogros2.testing.ec2 import Ec2Box
+with Ec2Box() as box:
+    ec2 = boto3.client('ec2', region_name='us-east-1', **box.client_arguments)
+    image = boto3.client('ssm', region_name='us-east-1', **box.client_arguments).get_parameter(
+        Name=sys.argv[1])['Parameter']['Value']
+    made = ec2.run_instances(ImageId=image, InstanceType='t3.medium', MinCount=1, MaxCount=1)
+    box.wait_for(made['Instances'][0]['InstanceId'], 'running', computer=True)
+    print(box.mark, box._child.pid, flush=True)
+    time.sleep(600)
+"""
+
+
+def traces_of(mark):
+    """Return what a box with this mark has on this computer now."""
+    found = [name for name in process.run(
+        Command(('ip', 'netns', 'list'), sudo=True), timeout=20).stdout.split()
+        if name.startswith(f'fogt{mark}')]
+    found += process.run(Command(
+        ('podman', 'ps', '-aq', f'--filter=label=fogros2-ec2={mark}'), sudo=True),
+        timeout=20).stdout.split()
+    found += [str(path) for path in Path('/var/lib/fogros2-ec2').glob(mark)]
+    return found + [str(path) for path in Path('/etc/netns').glob(f'fogt{mark}*')]
+
+
+@pytest.mark.parametrize('whose', ['test', 'box'])
+def test_a_box_leaves_nothing_whoever_dies(box, whose):
+    child = subprocess.Popen([sys.executable, '-c', STARTER, UBUNTU], stdout=subprocess.PIPE,
+                             text=True)
+    mark, pid = child.stdout.readline().split()
+    assert traces_of(mark)
+    if whose == 'test':
+        child.kill()
+    else:
+        process.run(Command(('kill', '-KILL', pid), sudo=True), timeout=20)
+        assert traces_of(mark)
+        os.kill(child.pid, signal.SIGKILL)
+        with Ec2Box():
+            pass  # the next one tidies up
+    child.wait(10)
+    child.stdout.close()
+    wait_until(lambda: not traces_of(mark), timeout=15, what='the box to be gone')
