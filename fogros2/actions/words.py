@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from decimal import Decimal
 import os
 from typing import Any, Optional, Protocol, TYPE_CHECKING
 
@@ -88,7 +89,7 @@ def resolve(context: LaunchContext, value: Any) -> Any:
     A list or tuple is one text in pieces, as everywhere in launch; Items become a list; other
     types are returned as they are.
     """
-    if value is None or isinstance(value, (str, int, float)):
+    if value is None or isinstance(value, (str, int, float, Decimal)):
         return value
     if isinstance(value, Number):
         text = resolve(context, value.value)
