@@ -34,6 +34,13 @@ ON_DEMAND = {
     'capacitystatus': 'Used', 'marketoption': 'OnDemand',
 }
 SPOT_PRODUCT = 'Linux/UNIX'
+#: What an operation is, for messages.
+_WORDS = {
+    'describe_instance_types': 'asking for the instance types',
+    'describe_instance_type_offerings': 'asking for the zones of the instance types',
+    'describe_spot_price_history': 'asking for the spot prices',
+    'get_products': 'asking for the prices',
+}
 #: The most types that one request for spot prices may name.
 _NAMED_TYPES = 100
 
@@ -185,7 +192,7 @@ class Market:
         return prices
 
     def _pages(self, service: str, region: str, operation: str, **arguments: Any) -> Iterator[Any]:
-        with translated(f'asking AWS what there is in {region}', region):
+        with translated(_WORDS[operation], region):
             api = self._clients(service, region)
             yield from api.get_paginator(operation).paginate(**arguments)
 
