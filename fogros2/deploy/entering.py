@@ -54,10 +54,11 @@ class Entrance:
                     endpoint, key_file=str(job.folder.key_file),
                     host_key=job.record.host_key or endpoint.host_key)
             job.save(shell=endpoint)
-            if job.provider.firewall and job.reused:
-                # the launch before closed it; or it is another address by now
+            if job.provider.firewall:
                 job.undoing('firewall', self._close)
-                self._open()
+                if job.reused:
+                    # the launch before closed it; or the robot has another address by now
+                    self._open()
             shell = self._shell = MovableShell(self._shell_to(endpoint))
             job.shell = shell
             job.undo.callback(shell.close)

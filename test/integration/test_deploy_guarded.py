@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines behind a firewall, with a host key that was handed over, that are taken away."""
+
+from __future__ import annotations
+
+import ipaddress
+import shutil
+import socket
+import threading
+import time
+import uuid
+
+import pytest
+
+from fogros2.deploy import job, Launch
+from fogros2.deploy import launch as launches
+from fogros2.model import Command, MachineSpec, NodeSpec
+from fogros2.process import run
+from fogros2.provider import container_machine
+from fogros2.provider.container import ContainerProvider
+from fogros2.store import Store
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+# what a cloud's firewall does in front of a machine; connections that exist end, too
+RULES = """\
+table inet cloud
+delete table inet cloud
+table inet cloud {
+  chain input {
+    type filter hook input priority filter; policy accept;
+    iifname "fog*" accept
+    iifname "lo" accept
+    tcp dport %d ip saddr != { %s } drop
+  }
+}
+"""
+
+
+class CloudLike(ContainerProvider):
+    """Containers as a cloud has them: behind a firewall, and with host keys from outside."""
+
+    firewall = True
+    one_time_host_key = True
+    notice = ('cat', '/run/notice')
+    robot = ''
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+        self.pinned = {}
+
+    def robot_address(self):
+        return self.robot
+
+    def allow(self, machine_id, port, sources):
+        self.asked.append((port, list(sources)))
+        engine, identity, _ = container_machine.parse_id(machine_id)
+        # 192.0.2.0 is nobody: a set has to have a member
+        rules = RULES % (port, ', '.join(sources) or '192.0.2.0')
+        engine.call('exec', identity, 'sh', '-c', 'printf %s "$1" | nft -f -', 'sh', rules,
+                    what='set the firewall')
+
+    def pin(self, machine_id, host_key):
+        self.pinned[machine_id] = host_key
+
+
+@pytest.fixture
+def cloud(monkeypatch, cloud_network):
+    provider = CloudLike()
+    subnet = run(Command(('podman', 'network', 'inspect', cloud_network, '--format',
+                          '{{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60).stdout
+    provider.robot = f'{next(ipaddress.ip_network(subnet.strip()).hosts())}/32'
+    for module in (job, launches):
+        monkeypatch.setattr(module, 'provider', lambda name: provider)
+    return provider
+
+
+@pytest.fixture
+def spec(cloud_network):
+    def make(name='guarded', **changes):
+        return MachineSpec(f'{name}-{RUN}', 'container', {'network': cloud_network}, **changes)
+    return make
+
+
+def answers(host, port=22):
+    try:
+        with socket.create_connection((host, port), timeout=1.0):
+            return True
+    except OSError:
+        return False
+
+
+def server_address(machine):
+    words = machine.shell.run(
+        Command(('sh', '-c', 'echo $SSH_CONNECTION')), timeout=20).stdout.split()
+    return words[2]
+
+
+def test_a_machine_behind_a_firewall_is_reached_through_the_vpn_alone(cloud, spec):
+    store = Store()
+    first = Launch(store=store)
+    kept = spec(on_exit='keep')
+    handed_over = []
+    describe = cloud.describe
+
+    def note(machine_id):
+        machine = describe(machine_id)
+        if machine.shell is not None and not handed_over:
+            handed_over.append(machine.shell.host_key)
+        return machine
+
+    cloud.describe = note
+    try:
+        machine = first.up(kept)
+        outside = machine.machine.shell.host
+        key = store.machine(kept.name).load().host_key
+        assert key and key not in handed_over
+        assert cloud.pinned == {machine.machine.id: key}
+        assert cloud.asked == [(22, [])]
+        assert server_address(machine) == machine.vpn_address
+        assert not answers(outside)
+        heard = []
+        machine.subscribe(heard.append)
+        machine.start([NodeSpec('n-1', 'n-1', arguments=('echo', 'hello'))])
+        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=20,
+                   what='the node to end')
+    finally:
+        assert first.down() == []
+    assert cloud.asked == [(22, []), (22, [cloud.robot]), (22, [])]
+    assert not answers(outside)
+
+    # a later launch gets in all the same, and finds the key that the machine made
+    cloud.asked.clear()
+    second = Launch(store=store)
+    try:
+        again = second.up(spec())
+        assert again.machine.id == machine.machine.id
+        assert store.machine(kept.name).load().host_key == key
+        assert cloud.asked == [(22, [cloud.robot]), (22, [])]
+        assert server_address(again) == again.vpn_address
+    finally:
+        assert second.down() == []
+
+
+def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypatch):
+    monkeypatch.setattr('fogros2.deploy.entering.ADDRESS_INTERVAL', 0.5)
+    create = cloud.create
+
+    def shut(spec, request):
+        machine_id = create(spec, request)
+        cloud.reachable(machine_id, name=spec.name, timeout=30, cancel=threading.Event())
+        cloud.allow(machine_id, 22, ['192.0.2.7/32'])
+        return machine_id
+
+    monkeypatch.setattr(cloud, 'create', shut)
+    monkeypatch.setattr('fogros2.deploy.entering.LOGIN_ATTEMPT', 1.0)
+    launch = Launch()
+    try:
+        launch.up(spec())
+    finally:
+        assert launch.down() == []
+    assert cloud.asked == [(22, ['192.0.2.7/32']), (22, [cloud.robot]), (22, [])]
+
+
+def test_what_takes_a_machine_away_is_told(cloud, spec, monkeypatch):
+    monkeypatch.setattr('fogros2.deploy.guarding.NOTICE_INTERVAL', 0.5)
+    monkeypatch.setattr('fogros2.deploy.watching.SILENCE', 2.5)
+    launch = Launch()
+    heard = []
+    try:
+        machine = launch.up(spec())
+        machine.subscribe(heard.append)
+        machine.shell.run(Command.script('echo soon gone >/run/notice', sudo=True), timeout=20)
+        wait_until(lambda: any(e['event'] == 'notice' for e in heard), timeout=20,
+                   what='the notice')
+        engine, identity, _ = container_machine.parse_id(machine.machine.id)
+        begin = time.monotonic()
+        engine.call('kill', identity, what='take the machine away')
+        wait_until(lambda: any(e['event'] == 'lost' for e in heard), timeout=25,
+                   what='the loss')
+    finally:
+        begin = time.monotonic()
+        assert launch.down() == []
+        assert time.monotonic() - begin < 15
+    told = [e for e in heard if e['event'] in ('notice', 'lost')]
+    assert [e['event'] for e in told] == ['notice', 'lost']
+    assert told[0]['reason'] == 'soon gone'
+    assert identity in told[1]['reason'] or 'stopped' in told[1]['reason']
