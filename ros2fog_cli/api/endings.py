@@ -29,7 +29,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Machine, MachineState, VpnInterface
 from fogros2.report import Reporter
-from fogros2.store import process_start, Record, Store
+from fogros2.store import process_alive, Record, Store
 from fogros2.vpn import Vpn
 from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines
@@ -150,7 +150,7 @@ def _leave(record: Record, *, force: bool) -> None:
                                  python=record.python)
             try:
                 launch = client.request('status')['launch']
-                if launch and launch != record.launch:
+                if launch not in ('', record.launch, record.last):
                     return  # ours is gone, and another robot has the computer since
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
             except AgentError:
@@ -265,7 +265,8 @@ def _dead(folder: Path, now: float) -> bool:
     """Return whether the launch of a folder is gone, by its process or else by its age."""
     try:
         data = json.loads((folder / 'process.json').read_text())
-        return process_start(int(data['pid'])) != int(data['pid_start'])
+        return not process_alive(int(data['pid']), int(data['pid_start']),
+                                 str(data.get('boot', '')))
     except (OSError, ValueError, KeyError, TypeError):
         try:
             return now - folder.stat().st_mtime > FOLDER_AGE

@@ -45,6 +45,9 @@ class StatusVerb(VerbExtension):
                         client.close()
             except FogError as error:
                 problems.append(f'agent: {error}')
+        else:
+            problems.append(f"agent: this robot has no record of '{entry.name}'; only the robot "
+                            'that launched it can ask its agent')
         if args.json:
             print(json.dumps({**status, 'problems': problems}, indent=2))
         else:

@@ -391,15 +391,18 @@ def test_a_machine_that_was_reused_lives_from_then_on() -> None:
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
     store = Store()
-    for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None)):
+    rebooted = {**alive(), 'boot': 'another'}
+    for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None),
+                        ('eeeeee', rebooted)):
         folder = store.launch(name)
         if about is not None:
             (folder / 'process.json').write_text(json.dumps(about))
     record('a', launch='dddddd', **dead())
     store.launch('dddddd')
-    assert [left.launch for left in endings.leftovers(store)] == ['bbbbbb']
+    assert [left.launch for left in endings.leftovers(store)] == ['bbbbbb', 'eeeeee']
     later = time.time() + endings.FOLDER_AGE + 60
-    assert [left.launch for left in endings.leftovers(store, later)] == ['bbbbbb', 'cccccc']
+    assert [left.launch for left in endings.leftovers(store, later)] == [
+        'bbbbbb', 'cccccc', 'eeeeee']
 
 
 def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
