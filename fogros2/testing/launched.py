@@ -23,14 +23,16 @@ class Launched:
 
     :param words: what follows ``ros2 launch``.
     :param environment: its variables, this process's unless given.
+    :param prefix: words before ``ros2``, such as what leads into a network namespace.
     """
 
     def __init__(
         self, *words: str, environment: Optional[Mapping[str, str]] = None,
+        prefix: Sequence[str] = (),
     ) -> None:
         self.said: list[str] = []
         self.child = subprocess.Popen(
-            [*_WITH_SIGINT, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
+            [*_WITH_SIGINT, *prefix, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
             env=None if environment is None else dict(environment))
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -101,8 +103,10 @@ def launching() -> Iterator[Callable[..., Launched]]:
     """Yield what starts launches; those that still run at the block's end are ended, in order."""
     started: list[Launched] = []
 
-    def start(*words: str, environment: Optional[Mapping[str, str]] = None) -> Launched:
-        started.append(Launched(*words, environment=environment))
+    def start(
+        *words: str, environment: Optional[Mapping[str, str]] = None, prefix: Sequence[str] = (),
+    ) -> Launched:
+        started.append(Launched(*words, environment=environment, prefix=prefix))
         return started[-1]
 
     try:
@@ -120,10 +124,11 @@ def launching() -> Iterator[Callable[..., Launched]]:
 
 def ros2(
     *words: str, environment: Optional[Mapping[str, str]] = None, timeout: float = 60.0,
+    prefix: Sequence[str] = (),
 ) -> subprocess.CompletedProcess[str]:
     """Run ``ros2`` with these words and return what it left; nobody is there to be asked."""
     return subprocess.run(
-        [ROS2, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout,
+        [*prefix, ROS2, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout,
         env=None if environment is None else dict(environment))
 
 
