@@ -11,10 +11,15 @@ import secrets
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
-from fogros2.store import Store
+from fogros2 import process
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider.ssh import SSHProvider
+from fogros2.store import Record, Store
+from fogros2.testing.sshd import private_sshd
 from fogros2.waiting import wait_until
 
 pytestmark = pytest.mark.timeout(240)
@@ -157,3 +162,22 @@ def test_gc_after_a_launch_that_was_killed_without_a_store(
     monkeypatch.setenv('FOGROS2_STATE_HOME', here)
     assert f'leftovers of {name}' in fog('gc').stdout
     assert fog('gc').stdout == 'nothing to clear\n'
+
+
+@pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
+def test_an_ssh_machine_whose_agent_left_is_deleted_at_once(tmp_path: Path) -> None:
+    """Its agent took its program along; what tried to run that took six seconds to give up."""
+    with private_sshd(tmp_path / 'sshd') as server:
+        endpoint = server.endpoint
+        spec = MachineSpec('lab', 'ssh', {
+            'host': endpoint.host, 'port': str(endpoint.port), 'user': endpoint.user,
+            'key': endpoint.key_file, 'host_key': endpoint.host_key})
+        machine_id = SSHProvider().create(spec, CreateRequest('token', '', {}, 51820))
+        gone = tmp_path / 'agent'
+        Store().machine('lab').save(Record(
+            'lab', 'ssh', spec, machine_id=machine_id, created=time.time(), launch='abc123',
+            shell=endpoint, agent=str(gone), agent_program=str(gone / 'agent.py')))
+        begin = time.monotonic()
+        assert 'deleted lab' in fog('delete', 'lab', '--yes').stdout
+        assert time.monotonic() - begin < 5.0
+        assert not Store().machine('lab').exists()
