@@ -31,7 +31,7 @@ from launch.events.process import ShutdownProcess
 import launch.logging
 
 from fogros2.actions import cost, private, signals, streaming
-from fogros2.actions.carriers import RobotCarrier
+from fogros2.actions.carriers import Carrier
 from fogros2.actions.console import Console
 from fogros2.actions.interruption import MachineInterrupted
 from fogros2.actions.session import Session
@@ -179,6 +179,7 @@ class Coordinator:
             session = Session(
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, taken_away=self._taken_away)
+            session.rename(self._streams.remappings(spec.name))
             self._sessions[spec.name] = session
             self._new.append(session)
             self.launch.expect([spec.name])
@@ -206,7 +207,7 @@ class Coordinator:
         self, entries: Iterable[Entry], session: Session,
     ) -> list[tuple[Optional[str], NodeSpec]]:
         """
-        Stream topics between the robot and a machine, besides what all machines stream.
+        Stream topics to and from a machine, besides what all machines stream.
 
         :return: the nodes it takes that aren't there yet, with their machine, None for the robot.
         :raises ConfigurationError: an unknown transport, or streams that contradict each other.
@@ -218,7 +219,9 @@ class Coordinator:
         if not wanted:
             return []
         new = self._streams.add(wanted, session.spec.name)
-        session.rename(self._streams.remappings(session.spec.name))
+        # another machine may be the source
+        for one in self._sessions.values():
+            one.rename(self._streams.remappings(one.spec.name))
         return new
 
     def begin(self) -> None:
@@ -416,7 +419,7 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
 
 
 def _carries(node: str, action: ExecuteLocal) -> bool:
-    return isinstance(action, RobotCarrier) and action.node == node
+    return isinstance(action, Carrier) and action.node == node
 
 
 def _nothing() -> None:

@@ -80,7 +80,8 @@ class RemoteProcess(ExecuteLocal):
                 found.append(carriers.RobotCarrier(spec, session.came_up))
             else:
                 found.append(carriers.Carrier(spec))
-                send(found[-1], self._fogros2_machine)
+                own = machine == session.spec.name
+                send(found[-1], self._fogros2_machine if own else machine)
         return found
 
     @property

@@ -33,7 +33,8 @@ def check(entries: Iterable[Entry]) -> None:
         from fogros2.image_transport.streams import stream, StreamTopic
         parts = (entry.topic, entry.transport) if isinstance(entry, StreamTopic) else entry
         if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
-            stream(_named(entry, '/'), 'machine')
+            # a name that no machine has, so that it can't be the source
+            stream(_named(entry, '/'), '')
 
 
 def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) -> list[Entry]:
@@ -50,7 +51,7 @@ def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) ->
         elif isinstance(entry, StreamTopic):
             entry = StreamTopic(
                 words.resolve(context, entry.topic), words.resolve(context, entry.transport),
-                entry.direction, **{
+                entry.direction, source=_source(context, entry.source), **{
                     key: _parameter(context, value) for key, value in entry.parameters.items()})
         found.append(_named(entry, namespace))
     return found
@@ -65,12 +66,12 @@ class Streams:
 
     def add(self, entries: Iterable[Entry], machine: str) -> list[tuple[Optional[str], NodeSpec]]:
         """
-        Add streams between the robot and ``machine``.
+        Add streams to and from ``machine``.
 
         :return: the nodes that they need and no earlier stream did, each with the machine that
             it runs on, None for the robot.
-        :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or two hosts would
-            publish one topic, or one topic reach a host in two ways. Nothing was added then.
+        :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or images would
+            come back to where they are from, or reach a host in two ways. Nothing was added then.
         """
         from fogros2.image_transport import streams
         several = list(self._streams)
@@ -88,22 +89,25 @@ class Streams:
         return new
 
     def remove(self, machine: str) -> list[str]:
-        """Forget a machine's streams; return the ids of the robot's nodes that none needs now."""
+        """Forget a machine's streams; return the ids of others' nodes that none needs now."""
         if not self._streams:
             return []
-        from fogros2.image_transport import streams
-        before = streams.nodes(self._streams).get(None, [])
+        before = self._nodes_elsewhere(machine)
         self._streams = [one for one in self._streams if machine not in (one.source, one.target)]
-        needed = {spec.id for spec in streams.nodes(self._streams).get(None, [])}
-        removed = [spec.id for spec in before if spec.id not in needed]
+        removed = sorted(before - self._nodes_elsewhere(machine))
         self._handed_out -= set(removed)
         return removed
+
+    def _nodes_elsewhere(self, machine: str) -> set[str]:
+        from fogros2.image_transport import streams
+        return {spec.id for host, specs in streams.nodes(self._streams).items()
+                if host != machine for spec in specs}
 
     def remappings(self, machine: str) -> dict[str, str]:
         """Return how the topics of the streams are renamed for nodes on a machine."""
         if not self._streams:
             return {}
-        from fogros2.image_transport.topics import remappings
+        from fogros2.image_transport.streams import remappings
         return remappings(self._streams, machine)
 
 
@@ -149,12 +153,12 @@ def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
 def _compare(one: Stream, other: Stream) -> None:
     if one.topic != other.topic:
         return
-    if one.source != other.source:
-        raise ConfigurationError(
-            f'{one.topic} is streamed both from {_host(other.source)} and from '
-            f'{_host(one.source)}',
-            'a topic comes from one host: stream it where its publisher is, or rename one of them')
-    if one.target == other.target and (
+    for host, end in ((one.source, other.target), (one.target, other.source)):
+        if host == end:
+            raise ConfigurationError(
+                f'{one.topic} is streamed both from {_host(host)} and to it',
+                'what comes in under that name would go out again: rename one of the two')
+    if (one.source, one.target) == (other.source, other.target) and (
             one.transport != other.transport or one.options != other.options):
         raise ConfigurationError(
             f'{one.topic} is streamed to {_host(one.target)} twice, in different ways',
@@ -178,7 +182,19 @@ def _named(entry: Any, namespace: str) -> Any:
 
 def _with_topic(entry: StreamTopic, topic: str) -> StreamTopic:
     from fogros2.image_transport.streams import StreamTopic
-    return StreamTopic(topic, entry.transport, entry.direction, **entry.parameters)
+    return StreamTopic(
+        topic, entry.transport, entry.direction, source=entry.source, **entry.parameters)
+
+
+def _source(context: LaunchContext, source: Any) -> Any:
+    """Return the name of the machine that publishes, None for the robot."""
+    from fogros2.actions.machines import CloudInstance
+    if not isinstance(source, CloudInstance):
+        return words.resolve(context, source)
+    from fogros2.actions.coordinator import Coordinator
+    # it may be that nothing else of the launch runs there
+    Coordinator.of(context).know(source)
+    return source.spec(context).name
 
 
 def _parameter(context: LaunchContext, value: Any) -> Any:

@@ -4,12 +4,24 @@
 from __future__ import annotations
 
 import abc
+from typing import ClassVar
 
 from fogros2.model import NodeSpec, Stream
 
 
 class ImageTransport(abc.ABC):
-    """A way to encode a topic on one side and decode it on the other; pure."""
+    """A way to encode a topic on one side and decode it on the other; pure but for ``check``."""
+
+    #: Whether the pair carries camera info too, for streams that ask for it. Where it doesn't,
+    #: camera info keeps its name, and crosses the VPN as it is.
+    camera_info: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """
+        Hold what this computer has against what a node of the pair needs; costs next to nothing.
+
+        :raises PrerequisiteError: something isn't installed.
+        """
 
     @abc.abstractmethod
     def encoder(self, stream: Stream) -> NodeSpec:

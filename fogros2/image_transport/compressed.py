@@ -7,12 +7,18 @@ import dataclasses
 
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import node
+from fogros2.image_transport.topics import check_modules, node
 from fogros2.model import NodeSpec, Stream
 
 
 class Compressed(ImageTransport):
     """``/camera`` crosses as ``/camera/compressed``, as ROS's own transport of that name."""
+
+    camera_info = True
+
+    def check(self) -> None:
+        """Look for PyAV, OpenCV and NumPy."""
+        check_modules()
 
     def encoder(self, stream: Stream) -> NodeSpec:
         """Return the encoder."""

@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import node
+from fogros2.image_transport.topics import check_modules, node
 from fogros2.model import NodeSpec, Stream
 
 
 class H264(ImageTransport):
     """``/camera`` crosses as ``/camera/h264``."""
+
+    camera_info = True
+
+    def check(self) -> None:
+        """Look for PyAV, OpenCV and NumPy."""
+        check_modules()
 
     def encoder(self, stream: Stream) -> NodeSpec:
         """Return the encoder."""

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import ClassVar, Optional
 
+from fogros2.errors import PrerequisiteError
 from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import check, identifier, local_topic
+from fogros2.image_transport.topics import check, local_topic, names_of
 from fogros2.model import NodeSpec, Stream
 
 
@@ -20,27 +23,42 @@ class Republish(ImageTransport):
 
     plugin: ClassVar[str]
 
+    def check(self) -> None:
+        """
+        Look for the two packages in AMENT_PREFIX_PATH.
+
+        :raises PrerequisiteError: one isn't there.
+        """
+        prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+        for package in ('image_transport', f'{self.plugin}_image_transport'):
+            if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).exists()
+                       for prefix in prefixes if prefix):
+                apt = f"ros-jazzy-{package.replace('_', '-')}"
+                raise PrerequisiteError(
+                    f'streams by {self.plugin} need the package {package}, which is not here',
+                    f"apt install {apt}, here and on the machine; or stream by 'h264'")
+
     def encoder(self, stream: Stream) -> NodeSpec:
         """Return republish from raw."""
         image = local_topic(stream.topic, stream.source)
-        return self._node(stream, 'encoder', stream.source, 'raw', self.plugin, {
-            'in': image, f'out/{self.plugin}': f'{stream.topic}/{self.plugin}'})
+        return self._node(stream, 'encoder', stream.source, 'raw', self.plugin, 'out', {
+            'in': image})
 
     def decoder(self, stream: Stream) -> NodeSpec:
         """Return republish to raw."""
         image = local_topic(stream.topic, stream.target)
-        return self._node(stream, 'decoder', stream.target, self.plugin, 'raw', {
-            f'in/{self.plugin}': f'{stream.topic}/{self.plugin}', 'out': image})
+        return self._node(stream, 'decoder', stream.target, self.plugin, 'raw', 'in', {
+            'out': image})
 
     def _node(
         self, stream: Stream, role: str, machine: Optional[str], source: str, target: str,
-        names: dict[str, str],
+        side: str, names: dict[str, str],
     ) -> NodeSpec:
         check(stream)
-        label = f'{identifier(stream.topic)}_{self.plugin}_{role}'
-        words = ['--ros-args', '-r', f'__node:={label}', '-p', f'in_transport:={source}',
+        label, full, between = names_of(stream, role, self.plugin)
+        words = ['--ros-args', '-r', f'__node:={full}', '-p', f'in_transport:={source}',
                  '-p', f'out_transport:={target}']
-        for old, new in names.items():
+        for old, new in {**names, f'{side}/{self.plugin}': between}.items():
             words += ['-r', f'{old}:={new}']
         if role == 'encoder':
             for key, value in stream.options.items():

@@ -10,8 +10,8 @@ from typing import Any, Literal, Optional, Union
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import check
+from fogros2.image_transport import ImageTransport, topics
+from fogros2.image_transport.topics import camera_info_topic, carries_info, check
 from fogros2.model import NodeSpec, Stream
 
 GROUP = 'fogros2.image_transport'
@@ -27,11 +27,13 @@ class StreamTopic:
 
         CloudNode(machine=..., stream_topics=[
             ('/camera', 'h264'),
-            StreamTopic('/annotated', 'h264', 'to_robot', bitrate=2_000_000)])
+            StreamTopic('/annotated', 'h264', 'to_robot', bitrate=2_000_000),
+            StreamTopic('/map', 'h264', source=mapper)])
 
     :param topic: the full name that publisher and subscriber use.
     :param transport: 'h264', 'compressed', 'raw', or another that is installed.
-    :param direction: 'to_cloud' (the robot publishes) or 'to_robot'.
+    :param direction: 'to_cloud' (the robot publishes, or ``source``) or 'to_robot'.
+    :param source: another machine of the launch, or its name, that publishes in the robot's place.
     :param parameters: the transport's own; see doc/h264.md.
     """
 
@@ -39,12 +41,13 @@ class StreamTopic:
     transport: str
     direction: Direction
     parameters: Mapping[str, Any]
+    source: Any
 
     def __init__(
-        self, topic: str, transport: str = 'h264', direction: Direction = 'to_cloud',
-        **parameters: Any,
+        self, topic: str, transport: str = 'h264', direction: Direction = 'to_cloud', *,
+        source: Any = None, **parameters: Any,
     ) -> None:
-        for name, value in (('topic', topic), ('transport', transport),
+        for name, value in (('topic', topic), ('transport', transport), ('source', source),
                             ('direction', direction), ('parameters', parameters)):
             object.__setattr__(self, name, value)
 
@@ -55,10 +58,12 @@ Entry = Union[StreamTopic, tuple[str, str]]
 
 def stream(entry: Entry, machine: str) -> Stream:
     """
-    Return the stream between the robot and ``machine`` that an entry asks for.
+    Return the stream to or from ``machine`` that an entry asks for.
 
+    :param entry: its source, if it has one, as a name.
     :raises ConfigurationError: not an entry; an unknown transport (the hint lists those there
         are) or direction; a topic that can't be carried.
+    :raises PrerequisiteError: the robot lacks what its end of the stream takes.
     """
     if isinstance(entry, tuple) and len(entry) == 2:
         entry = StreamTopic(*entry)
@@ -75,9 +80,14 @@ def stream(entry: Entry, machine: str) -> Stream:
         raise ConfigurationError(f"{entry.topic}: direction '{entry.direction}' is unknown",
                                  "there are 'to_cloud' and 'to_robot'")
     there = entry.direction == 'to_cloud'
-    made = Stream(entry.topic, entry.transport, source=None if there else machine,
+    if entry.source is not None and not there:
+        raise ConfigurationError(f"{entry.topic}: a stream 'to_robot' has its source already",
+                                 'leave source= out: the machine it stands at publishes')
+    made = Stream(entry.topic, entry.transport, source=entry.source if there else machine,
                   target=machine if there else None, options=dict(entry.parameters))
     check(made)
+    if None in (made.source, made.target):
+        _transport(made).check()
     return made
 
 
@@ -91,13 +101,31 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
     :raises PrerequisiteError: a transport's own dependency isn't installed.
     """
     found: dict[Optional[str], dict[str, NodeSpec]] = {}
+    informed: dict[tuple[Optional[str], Optional[str], str], str] = {}
     for one in streams:
-        transport: ImageTransport = plugin_system.load(GROUP, one.transport)()
+        transport = _transport(one)
+        decoded = one
+        if transport.camera_info and carries_info(one):
+            # images beside each other have one camera info: it comes with the first of them
+            info = camera_info_topic(one.topic)
+            if informed.setdefault((one.source, one.target, info), one.topic) != one.topic:
+                decoded = dataclasses.replace(one, options={**one.options, 'camera_info': False})
         for machine, spec in ((one.source, transport.encoder(one)),
-                              (one.target, transport.decoder(one))):
+                              (one.target, transport.decoder(decoded))):
             there = found.setdefault(machine, {})
             if there.setdefault(spec.id, spec) != spec:
                 raise ConfigurationError(
                     f'{one.topic} is streamed twice with different parameters',
                     'give both streams the same ones')
     return {machine: list(specs.values()) for machine, specs in found.items()}
+
+
+def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:
+    """Return how topics of streams are renamed for nodes on a host; nothing on the robot."""
+    return topics.remappings(
+        [(one, _transport(one).camera_info) for one in streams], machine)
+
+
+def _transport(one: Stream) -> ImageTransport:
+    made: ImageTransport = plugin_system.load(GROUP, one.transport)()
+    return made

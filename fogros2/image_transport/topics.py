@@ -5,20 +5,27 @@ What the topics of a stream are called, on the robot and on machines; pure.
 On the robot a topic keeps its own name, so that drivers and viewers that a launch didn't start
 work as they are. On a machine, image and camera info get a name of that machine's own
 (``/camera`` becomes ``/fogros2/planner/camera``): the two sides would find each other across the
-VPN otherwise, and the raw images cross it. Between the two is the stream (``/camera/h264``).
+VPN otherwise, and the raw images cross it. Between the two is the stream, beside the image that
+it comes from (``/camera/h264``, ``/fogros2/planner/annotated/h264``): so several hosts may publish
+one topic.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+import importlib.util
 import json
 import re
 from typing import Any, Optional
 
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import NodeSpec, Stream
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+#: What image_transport_h264 imports, and what brings it with pip and apt.
+_MODULES = {
+    'av': ('av', 'python3-av'), 'cv2': ('opencv-python-headless', 'python3-opencv'),
+    'numpy': ('numpy', 'python3-numpy')}
 #: Options of a Stream that are no parameters of the encoder.
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
 
@@ -59,21 +66,54 @@ def carries_info(stream: Stream) -> bool:
     return bool(stream.options.get('camera_info', stream.source is None))
 
 
-def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:
+def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
+    """
+    Return a label of one of a stream's nodes, unique on its host; its node's name; the stream.
+
+    :param role: 'encoder' or 'decoder'.
+    :param name: last part of the stream's topic.
+    """
+    machine = stream.source if role == 'encoder' else stream.target
+    label = f'{identifier(stream.topic)}_{name}_{role}'
+    if role == 'decoder' and stream.source is not None:
+        label += f'_from_{identifier(stream.source)}'
+    full = label if machine is None else f'{label}_on_{identifier(machine)}'
+    return label, full, f'{local_topic(stream.topic, stream.source)}/{name}'
+
+
+def check_modules() -> None:
+    """
+    Look whether image_transport_h264 can run here.
+
+    :raises PrerequisiteError: it can't.
+    """
+    lacking = [names for module, names in _MODULES.items()
+               if importlib.util.find_spec(module) is None]
+    if lacking:
+        pip, apt = (' '.join(words) for words in zip(*lacking))
+        raise PrerequisiteError(
+            f'streams of images need {pip}, which this Python does not have',
+            f'pip install {pip}, or apt install {apt}')
+
+
+def remappings(
+    streams: Iterable[tuple[Stream, bool]], machine: Optional[str],
+) -> dict[str, str]:
     """
     Return how topics of streams are renamed for nodes on a host; nothing on the robot.
 
-    For a node that subscribes to a topic or publishes it; its camera info goes along.
+    For a node that subscribes to a topic or publishes it.
 
+    :param streams: each with whether its nodes carry camera info as well.
     :param machine: where the nodes run, None for the robot.
     """
     names: dict[str, str] = {}
     if machine is None:
         return names
-    for stream in streams:
+    for stream, informed in streams:
         if machine in (stream.source, stream.target):
             names[stream.topic] = local_topic(stream.topic, machine)
-            if carries_info(stream):
+            if informed and carries_info(stream):
                 info = camera_info_topic(stream.topic)
                 names[info] = local_topic(info, machine)
     return names
@@ -119,14 +159,13 @@ def node(
     """
     check(stream)
     image = local_topic(stream.topic, machine)
-    between = f'{stream.topic}/{name}'
+    label, full, between = names_of(stream, role, name)
     parameters: dict[str, Any] = {
         'codec': codec, 'stream': between, 'camera_info': carries_info(stream)}
     for key, value in stream.options.items():
         if key != 'camera_info' and (key in _DECODER_PARAMETERS) == (role == 'decoder'):
             parameters[key] = value
-    label = f'{identifier(stream.topic)}_{name}_{role}'
-    words = ['--ros-args', '-r', f'__node:={label}', '-r', f'image:={image}']
+    words = ['--ros-args', '-r', f'__node:={full}', '-r', f'image:={image}']
     for key, value in parameters.items():
         words += ['-p', f'{key}:={_yaml(key, value)}']
     return NodeSpec(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import re
 import threading
 
@@ -121,7 +122,7 @@ def test_both_directions(run, fake, planner):
     assert run(watched(fake, LaunchDescription, talker(
         planner, stream_topics=[('/camera', 'h264'), BACK]))) == 0
     assert there(fake, 'planner') == ['camera_h264_decoder', 'own', 'seen_h264_encoder']
-    assert here(fake) == ['camera_h264_encoder', 'seen_h264_decoder']
+    assert here(fake) == ['camera_h264_encoder', 'seen_h264_decoder_from_planner']
     assert rules(fake, 'planner') == [
         '/camera:=/fogros2/planner/camera', '/camera_info:=/fogros2/planner/camera_info',
         '/seen:=/fogros2/planner/seen']
@@ -144,7 +145,7 @@ def test_what_the_user_remapped(run, fake, planner):
         '/arm/camera_info:=/fogros2/planner/arm/camera_info']
     # what the group says is for its nodes, not for those that carry streams
     decoder = rules(fake, 'planner', 'arm_camera_h264_decoder')
-    assert decoder[:2] == ['__node:=arm_camera_h264_decoder',
+    assert decoder[:2] == ['__node:=arm_camera_h264_decoder_on_planner',
                            'image:=/fogros2/planner/arm/camera']
     assert not [rule for rule in decoder if '__ns' in rule or rule.startswith('image:=camera')]
 
@@ -256,8 +257,52 @@ def test_an_unknown_transport_elsewhere(run, fake, planner, make, capfd):
 
 def test_contradictions_are_refused_before_anything(run, fake, planner, mapper, capfd):
     assert run(LaunchDescription([
-        talker(planner, stream_topics=[BACK]), talker(mapper, stream_topics=[BACK])])) == 1
-    assert "/seen is streamed both from 'planner' and from 'mapper'" in capfd.readouterr().out
+        talker(planner, stream_topics=[BACK]),
+        talker(mapper, stream_topics=[('/seen', 'h264')])])) == 1
+    assert '/seen is streamed both from the robot and to it' in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_one_topic_comes_back_from_several_machines(run, fake, planner, mapper):
+    ends_when_all_started(fake, 6)
+    assert run(watched(fake, FogROSLaunchDescription, talker(planner), talker(mapper),
+                       stream_topics=[BACK])) == 0
+    assert here(fake) == ['seen_h264_decoder_from_mapper', 'seen_h264_decoder_from_planner']
+    for machine in ('planner', 'mapper'):
+        assert there(fake, machine) == ['own', 'seen_h264_encoder']
+        assert f'/seen:=/fogros2/{machine}/seen' in rules(fake, machine)
+
+
+@pytest.mark.parametrize('first', ['source', 'target'])
+@pytest.mark.parametrize('kind', [LaunchDescription, FogROSLaunchDescription])
+def test_from_machine_to_machine(run, fake, planner, mapper, first, kind):
+    """Both nodes know the topic's new name, whichever of them the launch file has first."""
+    ends_when_all_started(fake, 4)
+    nodes = [talker(mapper), talker(planner, stream_topics=[StreamTopic('/map', source=mapper)])]
+    if first == 'target':
+        nodes.reverse()
+    assert run(watched(fake, kind, *nodes)) == 0
+    assert here(fake) == []
+    assert there(fake, 'mapper') == ['map_h264_encoder', 'own']
+    assert there(fake, 'planner') == ['map_h264_decoder_from_mapper', 'own']
+    assert rules(fake, 'mapper') == ['/map:=/fogros2/mapper/map']
+    assert rules(fake, 'planner') == ['/map:=/fogros2/planner/map']
+
+
+def test_a_source_that_is_no_machine_of_the_launch(run, fake, planner, capfd):
+    assert run(LaunchDescription([
+        talker(planner, stream_topics=[StreamTopic('/map', source='mapper')])])) == 1
+    assert "no machine of this launch is called 'mapper'" in capfd.readouterr().out
+    assert not fake.noted('up')
+
+
+def test_what_the_robot_lacks_for_streams_is_said_before_anything(
+        run, fake, planner, capfd, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name, *rest: (
+        None if name == 'av' else find(name, *rest)))
+    assert run(LaunchDescription([talker(planner, stream_topics=[('/camera', 'h264')])])) == 1
+    assert 'pip install av, or apt install python3-av' in capfd.readouterr().out
     assert not fake.noted('up')
 
 

@@ -94,9 +94,10 @@ def test_nodes_are_handed_out_once() -> None:
 
 
 @pytest.mark.parametrize(('first', 'second', 'machine', 'said'), [
-    (('/a', 'h264'), StreamTopic('/a', 'h264', 'to_robot'), 'one', 'both from the robot and'),
-    (StreamTopic('/a', 'h264', 'to_robot'), StreamTopic('/a', 'h264', 'to_robot'), 'two',
-     "both from 'one' and from 'two'"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', 'to_robot'), 'one', "from 'one' and to it"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', 'to_robot'), 'two', 'from the robot and to it'),
+    (StreamTopic('/a', source='two'), StreamTopic('/a', source='one'), 'two',
+     "from 'one' and to it"),
     (('/a', 'h264'), ('/a', 'compressed'), 'one', "to 'one' twice"),
     (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'one', "to 'one' twice"),
     (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'two', 'different parameters')])

@@ -3,23 +3,26 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from fogros2 import plugin_system
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.image_transport.compressed import Compressed
 from fogros2.image_transport.h264 import H264
-from fogros2.image_transport.streams import nodes, stream, StreamTopic
+from fogros2.image_transport.republish import Theora
+from fogros2.image_transport.streams import nodes, remappings, stream, StreamTopic
 from fogros2.model import Stream
 
-PLUGINS: dict[str, Any] = {'h264': H264, 'compressed': Compressed}
+PLUGINS: dict[str, Any] = {'h264': H264, 'compressed': Compressed, 'theora': Theora}
 
 
 @pytest.fixture(autouse=True)
 def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let two transports be installed, whatever this environment has."""
+    """Let three transports be installed, whatever this environment has."""
     monkeypatch.setattr(plugin_system, 'names', lambda group: sorted(PLUGINS))
     monkeypatch.setattr(plugin_system, 'load', lambda group, name: PLUGINS[name])
 
@@ -29,12 +32,16 @@ def test_entries() -> None:
     assert stream(StreamTopic('/seen', 'h264', 'to_robot', bitrate=1_000_000), 'm') == Stream(
         '/seen', 'h264', source='m', options={'bitrate': 1_000_000})
     assert StreamTopic('/c') == StreamTopic('/c', 'h264', 'to_cloud')
+    assert stream(StreamTopic('/map', source='a'), 'b') == Stream(
+        '/map', 'h264', source='a', target='b')
 
 
 @pytest.mark.parametrize(('entry', 'said'), [
-    (('/camera', 'h265'), 'there are: compressed, h264'),
-    (('/camera', 'vhs'), 'there are: compressed, h264'),
+    (('/camera', 'h265'), 'there are: compressed, h264, theora'),
+    (('/camera', 'vhs'), 'there are: compressed, h264, theora'),
     ('/camera', 'StreamTopic'), (('/camera',), 'StreamTopic'), (('camera', 'h264'), 'full name'),
+    (StreamTopic('/camera', direction='to_robot', source='a'), 'leave source= out'),
+    (StreamTopic('/camera', source='m'), 'from m to itself'),
     (StreamTopic('/camera', direction='up'), 'direction')])  # type: ignore[arg-type]
 def test_what_is_refused(entry: Any, said: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
@@ -47,7 +54,7 @@ def test_nodes_of_several_streams_and_machines() -> None:
                stream(StreamTopic('/seen', 'compressed', 'to_robot'), 'a')]
     found = {machine: [spec.name for spec in specs] for machine, specs in nodes(streams).items()}
     assert found == {
-        None: ['camera_h264_encoder', 'seen_compressed_decoder'],
+        None: ['camera_h264_encoder', 'seen_compressed_decoder_from_a'],
         'a': ['camera_h264_decoder', 'seen_compressed_encoder'], 'b': ['camera_h264_decoder']}
 
 
@@ -56,3 +63,77 @@ def test_one_topic_is_encoded_in_one_way() -> None:
                stream(StreamTopic('/camera', bitrate=500_000), 'b')]
     with pytest.raises(ConfigurationError, match='twice'):
         nodes(streams)
+
+
+def test_one_topic_from_several_machines() -> None:
+    """Each has a stream of its own, and nodes with names of their own."""
+    back = StreamTopic('/seen', 'h264', 'to_robot')
+    found = nodes([stream(back, 'a'), stream(back, 'b')])
+    assert [spec.name for spec in found[None]] == [
+        'seen_h264_decoder_from_a', 'seen_h264_decoder_from_b']
+    words = [word for specs in found.values() for spec in specs for word in spec.arguments]
+    assert sorted(word for word in words if 'stream:=' in str(word)) == sorted(
+        2 * ['stream:="/fogros2/a/seen/h264"', 'stream:="/fogros2/b/seen/h264"'])
+    names = [word for word in words if '__node' in str(word)]
+    assert len(set(names)) == 4, names
+
+
+def test_from_one_machine_to_another() -> None:
+    between = [stream(StreamTopic('/map', source='a'), 'b')]
+    found = nodes(between)
+    assert {machine: [spec.name for spec in specs] for machine, specs in found.items()} == {
+        'a': ['map_h264_encoder'], 'b': ['map_h264_decoder_from_a']}
+    assert 'image:=/fogros2/a/map' in found['a'][0].arguments
+    assert 'image:=/fogros2/b/map' in found['b'][0].arguments
+    assert remappings(between, 'a') == {'/map': '/fogros2/a/map'}
+    assert remappings(between, 'b') == {'/map': '/fogros2/b/map'}
+
+
+def test_two_images_of_one_camera_have_one_camera_info() -> None:
+    """It would come twice otherwise; another machine, and another camera, has its own."""
+    streams = [stream((topic, 'h264'), machine) for topic, machine in (
+        ('/camera/image_raw', 'a'), ('/camera/image_rect', 'a'), ('/camera/image_rect', 'b'),
+        ('/other/image_raw', 'a'))]
+
+    def told(machine: str) -> list[bool]:
+        return ['camera_info:=true' in spec.arguments for spec in nodes(streams)[machine]]
+
+    assert told('a') == [True, False, True]
+    assert told('b') == [True]
+    # as it is asked for, or not, on the other side
+    assert ['camera_info:=true' in spec.arguments for spec in nodes(streams)[None]] == 3 * [True]
+
+
+def test_camera_info_that_a_transport_leaves_alone_keeps_its_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Theora, 'check', lambda self: None)
+    assert remappings([stream(('/arm/camera', 'theora'), 'm')], 'm') == {
+        '/arm/camera': '/fogros2/m/arm/camera'}
+
+
+@pytest.mark.parametrize('module', ['av', 'cv2', 'numpy'])
+def test_what_the_robot_lacks_is_found_at_once(
+    monkeypatch: pytest.MonkeyPatch, module: str,
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: (
+        None if name == module else find(name)))
+    with pytest.raises(PrerequisiteError) as caught:
+        stream(('/camera', 'h264'), 'm')
+    assert 'pip install' in caught.value.hint
+    # between machines, the robot has nothing to do
+    assert stream(StreamTopic('/camera', source='a'), 'b')
+
+
+def test_what_republish_lacks_is_found_at_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    for package in ('image_transport', 'theora_image_transport'):
+        with pytest.raises(PrerequisiteError, match=f'need the package {package},'):
+            stream(('/camera', 'theora'), 'm')
+        (index / package).touch()
+    assert stream(('/camera', 'theora'), 'm').transport == 'theora'

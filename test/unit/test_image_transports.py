@@ -36,7 +36,7 @@ def test_robot_to_cloud() -> None:
         'stream': '"/front/image_raw/h264"', 'bitrate': '2000000', 'quality': '21.5',
         'lossless': 'false', 'preset': '"superfast"'}
     assert words(decoder.arguments) == {
-        '__node': 'front_image_raw_h264_decoder',
+        '__node': 'front_image_raw_h264_decoder_on_planner_1',
         'image': '/fogros2/planner_1/front/image_raw',
         'camera_info': 'true', 'codec': '"h264"',
         'stream': '"/front/image_raw/h264"', 'show_damage': 'true'}
@@ -49,7 +49,8 @@ def test_cloud_to_robot() -> None:
     encoder, decoder = H264().encoder(FROM_CLOUD), H264().decoder(FROM_CLOUD)
     assert words(encoder.arguments)['image'] == '/fogros2/planner_1/annotated'
     assert words(decoder.arguments)['image'] == '/annotated'
-    assert words(encoder.arguments)['stream'] == words(decoder.arguments)['stream']
+    assert words(encoder.arguments)['stream'] == words(decoder.arguments)['stream'] == (
+        '"/fogros2/planner_1/annotated/h264"')
 
 
 def test_one_encoder_serves_two_machines() -> None:
@@ -79,7 +80,7 @@ def test_raw_and_republish() -> None:
         '__node': 'camera_theora_encoder', 'in_transport': 'raw', 'out_transport': 'theora',
         'in': '/camera', 'out/theora': '/camera/theora', '.camera.theora.quality': '31'}
     assert words(decoder.arguments) == {
-        '__node': 'camera_theora_decoder', 'in_transport': 'theora', 'out_transport': 'raw',
+        '__node': 'camera_theora_decoder_on_m', 'in_transport': 'theora', 'out_transport': 'raw',
         'in/theora': '/camera/theora', 'out': '/fogros2/m/camera'}
 
 
@@ -105,7 +106,8 @@ def test_names_on_a_machine() -> None:
 
 
 def test_remappings_are_of_the_machines_that_take_part() -> None:
-    streams = [TO_CLOUD, FROM_CLOUD, Stream('/other', 'h264', target='elsewhere')]
+    streams = [(one, True) for one in (
+        TO_CLOUD, FROM_CLOUD, Stream('/other', 'h264', target='elsewhere'))]
     assert remappings(streams, None) == {}
     assert remappings(streams, 'planner-1') == {
         '/front/image_raw': '/fogros2/planner_1/front/image_raw',
@@ -118,7 +120,7 @@ def test_camera_info_comes_back_only_when_asked_for() -> None:
     assert words(H264().decoder(FROM_CLOUD).arguments)['camera_info'] == 'false'
     asked = Stream('/left/annotated', 'h264', source='m', options={'camera_info': True})
     assert words(H264().encoder(asked).arguments)['camera_info'] == 'true'
-    assert remappings([asked], 'm')['/left/camera_info'] == '/fogros2/m/left/camera_info'
+    assert remappings([(asked, True)], 'm')['/left/camera_info'] == '/fogros2/m/left/camera_info'
 
 
 @pytest.mark.parametrize(('own', 'namespace', 'expected'), [
