@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from decimal import Decimal
 import datetime
+from decimal import Decimal
 import logging
 from pathlib import Path
 import urllib.request
@@ -35,12 +35,15 @@ def moto_server() -> Iterator[str]:
 @pytest.fixture
 def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
-    import boto3
     from moto.core import DEFAULT_ACCOUNT_ID
+    from moto.ec2.models import ec2_backends
+    from moto.ec2.models.amis import AmiBackend
     from moto.ssm.models import Parameter, ssm_backends
 
     from fogros2.provider.aws import images
 
+    # a thousand of other people's images, loaded anew for each test and region
+    monkeypatch.setenv('MOTO_EC2_LOAD_DEFAULT_AMIS', 'false')
     urllib.request.urlopen(urllib.request.Request(
         f'{moto_server}/moto-api/reset', method='POST'), timeout=10.0).close()
     for name, value in {
@@ -53,18 +56,29 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         monkeypatch.setenv(name, value)
     for name in ('AWS_PROFILE', 'AWS_SESSION_TOKEN', 'AWS_REGION'):
         monkeypatch.delenv(name, raising=False)
+    create_image = AmiBackend.create_image
+
+    def create_with_snapshots(self, instance_id, name, description, tag_specifications):
+        """Tag an image's snapshot as well, which Moto doesn't know of."""
+        kinds = {kind: [tag for spec in tag_specifications if spec['ResourceType'] == kind
+                        for tag in spec['Tags']] for kind in ('image', 'snapshot')}
+        image = create_image(self, instance_id, name, description, [
+            {'ResourceType': 'image', 'Tags': kinds['image']}])
+        image.ebs_snapshot.add_tags({tag['Key']: tag['Value'] for tag in kinds['snapshot']})
+        return image
+
+    monkeypatch.setattr(AmiBackend, 'create_image', create_with_snapshots)
     # Moto has no price list
     monkeypatch.setattr('fogros2.provider.aws.choices.price_of',
                         lambda *args, **kwargs: Decimal('0.0416'))
     for region in MOTO_REGIONS:
-        ec2 = boto3.client('ec2', region)
         for arch in images.UBUNTU:
-            # Moto takes no parameter whose name is AWS's own, and has none of these
             for path in (images.UBUNTU[arch], images.DEEP_LEARNING[arch]):
-                image = ec2.register_image(
-                    Name=path, Architecture=arch, RootDeviceName='/dev/sda1',
-                    VirtualizationType='hvm')['ImageId']
+                # by its insides: Moto drops what an image is registered with, and takes no
+                # parameter whose name is AWS's own
+                image = ec2_backends[DEFAULT_ACCOUNT_ID][region].register_image(path, path)
+                image.architecture, image.virtualization_type = arch, 'hvm'
                 ssm_backends[DEFAULT_ACCOUNT_ID][region]._parameters[path] = [Parameter(
-                    DEFAULT_ACCOUNT_ID, path, image, 'String', None, None, None,
+                    DEFAULT_ACCOUNT_ID, path, image.id, 'String', None, None, None,
                     datetime.datetime.now(), 1, 'text')]
     return moto_server

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 import os
 from pathlib import Path
 import threading
 from typing import Any, Optional
 
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws.failures import translated
 
 #: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
@@ -133,10 +134,8 @@ class Account:
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""
-        from botocore.exceptions import BotoCoreError, ClientError
-        try:
+        with contextlib.suppress(FogError), translated('decoding a message of AWS', region):
             answer = self.client('sts', region, hasty=True).decode_authorization_message(
                 EncodedMessage=message)
-        except (ClientError, BotoCoreError):
-            return ''
-        return str(answer['DecodedMessage'])
+            return str(answer['DecodedMessage'])
+        return ''

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
 from decimal import Decimal
+import time
 from typing import Any, Optional
 
 from fogros2.errors import Cancelled, FogError, NameTaken
@@ -22,7 +23,7 @@ from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError, code_of, GONE, NO_ROOM, NO_ROOM_IN_REGION
 from fogros2.provider.aws.host_key import one_time
 from fogros2.provider.aws.images import Kind
-from fogros2.provider.aws.instances import MachineId, Place, TAG_ATTEMPT
+from fogros2.provider.aws.instances import MachineId, Place, TAG_ATTEMPT, TAG_MADE
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.user_data import user_data
 
@@ -126,10 +127,11 @@ class Creation:
             undo.callback(_attempt, lambda: self._drop_group(region))
             undo.callback(_attempt, lambda: drop_key(self.account, region, self.attempt))
             with ThreadPoolExecutor(1, 'fog-aws') as pool:
-                importing = pool.submit(self._import_key, region, tags)
+                made = {**tags, TAG_MADE: str(int(time.time()))}
+                importing = pool.submit(self._import_key, region, made)
                 group = network.create_group(
                     self.account, region, attempt=self.attempt, name=self.spec.name, vpc=vpc,
-                    tags=tags, vpn_port=self.request.vpn_port, sources=sources)
+                    tags=made, vpn_port=self.request.vpn_port, sources=sources)
                 importing.result()
             instance = self._first_with_room(region, chosen, group, {
                 **tags, instances.TAG_HOST_KEY: host_key.public}, data)

@@ -6,26 +6,36 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from fogros2.provider import TAG_NAME
 from fogros2.provider.aws import instances, network
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.creation import drop_key
 from fogros2.provider.aws.failures import AwsError, code_of, GONE
-from fogros2.provider.aws.instances import MachineId, TAG_ATTEMPT
+from fogros2.provider.aws.instances import MachineId, TAG_ATTEMPT, TAG_MADE
 from fogros2.waiting import wait_until
 
 #: Seconds that an instance may take to end; usually it is half a minute.
 PATIENCE = 300.0
+#: Seconds after which a group without an instance gets none any more.
+SETTLED = 900.0
 
 
 def destroy(account: Account, machine: MachineId) -> None:
     """
     End an instance and everything that was made for it; returns when all is gone.
 
-    What is gone already is no error, and what it left behind goes all the same.
+    What is gone already is no error, and what it left behind goes all the same. An instance that
+    doesn't carry the machine's tag isn't touched.
 
     :raises FogError: something could not be deleted.
     """
-    if _terminate(account, machine):
+    if _there(account, machine):
+        try:
+            account.call('ec2', machine.region, 'terminate_instances',
+                         f'ending {machine.instance}', InstanceIds=[machine.instance])
+        except AwsError as error:
+            if code_of(error) not in GONE:
+                raise
         wait_until(
             lambda: not _there(account, machine), timeout=PATIENCE, interval=1.0, longest=5.0,
             what=f'{machine.instance} in {machine.region} to be terminated',
@@ -33,28 +43,12 @@ def destroy(account: Account, machine: MachineId) -> None:
     sweep(account, machine.region, machine.attempt)
 
 
-def _terminate(account: Account, machine: MachineId) -> bool:
-    """Ask for the end; returns whether there is something to wait for."""
-    try:
-        answer = account.call('ec2', machine.region, 'terminate_instances',
-                              f'ending {machine.instance}', InstanceIds=[machine.instance])
-    except AwsError as error:
-        if code_of(error) in GONE:
-            return False
-        raise
-    return any(entry['CurrentState']['Name'] != 'terminated'
-               for entry in answer['TerminatingInstances'])
-
-
 def _there(account: Account, machine: MachineId) -> bool:
-    try:
-        found = instances.instances_in(account.call(
-            'ec2', machine.region, 'describe_instances', f'watching {machine.instance} end',
-            InstanceIds=[machine.instance])['Reservations'])
-    except AwsError as error:
-        if code_of(error) in GONE:
-            return False
-        raise
+    # by filters: unlike an id that EC2 has forgotten, what they don't find is no error
+    found = instances.instances_in(account.call(
+        'ec2', machine.region, 'describe_instances', f'watching {machine.instance} end',
+        Filters=[{'Name': 'instance-id', 'Values': [machine.instance]},
+                 *instances.tag_filters({TAG_ATTEMPT: machine.attempt})])['Reservations'])
     return any(instance['State']['Name'] != 'terminated' for instance in found)
 
 
@@ -75,6 +69,32 @@ def sweep(account: Account, region: str, attempt: str) -> None:
     for volume in volumes:
         _gone_is_fine(account, region, 'delete_volume', 'deleting a disk',
                       VolumeId=volume['VolumeId'])
+
+
+def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
+    """
+    Return attempts of which only a group or a key is left, and the names of their machines.
+
+    A machine that ends by itself takes its disk and address along, but not these.
+
+    :param now: seconds since the epoch; what was made just before may get its instance still.
+    """
+    ours = [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}]
+    entries = [
+        *account.pages('ec2', region, 'describe_security_groups', 'SecurityGroups',
+                       'looking for what is left', Filters=ours),
+        *account.call('ec2', region, 'describe_key_pairs', 'looking for what is left',
+                      Filters=ours)['KeyPairs']]
+    tags = [instances.tags_of(entry) for entry in entries]
+    left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
+            if now - float(t.get(TAG_MADE, 0)) > SETTLED}
+    if left:
+        for instance in instances.instances_in(account.pages(
+                'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
+                Filters=[*ours, {'Name': 'instance-state-name',
+                                 'Values': [*instances.ALIVE, 'shutting-down']}])):
+            left.pop(instances.tags_of(instance)[TAG_ATTEMPT], None)
+    return left
 
 
 def _gone_is_fine(account: Account, region: str, operation: str, what: str, **words: Any) -> None:

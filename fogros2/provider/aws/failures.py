@@ -172,11 +172,16 @@ def translated(
     :raises AwsError: AWS refused.
     """
     from botocore import exceptions
+    from botocore.parsers import ResponseParserError
 
     try:
         yield
     except exceptions.ClientError as error:
         raise refused(error.response, error.operation_name, what, region, decode) from error
+    except ResponseParserError as error:
+        raise PrerequisiteError(
+            f'{what}{f" in {region}" if region else ""} failed: what answered is not AWS',
+            'is there a proxy, or a page to log in to this network?') from error
     except exceptions.BotoCoreError as error:
         raise _unsent(error, what, region) from error
 

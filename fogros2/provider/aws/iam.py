@@ -5,41 +5,22 @@ from __future__ import annotations
 
 from typing import Any
 
-#: What a launch takes, from nothing to nothing.
-LAUNCH = (
-    'ec2:AuthorizeSecurityGroupIngress',
-    'ec2:CreateSecurityGroup',
-    'ec2:CreateTags',
-    'ec2:DeleteKeyPair',
-    'ec2:DeleteSecurityGroup',
+from fogros2.provider.aws.images import TAG_BAKED
+from fogros2.provider.aws.instances import TAG_ATTEMPT
+
+#: Asked of what anybody has.
+LOOK = (
     'ec2:DescribeAddresses',
     'ec2:DescribeImages',
     'ec2:DescribeInstanceTypes',
     'ec2:DescribeInstances',
     'ec2:DescribeKeyPairs',
+    'ec2:DescribeRegions',
     'ec2:DescribeSecurityGroups',
+    'ec2:DescribeSnapshots',
     'ec2:DescribeSubnets',
     'ec2:DescribeVolumes',
-    'ec2:ImportKeyPair',
-    'ec2:RevokeSecurityGroupIngress',
-    'ec2:RunInstances',
-    'ec2:TerminateInstances',
     'ssm:GetParameter',
-)
-#: ``on_exit='stop'``, what a machine has besides, and ``ros2 fog list`` over regions.
-MACHINES = (
-    'ec2:DeleteVolume',
-    'ec2:DescribeRegions',
-    'ec2:ReleaseAddress',
-    'ec2:StartInstances',
-    'ec2:StopInstances',
-)
-#: ``ros2 fog image``.
-IMAGES = (
-    'ec2:CreateImage',
-    'ec2:DeleteSnapshot',
-    'ec2:DeregisterImage',
-    'ec2:DescribeSnapshots',
 )
 #: ``ros2 fog price``, 'cheapest', ``max_price=`` and the cost column.
 PRICES = (
@@ -47,18 +28,57 @@ PRICES = (
     'ec2:DescribeSpotPriceHistory',
     'pricing:GetProducts',
 )
-#: Not needed, but what is refused is told better with it.
+#: What makes something new, or names what may be gone already.
+MAKE = (
+    'ec2:CreateImage',
+    'ec2:CreateSecurityGroup',
+    'ec2:DeleteKeyPair',
+    'ec2:ImportKeyPair',
+    'ec2:RunInstances',
+)
+#: What changes or ends a machine: those with FogROS2's tag alone.
+CHANGE = (
+    'ec2:AuthorizeSecurityGroupIngress',
+    'ec2:DeleteSecurityGroup',
+    'ec2:DeleteVolume',
+    'ec2:ReleaseAddress',
+    'ec2:RevokeSecurityGroupIngress',
+    'ec2:StartInstances',
+    'ec2:StopInstances',
+    'ec2:TerminateInstances',
+)
+#: The same for images.
+CHANGE_IMAGES = (
+    'ec2:DeleteSnapshot',
+    'ec2:DeregisterImage',
+)
+TAG = ('ec2:CreateTags',)
+#: Not needed; with it, what is refused is told better.
 HELPFUL = ('sts:DecodeAuthorizationMessage',)
 
-ACTIONS = (*LAUNCH, *MACHINES, *IMAGES, *PRICES, *HELPFUL)
+ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_IMAGES, *TAG, *HELPFUL)
 #: Calls that no policy can refuse.
 FREE = ('sts:GetCallerIdentity',)
 
 
 def policy() -> dict[str, Any]:
     """Return the policy document, as IAM takes it; ``doc/aws.md`` has the same."""
+    machine = {'Null': {f'aws:ResourceTag/{TAG_ATTEMPT}': 'false'}}
+    image = {'Null': {f'aws:ResourceTag/{TAG_BAKED}': 'false'}}
+    born = {'StringEquals': {'ec2:CreateAction': [
+        'CreateImage', 'CreateSecurityGroup', 'ImportKeyPair', 'RunInstances']}}
+    statements: list[tuple[str, tuple[str, ...], dict[str, Any]]] = [
+        ('Look', (*LOOK, *PRICES, *HELPFUL), {}),
+        ('Make', MAKE, {}),
+        ('TagWhatIsMade', TAG, born),
+        ('TagMachines', TAG, machine),
+        ('ChangeMachines', CHANGE, machine),
+        ('ChangeImages', CHANGE_IMAGES, image),
+    ]
     return {
         'Version': '2012-10-17',
-        'Statement': [{
-            'Sid': 'FogROS2', 'Effect': 'Allow', 'Action': sorted(ACTIONS), 'Resource': '*'}],
+        'Statement': [
+            {'Sid': f'FogROS2{name}', 'Effect': 'Allow', 'Action': sorted(actions),
+             'Resource': '*', **({'Condition': condition} if condition else {})}
+            for name, actions, condition in statements],
     }

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+import datetime
 from decimal import Decimal, InvalidOperation
 import hashlib
 import re
@@ -24,6 +25,8 @@ TAG_USER = 'fogros2-user'
 TAG_IMAGE = 'fogros2-image'
 TAG_PRICE = 'fogros2-price-per-hour'
 TAG_SSH_FROM = 'fogros2-ssh-from'
+#: On groups and keys alone: seconds since the epoch at which they were made.
+TAG_MADE = 'fogros2-made'
 
 STATES = {
     'pending': MachineState.PENDING,
@@ -36,6 +39,8 @@ STATES = {
 }
 #: EC2's states of machines that are there.
 ALIVE = ('pending', 'running', 'stopping', 'stopped')
+#: How EC2 says when an instance was stopped.
+_STOPPED = re.compile(r'\((\d{4}-\d\d-\d\d \d\d:\d\d:\d\d) (?:GMT|UTC)\)')
 _ID = re.compile(r'aws:([a-z0-9-]+)/(i-[0-9a-f]+)/([0-9a-f]{16})')
 
 
@@ -203,7 +208,8 @@ def machine_of(region: str, instance: Mapping[str, Any]) -> Machine:
         inner_host=str(instance.get('PrivateIpAddress') or ''), place=region,
         kind=f'{kind} spot' if instance.get('InstanceLifecycle') == 'spot' else kind,
         tags={**tags, TAG_IMAGE: str(instance.get('ImageId', ''))}, end_command=END_COMMAND,
-        cost_per_hour=_price(tags.get(TAG_PRICE, '')))
+        cost_per_hour=_price(tags.get(TAG_PRICE, '')),
+        stopped=_stopped(instance) if state is MachineState.STOPPED else None)
 
 
 def address_of(instance: Mapping[str, Any]) -> str:
@@ -231,13 +237,12 @@ def instances_in(reservations: Iterable[Mapping[str, Any]]) -> list[Mapping[str,
     return [instance for entry in reservations for instance in entry['Instances']]
 
 
-def places(
-    region: str, kinds: Sequence[str], subnets: Sequence[str], *, tried: Iterable[Place],
-) -> list[Place]:
-    """Return the tries that are left in a region: each type in each subnet, types first."""
-    done = set(tried)
-    return [place for kind in kinds for place in (Place(region, kind, s) for s in subnets)
-            if place not in done]
+def _stopped(instance: Mapping[str, Any]) -> Optional[float]:
+    found = _STOPPED.search(str(instance.get('StateTransitionReason') or ''))
+    if found is None:
+        return None
+    when = datetime.datetime.strptime(found[1], '%Y-%m-%d %H:%M:%S')
+    return when.replace(tzinfo=datetime.timezone.utc).timestamp()
 
 
 def _price(text: str) -> Optional[Decimal]:

@@ -114,24 +114,24 @@ def _value(name: str, value: Any, default: Any) -> Any:
     if name == 'tags':
         return convert(name, value, {})
     if name == 'max_price':
-        return Decimal(repr(convert(name, value, 0.0)))
+        return Decimal(repr(convert(name, _number(value), 0.0)))
     if name == 'ssh_from' and isinstance(value, str):
         value = (value,)
-    if isinstance(default, bool):
-        if isinstance(value, bool):
-            return value
-        raise ConfigurationError(f"option '{name}' can't be {value!r}", 'it takes True or False')
-    if isinstance(default, int):
-        number = convert(name, value, 1.0)
-        if number != int(number):
-            raise ConfigurationError(f"option '{name}' can't be {value!r}",
-                                     'it takes a whole number')
-        return int(number)
     if name == 'gpu' and isinstance(value, bool):
         return '1' if value else ''
-    if isinstance(default, float) and value == 0:
-        return 0.0
+    if isinstance(default, float):
+        value = _number(value)
+        if value == 0:
+            return 0.0
     return convert(name, value, default)
+
+
+def _number(value: Any) -> Any:
+    """Return the number in a string, as launch arguments have it."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def _check(options: Options) -> None:

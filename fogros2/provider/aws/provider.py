@@ -272,6 +272,15 @@ class AWSProvider(Provider):
         self._account.call('ec2', machine.region, 'start_instances',
                            f'starting {machine.instance}', InstanceIds=[machine.instance])
 
+    def tidy(self) -> list[str]:
+        """Delete groups and keys of machines that ended by themselves."""
+        def ask(region: str) -> list[str]:
+            found = ending.leftovers(self._account, region, time.time())
+            for attempt in found:
+                ending.sweep(self._account, region, attempt)
+            return [f"security group and key of '{name}' in {region}" for name in found.values()]
+        return [words for found in self._in_regions(ask) for words in found]
+
     # -- who reaches it, and who it is ----------------------------------------------------------
 
     def robot_address(self) -> str:

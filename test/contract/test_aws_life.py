@@ -1,0 +1,614 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The AWS provider against Moto's EC2: what it asks, what it leaves, what it does when refused."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+from decimal import Decimal
+import gzip
+import json
+import re
+import threading
+import uuid
+
+import boto3
+from botocore.awsrequest import AWSResponse
+import pytest
+
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    PrerequisiteError,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
+from fogros2.provider.aws import AWSProvider, iam, images, instances, user_data
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.failures import AwsError
+from fogros2.testing.provider_contract import PUBLIC_KEY
+
+pytestmark = pytest.mark.usefixtures('moto_aws')
+
+HOME, AWAY = 'eu-central-1', 'us-east-1'
+KEY = 'ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ3Tq0CrBqXbWb0bqzPkGrjsvC7OxUD3yAyRIqLHTNN9'
+
+
+class Watched:
+    """
+    A provider whose calls are counted, and refused as a test says.
+
+    :ivar calls: (service:Operation, parameters), each call once however often it is repeated.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, dict]] = []
+        self.refusals: dict[str, list[tuple[str, str] | None]] = {}
+        session = boto3.session.Session()
+        session.events.register('provide-client-params', self._called)
+        session.events.register('before-send', self._sent)
+        self.account = Account(session)
+        self.provider = AWSProvider(self.account)
+
+    def _called(self, params, model, **words):
+        self.calls.append((f'{model.service_model.endpoint_prefix}:{model.name}', dict(params)))
+
+    def refuse(self, operation: str, *codes: str | None, said: str = 'as AWS said') -> None:
+        """Answer the next calls of an operation so; None lets one through."""
+        self.refusals[operation] = [code and (code, said) for code in codes]
+
+    def _sent(self, event_name, request, **words):
+        waiting = self.refusals.get(event_name.rsplit('.', 1)[-1])
+        refusal = waiting.pop(0) if waiting else None
+        if refusal is None:
+            return None
+        code, said = refusal
+        if 'ssm' in event_name:
+            body = json.dumps({'__type': code, 'message': said})
+        else:
+            body = (f'<Response><Errors><Error><Code>{code}</Code><Message>{said}</Message>'
+                    '</Error></Errors><RequestID>1</RequestID></Response>')
+        status = 503 if code in ('RequestLimitExceeded', 'Unavailable') else 400
+        return AWSResponse(request.url, status, {}, _Raw(body.encode()))
+
+    def count(self) -> Counter[str]:
+        return Counter(name for name, _ in self.calls)
+
+    def asked(self, operation: str) -> list[dict]:
+        return [params for name, params in self.calls if name.endswith(f':{operation}')]
+
+
+class _Raw:
+    """The body of an answer as urllib3 hands it over."""
+
+    def __init__(self, body: bytes) -> None:
+        self._body = body
+
+    def stream(self, **words) -> Iterator[bytes]:
+        yield self._body
+
+
+@pytest.fixture
+def aws() -> Watched:
+    return Watched()
+
+
+def ask(name='planner', *, dependencies='', on_exit='delete', **options):
+    spec = MachineSpec(name, 'aws', {'ec2_instance_type': 't3.medium', **options}, on_exit=on_exit)
+    return spec, CreateRequest(
+        str(uuid.uuid4()), PUBLIC_KEY, {TAG_NAME: name, 'fogros2-launch': 'l1'}, 51820,
+        agent_config={'machine': name, 'directory': '/run/fogros2'}, dependencies=dependencies)
+
+
+def ec2(region=HOME):
+    return boto3.client('ec2', region)
+
+
+def left(region=HOME) -> dict[str, list]:
+    """Return what of ours is in a region."""
+    client = ec2(region)
+    found = instances.instances_in(client.describe_instances(
+        Filters=[{'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]
+    )['Reservations'])
+    return {
+        'instances': [entry['InstanceId'] for entry in found],
+        'groups': [entry['GroupId'] for entry in client.describe_security_groups()[
+            'SecurityGroups'] if entry['GroupName'] != 'default'],
+        'keys': [entry['KeyName'] for entry in client.describe_key_pairs()['KeyPairs']],
+        'volumes': [entry['VolumeId'] for entry in client.describe_volumes()['Volumes']],
+        'addresses': [entry['PublicIp'] for entry in client.describe_addresses()['Addresses']],
+    }
+
+
+NOTHING = {'instances': [], 'groups': [], 'keys': [], 'volumes': [], 'addresses': []}
+
+
+def described(machine_id, region=HOME):
+    return ec2(region).describe_instances(
+        InstanceIds=[machine_id.split('/')[1]])['Reservations'][0]['Instances'][0]
+
+
+def ports(machine_id, region=HOME):
+    """Return who reaches a machine: 'tcp 22' -> networks."""
+    group, = ec2(region).describe_security_groups(
+        Filters=[{'Name': 'group-name', 'Values': [f'fogros2-{machine_id.split("/")[2]}']}]
+    )['SecurityGroups']
+    return {f'{rule["IpProtocol"]} {rule["FromPort"]}': sorted(
+        entry.get('CidrIp') or entry['CidrIpv6'] for entry in rule['IpRanges']
+        + rule['Ipv6Ranges']) for rule in group['IpPermissions']}
+
+
+# -- a whole life -------------------------------------------------------------------------------
+
+
+def test_a_launch_takes_few_calls_and_leaves_nothing(aws):
+    spec, request = ask()
+    provider = aws.provider
+    provider.check(spec)
+    spec = provider.resolve(spec)
+    machine_id = provider.create(spec, request)
+    machine = provider.reachable(
+        machine_id, name='planner', timeout=20.0, cancel=threading.Event())
+    provider.pin(machine_id, f'{KEY} root@planner')
+    provider.allow(machine_id, 22, [])
+    started = sum(aws.count().values())
+    provider.destroy(machine_id)
+    assert machine.cost_per_hour == Decimal('0.0416')
+    assert left() == NOTHING
+    # a boot of 20 s is looked at ten times more, and the end of half a minute eight times
+    assert started <= 12, aws.count()
+    assert sum(aws.count().values()) <= 20, aws.count()
+
+
+def test_an_instance_is_as_it_has_to_be(aws):
+    spec, request = ask(disk_size=20, tags={'team': 'slam'})
+    machine_id = aws.provider.create(spec, request)
+    attempt = machine_id.rsplit('/', 1)[1]
+    asked, = aws.asked('RunInstances')
+    told = gzip.decompress(asked['UserData']).decode()
+    assert json.loads(told.partition('\n')[2])['ssh_authorized_keys'] == [PUBLIC_KEY]
+    assert asked['MetadataOptions']['HttpTokens'] == 'required'
+    assert asked['BlockDeviceMappings'][0]['Ebs']['VolumeSize'] == 20
+    found = described(machine_id)
+    behaviour = ec2().describe_instance_attribute(
+        InstanceId=found['InstanceId'], Attribute='instanceInitiatedShutdownBehavior')
+    assert behaviour['InstanceInitiatedShutdownBehavior']['Value'] == 'terminate'
+    tags = instances.tags_of(found)
+    assert tags['fogros2-attempt'] == attempt
+    assert tags['team'] == 'slam'
+    assert not any(request.token in value for value in tags.values())
+    assert ports(machine_id) == {
+        'udp 51820': ['0.0.0.0/0', '::/0'], 'tcp 22': ['198.51.100.7/32']}
+    key, = ec2().describe_key_pairs(KeyNames=[f'fogros2-{attempt}'])['KeyPairs']
+    assert instances.tags_of(key)['fogros2-attempt'] == attempt
+    ubuntu = boto3.client('ssm', HOME).get_parameter(Name=images.UBUNTU['x86_64'])
+    assert found['ImageId'] == ubuntu['Parameter']['Value']
+
+
+def test_every_request_is_one_that_the_service_has(aws):
+    """Botocore validates each request against the service's model, unless told not to."""
+    for service in ('ec2', 'ssm', 'sts'):
+        assert aws.account.client(service, HOME).meta.config.parameter_validation
+    with pytest.raises(ProviderError, match='Unknown parameter'):
+        aws.account.call('ec2', HOME, 'describe_instances', 'asking', NoSuch=1)
+
+
+def test_the_host_key_is_told_on_every_computer_and_pinned_anew(aws):
+    spec, request = ask()
+    machine_id = aws.provider.create(spec, request)
+    another = AWSProvider()
+    once = another.describe(machine_id).shell.host_key
+    script = gzip.decompress(aws.asked('RunInstances')[0]['UserData']).decode()
+    assert once in script
+    another.pin(machine_id, f'{KEY} root@planner')
+    assert aws.provider.describe(machine_id).shell.host_key == KEY
+    found, = AWSProvider().find({TAG_NAME: 'planner'})
+    assert found.shell.host_key == KEY
+
+
+def test_who_may_log_in_changes_and_ends(aws):
+    first, request = ask()
+    second, other = ask('mapper')
+    planner = aws.provider.create(first, request)
+    mapper = aws.provider.create(second, other)
+    aws.provider.allow(planner, 22, ['198.51.100.8/32', '2001:db8::8/128'])
+    assert ports(planner)['tcp 22'] == ['198.51.100.8/32', '2001:db8::8/128']
+    aws.provider.allow(planner, 22, [])
+    aws.provider.allow(planner, 22, [])
+    assert ports(planner) == {'udp 51820': ['0.0.0.0/0', '::/0']}
+    # the sibling, which is still coming up, keeps its port
+    assert ports(mapper)['tcp 22'] == ['198.51.100.7/32']
+    aws.provider.allow(planner, 22, ['198.51.100.9'])
+    assert ports(planner)['tcp 22'] == ['198.51.100.9/32']
+
+
+def test_networks_that_were_named_stay_allowed_with_the_robot(aws):
+    spec, request = ask(ssh_from=['198.51.100.64/26'])
+    machine_id = aws.provider.create(spec, request)
+    assert ports(machine_id)['tcp 22'] == ['198.51.100.64/26']
+    aws.provider.allow(machine_id, 22, [])
+    assert 'tcp 22' not in ports(machine_id)
+    AWSProvider().allow(machine_id, 22, ['198.51.100.7/32'])
+    assert ports(machine_id)['tcp 22'] == ['198.51.100.64/26', '198.51.100.7/32']
+
+
+def test_a_machine_stops_and_starts(aws):
+    spec, request = ask(on_exit='stop')
+    machine_id = aws.provider.create(spec, request)
+    aws.provider.stop(machine_id)
+    machine = aws.provider.describe(machine_id)
+    assert machine.state is MachineState.STOPPED and machine.shell is None
+    assert [m.state for m in aws.provider.find({})] == [MachineState.STOPPED]
+    aws.provider.start(machine_id)
+    assert aws.provider.describe(machine_id).state is MachineState.RUNNING
+    behaviour = ec2().describe_instance_attribute(
+        InstanceId=machine_id.split('/')[1], Attribute='instanceInitiatedShutdownBehavior')
+    assert behaviour['InstanceInitiatedShutdownBehavior']['Value'] == 'stop'
+
+
+def test_a_spot_machine_can_not_be_stopped(aws):
+    spec, request = ask(spot=True, max_price=0.5)
+    machine_id = aws.provider.create(spec, request)
+    assert aws.provider.describe(machine_id).kind == 't3.medium spot'
+    with pytest.raises(Unsupported, match='spot'):
+        aws.provider.stop(machine_id)
+
+
+def test_what_a_machine_had_besides_goes_with_it(aws):
+    spec, request = ask()
+    machine_id = aws.provider.create(spec, request)
+    attempt = machine_id.rsplit('/', 1)[1]
+    tag = [{'Key': 'fogros2-attempt', 'Value': attempt}]
+    for kind, call, words in (
+            ('elastic-ip', ec2().allocate_address, {'Domain': 'vpc'}),
+            ('volume', ec2().create_volume, {'AvailabilityZone': f'{HOME}a', 'Size': 8})):
+        call(TagSpecifications=[{'ResourceType': kind, 'Tags': tag}], **words)
+    others = ec2().create_volume(AvailabilityZone=f'{HOME}a', Size=8)['VolumeId']
+    aws.provider.destroy(machine_id)
+    assert left() == {**NOTHING, 'volumes': [others]}
+
+
+def test_an_instance_that_is_not_ours_is_never_ended(aws):
+    image = ec2().describe_images()['Images'][0]['ImageId']
+    theirs = ec2().run_instances(
+        ImageId=image, MinCount=1, MaxCount=1)['Instances'][0]['InstanceId']
+    aws.provider.destroy(f'aws:{HOME}/{theirs}/0123456789abcdef')
+    assert left()['instances'] == [theirs]
+    assert not list(aws.provider.find({}))
+
+
+def test_what_ended_by_itself_is_tidied_up_but_not_what_is_being_made(aws, monkeypatch):
+    spec, request = ask()
+    gone = aws.provider.create(spec, request)
+    ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
+    alive = aws.provider.create(*ask('mapper'))
+    assert aws.provider.tidy() == []
+    monkeypatch.setattr('fogros2.provider.aws.ending.SETTLED', -1.0)
+    assert aws.provider.tidy() == [f"security group and key of 'planner' in {HOME}"]
+    assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
+    assert len(left()['groups']) == 1
+
+
+def test_machines_of_all_regions_are_found_with_two_calls_each_at_most(aws, monkeypatch):
+    here = aws.provider.create(*ask('planner', region=HOME))
+    there = aws.provider.create(*ask('mapper', region=AWAY))
+    assert here.startswith('aws:eu-central-1/') and there.startswith('aws:us-east-1/')
+    monkeypatch.delenv('FOGROS2_AWS_REGIONS')
+    aws.calls.clear()
+    assert {m.id for m in aws.provider.find({})} == {here, there}
+    enabled = len(ec2().describe_regions()['Regions'])
+    assert enabled >= 17
+    assert aws.count() == {'ec2:DescribeRegions': 1, 'ec2:DescribeInstances': enabled}
+    aws.provider.set_regions([AWAY])
+    assert [m.id for m in aws.provider.find({})] == [there]
+
+
+def test_a_region_that_is_closed_to_us_hides_no_other(aws, monkeypatch):
+    machine_id = aws.provider.create(*ask())
+    monkeypatch.delenv('FOGROS2_AWS_REGIONS')
+    aws.refuse('DescribeInstances', 'UnauthorizedOperation')
+    found = [m.id for m in aws.provider.find({})]
+    assert found in ([machine_id], [])  # it may be its own region that said no
+    aws.provider.set_regions([HOME])
+    aws.refuse('DescribeInstances', 'UnauthorizedOperation')
+    with pytest.raises(AwsError, match='ec2:DescribeInstances'):
+        list(aws.provider.find({}))
+
+
+def test_eight_machines_at_once_are_eight(aws):
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda n: aws.provider.create(*ask(f'm{n}')), range(8)))
+        assert len(set(made)) == 8
+        assert len(left()['groups']) == 8
+        list(pool.map(aws.provider.destroy, made))
+    assert left() == NOTHING
+
+
+# -- images -------------------------------------------------------------------------------------
+
+
+def test_an_image_is_baked_found_by_the_next_launch_and_goes_with_its_snapshots(aws):
+    spec, request = ask()
+    machine_id = aws.provider.create(spec, request)
+    first = aws.provider.bake(machine_id, 'planner', 'abcd')
+    again = aws.provider.bake(machine_id, 'planner: new', 'abcd')
+    assert aws.asked('CreateImage')[0]['NoReboot'] is True
+    found = {image.id: image for image in aws.provider.images()}
+    assert set(found) == {first, again}
+    assert found[first].name == 'planner'
+    assert found[first].dependencies == 'abcd'
+    assert found[first].state == 'available'
+    assert found[first].place == HOME
+    ours = {snapshot['SnapshotId'] for snapshot in ec2().describe_snapshots(
+        OwnerIds=['self'])['Snapshots'] if 'fogros2-baked' in instances.tags_of(snapshot)} or {
+            mapping['Ebs']['SnapshotId'] for image in ec2().describe_images(
+                Owners=['self'], Filters=[{'Name': 'tag-key', 'Values': ['fogros2-baked']}]
+            )['Images'] for mapping in image['BlockDeviceMappings']}
+    assert ours
+    for dependencies, ours_taken in (('abcd', True), ('other', False), ('', False)):
+        new = aws.provider.create(*ask(f'm{dependencies}', dependencies=dependencies))
+        assert (f'aws:{HOME}/{described(new)["ImageId"]}' in found) is ours_taken
+        tags = aws.provider.describe(new).tags
+        assert tags.get(TAG_DEPENDENCIES, '') == dependencies
+    aws.provider.delete_image(first)
+    aws.provider.delete_image(first)
+    aws.provider.delete_image(again)
+    assert not list(aws.provider.images())
+    kept = {entry['SnapshotId']
+            for entry in ec2().describe_snapshots(OwnerIds=['self'])['Snapshots']}
+    assert not ours & kept
+
+
+def test_an_image_of_somebody_else_is_not_deleted(aws):
+    theirs = ec2().describe_images(Owners=['self'])['Images'][0]['ImageId']
+    with pytest.raises(ProviderError, match='no image of FogROS2'):
+        aws.provider.delete_image(f'aws:{HOME}/{theirs}')
+    with pytest.raises(MachineNotFound):
+        aws.provider.delete_image('planner')
+
+
+def test_a_gpu_type_gets_the_image_with_the_driver_and_arm_its_own(aws):
+    parameters = {'g5.xlarge': images.DEEP_LEARNING['x86_64'],
+                  'm6g.large': images.UBUNTU['arm64']}
+    for number, (kind, parameter) in enumerate(parameters.items()):
+        made = aws.provider.create(*ask(f'm{number}', ec2_instance_type=kind))
+        told = boto3.client('ssm', HOME).get_parameter(Name=parameter)['Parameter']['Value']
+        assert described(made)['ImageId'] == told
+
+
+# -- bad input, before anything is made ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'ec2_instance_type': 't9.medium'}, 'ros2 fog price'),
+    ({'ami_image': 'ami-00000000'}, 'an AMI belongs to one region'),
+    ({'subnet': 'subnet-00000000'}, 'check subnet='),
+])
+def test_what_does_not_exist_is_named_before_anything_is_made(aws, options, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        aws.provider.create(*ask(**options))
+    assert left() == NOTHING
+    assert not aws.asked('CreateSecurityGroup')
+
+
+def test_an_image_for_another_processor_is_refused(aws):
+    arm = boto3.client('ssm', HOME).get_parameter(
+        Name=images.UBUNTU['arm64'])['Parameter']['Value']
+    with pytest.raises(ConfigurationError, match='arm64 processors, and t3.medium has x86_64'):
+        aws.provider.create(*ask(ami_image=arm))
+    assert not aws.asked('CreateSecurityGroup')
+
+
+def test_no_credentials_and_no_region_are_found_by_the_check(monkeypatch, aws):
+    spec, _ = ask()
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'):
+        monkeypatch.delenv(name)
+    with pytest.raises(PrerequisiteError, match='no AWS credentials'):
+        AWSProvider().check(spec)
+    monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'x')
+    with pytest.raises(PrerequisiteError, match='incomplete'):
+        AWSProvider().check(spec)
+    monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'x')
+    monkeypatch.delenv('AWS_DEFAULT_REGION')
+    with pytest.raises(ConfigurationError, match="region='nearest'"):
+        AWSProvider().check(spec)
+    monkeypatch.setenv('AWS_PROFILE', 'robots')
+    with pytest.raises(PrerequisiteError, match='robots'):
+        AWSProvider().check(spec)
+
+
+def test_a_price_above_the_cap_is_refused(aws):
+    spec, _ = ask(max_price=0.01)
+    with pytest.raises(ConfigurationError, match=r'0\.0416 US dollars'):
+        aws.provider.resolve(spec)
+    assert not aws.asked('RunInstances')
+    cheap, _ = ask(max_price=0.05)
+    assert aws.provider.resolve(cheap).options['region'] == HOME
+
+
+# -- refused ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('operation', 'code', 'words'), [
+    ('RunInstances', 'UnauthorizedOperation', 'does not allow ec2:RunInstances'),
+    ('RunInstances', 'VcpuLimitExceeded', 'Service Quotas'),
+    ('RunInstances', 'InvalidParameterValue', 'as AWS said'),
+    ('RunInstances', 'ExpiredToken', 'aws sso login'),
+    ('CreateSecurityGroup', 'VPCIdNotSpecified', 'create-default-vpc'),
+    ('CreateSecurityGroup', 'UnauthorizedOperation', 'ec2:CreateSecurityGroup'),
+    ('AuthorizeSecurityGroupIngress', 'UnauthorizedOperation', 'ec2:AuthorizeSecurity'),
+    ('ImportKeyPair', 'UnauthorizedOperation', 'does not allow ec2:ImportKeyPair'),
+    ('GetParameter', 'AccessDeniedException', 'does not allow ssm:GetParameter'),
+    ('DescribeInstances', 'RequestExpired', 'timedatectl'),
+    ('DescribeInstances', 'AuthFailure', 'get-caller-identity'),
+    ('DescribeInstances', 'OptInRequired', 'enable it'),
+])
+def test_a_refusal_is_one_line_with_a_hint_and_leaves_nothing(aws, operation, code, words):
+    aws.refuse(operation, code)
+    with pytest.raises(FogError) as caught:
+        aws.provider.create(*ask())
+    assert words in str(caught.value)
+    assert '\n' not in str(caught.value)
+    assert HOME in str(caught.value)
+    assert left() == NOTHING
+
+
+def test_what_could_not_be_told_apart_is_undone_as_far_as_it_goes(aws):
+    aws.refuse('RunInstances', 'InvalidParameterValue')
+    aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
+    with pytest.raises(AwsError, match='as AWS said'):
+        aws.provider.create(*ask())
+    assert left()['groups'] == []
+    assert len(left()['keys']) == 1
+
+
+def test_requests_that_aws_throttles_are_made_again(aws):
+    aws.refuse('RunInstances', 'RequestLimitExceeded', 'RequestLimitExceeded')
+    machine_id = aws.provider.create(*ask())
+    assert left()['instances'] == [machine_id.split('/')[1]]
+    assert aws.count()['ec2:RunInstances'] == 1
+    token, = {params['ClientToken'] for params in aws.asked('RunInstances')}
+    assert token
+
+
+def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
+    machine_id = aws.provider.create(*ask())
+    aws.refuse('DeleteSecurityGroup', 'DependencyViolation', 'DependencyViolation')
+    aws.provider.destroy(machine_id)
+    assert left() == NOTHING
+    assert aws.count()['ec2:DeleteSecurityGroup'] == 3
+
+
+def test_no_room_in_a_zone_leads_to_the_next(aws):
+    aws.refuse('RunInstances', 'InsufficientInstanceCapacity', 'Unsupported')
+    aws.provider.create(*ask())
+    tries = aws.asked('RunInstances')
+    assert ['NetworkInterfaces' in params for params in tries] == [False, True, True]
+    subnets = [params['NetworkInterfaces'][0]['SubnetId'] for params in tries[1:]]
+    assert len(set(subnets)) == 2
+    assert len({params['ClientToken'] for params in tries}) == 3
+    assert tries[1]['NetworkInterfaces'][0]['AssociatePublicIpAddress'] is True
+    assert len(left()['groups']) == 1
+
+
+def test_a_quota_leads_to_the_next_type_at_once(aws):
+    aws.refuse('RunInstances', 'VcpuLimitExceeded')
+    machine_id = aws.provider.create(*ask(instance_types=['t3.large']))
+    assert [params['InstanceType'] for params in aws.asked('RunInstances')] == [
+        't3.medium', 't3.large']
+    assert aws.provider.describe(machine_id).kind == 't3.large'
+
+
+def test_no_room_in_a_region_leads_to_the_next_and_leaves_nothing_there(aws):
+    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
+    machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
+    assert machine_id.startswith(f'aws:{AWAY}/')
+    assert left(HOME) == NOTHING
+    assert len(left(AWAY)['instances']) == 1
+
+
+def test_no_room_anywhere_is_the_error_and_nothing_is_left(aws):
+    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 20)
+    with pytest.raises(AwsError, match='instance_types='):
+        aws.provider.create(*ask(region=HOME, regions=[AWAY]))
+    assert left(HOME) == left(AWAY) == NOTHING
+
+
+def test_a_launch_that_ends_meanwhile_tries_no_further_place(aws):
+    spec, request = ask()
+    cancel = threading.Event()
+    request = dataclasses.replace(request, cancel=cancel)
+    cancel.set()
+    with pytest.raises(Cancelled):
+        aws.provider.create(spec, request)
+    assert left() == NOTHING
+
+
+def test_the_same_request_is_the_same_to_the_byte(aws):
+    """EC2 knows a request again by its token only if everything else is the same too."""
+    spec, request = ask()
+    aws.refuse('RunInstances', 'InternalError')
+    with pytest.raises(AwsError):
+        aws.provider.create(spec, request)
+    aws.provider.create(spec, request)
+    first, second = aws.asked('RunInstances')
+    first.pop('SecurityGroupIds'), second.pop('SecurityGroupIds')
+    assert first == second
+
+
+def test_an_attempt_that_was_cut_short_is_taken_up_where_it_was(aws):
+    """The process was killed between the group, the key and the instance."""
+    spec, request = ask()
+    aws.refuse('RunInstances', 'InternalError')
+    aws.refuse('DeleteKeyPair', 'InternalError')
+    aws.refuse('DescribeSecurityGroups', 'InternalError')
+    with pytest.raises(AwsError):
+        aws.provider.create(spec, request)
+    assert len(left()['groups']) == len(left()['keys']) == 1
+    machine_id = AWSProvider().create(spec, request)
+    assert len(left()['groups']) == len(left()['keys']) == 1
+    AWSProvider().destroy(machine_id)
+    assert left() == NOTHING
+
+
+def test_a_new_instance_that_ec2_does_not_know_yet_is_pending(aws):
+    machine_id = aws.provider.create(*ask())
+    aws.refuse('DescribeInstances', 'InvalidInstanceID.NotFound')
+    assert aws.provider.describe(machine_id).state is MachineState.PENDING
+    aws.refuse('DescribeInstances', 'InvalidInstanceID.NotFound')
+    with pytest.raises(MachineNotFound):
+        AWSProvider(Account(aws.account.session())).describe(machine_id)
+
+
+def test_a_machine_that_ends_while_it_comes_up_says_why(aws):
+    machine_id = aws.provider.create(*ask())
+    ec2().terminate_instances(InstanceIds=[machine_id.split('/')[1]])
+    with pytest.raises(ProviderError, match='ended while it was coming up: Client.User'):
+        aws.provider.reachable(machine_id, name='planner', timeout=20, cancel=threading.Event())
+
+
+# -- rights -------------------------------------------------------------------------------------
+
+
+def test_the_policy_has_every_call_and_every_action_of_it_is_used(aws):
+    provider = aws.provider
+    provider.answers()
+    machine_id = provider.create(*ask(on_exit='stop'))
+    attempt = machine_id.rsplit('/', 1)[1]
+    tag = [{'Key': 'fogros2-attempt', 'Value': attempt}]
+    ec2().allocate_address(Domain='vpc', TagSpecifications=[
+        {'ResourceType': 'elastic-ip', 'Tags': tag}])
+    ec2().create_volume(AvailabilityZone=f'{HOME}a', Size=8, TagSpecifications=[
+        {'ResourceType': 'volume', 'Tags': tag}])
+    provider.allow(machine_id, 22, [])
+    provider.pin(machine_id, KEY)
+    provider.stop(machine_id)
+    provider.start(machine_id)
+    image = provider.bake(machine_id, 'planner', 'abcd')
+    list(provider.images())
+    provider.delete_image(image)
+    provider.tidy()
+    provider.destroy(machine_id)
+    aws.refuse('RunInstances', 'InsufficientInstanceCapacity')
+    provider.destroy(provider.create(*ask()))
+    provider.set_regions(['all'])
+    list(provider.find({}))
+    aws.refuse('RunInstances', 'UnauthorizedOperation',
+               said='Encoded authorization failure message: abc')
+    aws.refuse('DecodeAuthorizationMessage', 'AccessDenied')
+    with pytest.raises(AwsError):
+        provider.create(*ask())
+    called = set(aws.count())
+    assert called <= {*iam.ACTIONS, *iam.FREE}
+    assert {*iam.ACTIONS} - called == set(iam.PRICES)
+
+
+def test_user_data_stays_below_what_ec2_takes(aws):
+    aws.provider.create(*ask('a' * 40, tags={'team': 'x' * 200}))
+    assert len(aws.asked('RunInstances')[0]['UserData']) < user_data.LIMIT

@@ -1,0 +1,538 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decisions of the AWS provider, by value: options, requests, states, user data, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from decimal import Decimal
+import gzip
+import http.server
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import pytest
+import yaml
+
+from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
+from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider.aws import AWSProvider, clients, failures, iam, instances, network
+from fogros2.provider.aws import user_data as boot
+from fogros2.provider.aws.host_key import one_time
+from fogros2.provider.aws.instances import MachineId, Place
+from fogros2.provider.aws.options import check_spec, Options
+from fogros2.waiting import wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+TOKEN = '5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37'
+SPEC = MachineSpec('planner', 'aws', {'region': 'eu-central-1'})
+REQUEST = CreateRequest(
+    TOKEN, 'ssh-ed25519 AAAA robot', {'fogros2-launch': 'l1'}, 51820,
+    agent_config={'machine': 'planner', 'directory': '/run/fogros2'}, dependencies='abcd')
+IMAGE = {'ImageId': 'ami-1', 'RootDeviceName': '/dev/xvda', 'BlockDeviceMappings': [
+    {'DeviceName': '/dev/xvda', 'Ebs': {'VolumeSize': 40}}]}
+
+
+def spec(**options):
+    return dataclasses.replace(SPEC, options={**SPEC.options, **options})
+
+
+# -- options ----------------------------------------------------------------------------------
+
+
+def test_options_of_fogros2_are_taken_in_every_form_a_launch_file_has():
+    options = Options.parse({
+        'ami_image': None, 'region': 'us-west-1', 'ec2_instance_type': 't2.xlarge',
+        'disk_size': '40', 'spot': 'True', 'arch': 'amd64', 'min_cpu': '8', 'gpu': True,
+        'max_price': '1.25', 'ssh_from': '198.51.100.0/24', 'tags': {'team': 'slam'}})
+    assert options.disk_size == 40
+    assert options.spot is True
+    assert options.arch == 'x86_64'
+    assert options.min_cpu == 8.0
+    assert options.gpu == '1'
+    assert options.max_price == Decimal('1.25')
+    assert options.ssh_from == ('198.51.100.0/24',)
+
+
+@pytest.mark.parametrize(('options', 'chooses'), [
+    ({}, False), ({'ec2_instance_type': 'cheapest'}, True), ({'min_cpu': 4}, True),
+    ({'ec2_instance_type': 't3.large', 'min_cpu': 4}, False), ({'gpu': 1}, True)])
+def test_a_type_is_chosen_where_none_is_named(options, chooses):
+    assert Options.parse(options).chooses_type is chooses
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'ec2_instance_typ': 't3.medium'}, "did you mean 'ec2_instance_type'"),
+    ({'region': 'Frankfurt'}, "it takes 'eu-central-1' or 'nearest'"),
+    ({'ec2_instance_type': 't3'}, "can't be the ec2_instance_type"),
+    ({'ami_image': 'ubuntu'}, 'it takes ami-'),
+    ({'arch': 'riscv'}, 'x86_64 or arm64'),
+    ({'disk_size': 'lots'}, 'a whole number'),
+    ({'disk_size': 0}, 'a disk can not have 0 GB'),
+    ({'spot': 'perhaps'}, 'True or False'),
+    ({'max_price': 'cheap'}, "can't be 'cheap'"),
+    ({'security_groups': ['default']}, 'takes sg-'),
+    ({'security_groups': 'sg-1'}, 'a list of strings'),
+    ({'ssh_from': '300.0.0.1'}, 'no address or network'),
+    ({'tags': {'fogros2-name': 'x'}}, "can't be a tag"),
+    ({'ami_image': 'ami-1', 'regions': ['us-east-1']}, 'belongs to one region'),
+    ({'subnet': 'subnet-1', 'region': 'nearest'}, 'belongs to one region'),
+    ({'user': 'Robert; drop'}, 'it takes a login name'),
+])
+def test_a_wrong_option_is_named_with_what_to_do(options, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        Options.parse(options)
+
+
+def test_a_spot_instance_that_should_stop_is_refused_before_anything():
+    with pytest.raises(ConfigurationError, match="can't be stopped"):
+        check_spec(dataclasses.replace(spec(spot=True), on_exit='stop'))
+
+
+# -- what is asked of EC2 -----------------------------------------------------------------------
+
+
+def request(options=None, **changes):
+    asked = spec(**(options or {}))
+    parsed = Options.parse(asked.options)
+    asked = dataclasses.replace(asked, **changes)
+    return instances.run_request(
+        asked, REQUEST, parsed, place=Place('eu-central-1', 't3.medium'), image=IMAGE,
+        group='sg-own', tags=instances.own_tags(asked, REQUEST, parsed), user_data=b'x')
+
+
+def test_a_machine_is_asked_for_as_it_has_to_be():
+    words = request({'security_groups': ['sg-2'], 'iam_instance_profile': 'robots'})
+    attempt = instances.attempt_of(TOKEN)
+    tags = {'Name': 'planner', 'fogros2-launch': 'l1', 'fogros2-name': 'planner',
+            'fogros2-attempt': attempt, 'fogros2-user': 'ubuntu',
+            'fogros2-dependencies': 'abcd'}
+    listed = [{'Key': key, 'Value': value} for key, value in tags.items()]
+    assert words == {
+        'ImageId': 'ami-1', 'InstanceType': 't3.medium', 'MinCount': 1, 'MaxCount': 1,
+        'ClientToken': instances.client_token(TOKEN, Place('eu-central-1', 't3.medium')),
+        'KeyName': f'fogros2-{attempt}', 'UserData': b'x',
+        'InstanceInitiatedShutdownBehavior': 'terminate',
+        'MetadataOptions': {'HttpTokens': 'required', 'HttpEndpoint': 'enabled',
+                            'HttpPutResponseHopLimit': 1},
+        # the image's own disk is larger than what was asked for
+        'BlockDeviceMappings': [{'DeviceName': '/dev/xvda', 'Ebs': {
+            'VolumeSize': 40, 'VolumeType': 'gp3', 'Encrypted': True,
+            'DeleteOnTermination': True}}],
+        'TagSpecifications': [{'ResourceType': kind, 'Tags': listed}
+                              for kind in ('instance', 'volume', 'network-interface')],
+        'SecurityGroupIds': ['sg-own', 'sg-2'],
+        'IamInstanceProfile': {'Name': 'robots'},
+    }
+
+
+def test_a_machine_to_be_stopped_stops_at_its_shutdown():
+    assert request(on_exit='stop')['InstanceInitiatedShutdownBehavior'] == 'stop'
+    assert request(on_exit='keep')['InstanceInitiatedShutdownBehavior'] == 'terminate'
+
+
+def test_a_spot_machine_is_asked_for_once_and_with_its_cap():
+    words = request({'spot': True, 'max_price': 0.5})
+    assert words['InstanceMarketOptions'] == {'MarketType': 'spot', 'SpotOptions': {
+        'SpotInstanceType': 'one-time', 'InstanceInterruptionBehavior': 'terminate',
+        'MaxPrice': '0.5'}}
+    assert words['TagSpecifications'][-1]['ResourceType'] == 'spot-instances-request'
+
+
+def test_tokens_differ_by_place_and_tell_nothing_of_the_request():
+    places = [Place('eu-central-1', 't3.medium'), Place('eu-central-1', 't3.medium', 'subnet-1'),
+              Place('us-east-1', 't3.medium'), Place('eu-central-1', 't3.large')]
+    tokens = [instances.client_token(TOKEN, place) for place in places]
+    assert len(set(tokens)) == 4
+    assert tokens == [instances.client_token(TOKEN, place) for place in places]
+    assert all(len(token) <= 64 and TOKEN not in token for token in tokens)
+    assert TOKEN not in instances.attempt_of(TOKEN)
+
+
+def test_a_filter_takes_a_tag_by_its_letters():
+    assert instances.tag_filters({'fogros2-robot': r'a*b?c\d'})[1] == {
+        'Name': 'tag:fogros2-robot', 'Values': [r'a\*b\?c\\d']}
+
+
+# -- what EC2 says ------------------------------------------------------------------------------
+
+
+def instance(state='running', **more):
+    tags = {'fogros2-name': 'planner', 'fogros2-attempt': '0123456789abcdef',
+            'fogros2-host-key': 'ssh-ed25519 AAAA', 'fogros2-user': 'ubuntu',
+            'fogros2-price-per-hour': '0.0416'}
+    return {
+        'InstanceId': 'i-0abc', 'State': {'Name': state}, 'InstanceType': 't3.medium',
+        'ImageId': 'ami-1', 'PublicIpAddress': '198.51.100.9', 'PrivateIpAddress': '10.0.0.9',
+        'VpcId': 'vpc-1', 'LaunchTime': datetime.datetime(
+            2026, 1, 1, tzinfo=datetime.timezone.utc),
+        'Tags': instances.tag_list(tags), **more}
+
+
+def test_an_instance_becomes_a_machine():
+    machine = instances.machine_of('eu-central-1', instance())
+    assert machine.id == 'aws:eu-central-1/i-0abc/0123456789abcdef'
+    assert (machine.name, machine.state, machine.place) == (
+        'planner', MachineState.RUNNING, 'eu-central-1')
+    assert (machine.shell.host, machine.shell.user, machine.shell.host_key) == (
+        '198.51.100.9', 'ubuntu', 'ssh-ed25519 AAAA')
+    assert (machine.vpn_host, machine.inner_network, machine.inner_host) == (
+        '198.51.100.9', 'aws:vpc-1', '10.0.0.9')
+    assert machine.cost_per_hour == Decimal('0.0416')
+    assert machine.created == 1767225600.0
+    assert machine.tags['fogros2-image'] == 'ami-1'
+    assert machine.end_command == ('shutdown', '-h', 'now')
+
+
+@pytest.mark.parametrize(('state', 'ours'), [
+    ('pending', 'pending'), ('running', 'running'), ('stopping', 'stopping'),
+    ('stopped', 'stopped'), ('shutting-down', 'deleted'), ('terminated', 'deleted')])
+def test_every_state_has_a_word(state, ours):
+    machine = instances.machine_of('eu-central-1', instance(state))
+    assert str(machine.state) == ours
+    assert (machine.shell is not None) == (state == 'running')
+
+
+def test_a_machine_says_since_when_it_is_stopped():
+    machine = instances.machine_of('eu-central-1', instance(
+        'stopped', StateTransitionReason='User initiated (2026-01-01 00:00:00 GMT)'))
+    assert machine.stopped == 1767225600.0
+    assert instances.machine_of('eu-central-1', instance('stopped')).stopped is None
+
+
+def test_the_address_is_the_public_one_or_what_there_is():
+    six = [{'Ipv6Addresses': [{'Ipv6Address': '2001:db8::9'}]}]
+    assert instances.address_of(instance(NetworkInterfaces=six)) == '198.51.100.9'
+    assert instances.address_of(
+        instance(PublicIpAddress=None, NetworkInterfaces=six)) == '2001:db8::9'
+    assert instances.address_of(instance(PublicIpAddress=None)) == '10.0.0.9'
+
+
+@pytest.mark.parametrize('text', [
+    '', 'no-such-machine', 'i-0abc', 'aws:eu-central-1/i-0abc', 'aws:eu-central-1/i-0abc/xyz',
+    'aws:eu-central-1/i-0abc/0123456789abcdef/..'])
+def test_a_foreign_id_is_no_machine(text):
+    with pytest.raises(MachineNotFound):
+        MachineId.parse(text)
+
+
+# -- who comes in -------------------------------------------------------------------------------
+
+
+def test_rules_have_both_families_of_addresses():
+    assert network.rule('tcp', 22, ['198.51.100.7', '2001:db8::7', '198.51.100.7/32']) == {
+        'IpProtocol': 'tcp', 'FromPort': 22, 'ToPort': 22,
+        'IpRanges': [{'CidrIp': '198.51.100.7/32'}],
+        'Ipv6Ranges': [{'CidrIpv6': '2001:db8::7/128'}]}
+
+
+@pytest.fixture
+def echo(monkeypatch):
+    """Answer HTTP on the loopback with the words of a list, one after the other."""
+    said = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            status, words = said.pop(0)
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(words.encode())
+
+        do_PUT = do_GET
+
+        def log_message(self, *args):
+            """Say nothing."""
+
+    server = http.server.ThreadingHTTPServer(('127.0.0.1', 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    url = f'http://127.0.0.1:{server.server_port}/'
+    monkeypatch.setenv(network.CHECKIP_VARIABLE, url)
+    monkeypatch.delenv(network.ADDRESS_VARIABLE, raising=False)
+    yield url, said
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_the_robots_address_is_what_aws_sees_and_asked_once_for_all_machines(echo):
+    _, said = echo
+    said.append((200, '198.51.100.7\n'))
+    address = network.RobotAddress()
+    assert address() == address() == '198.51.100.7/32'
+    assert not said
+
+
+@pytest.mark.parametrize('answer', [(200, '<html>log in to this hotel</html>'), (503, '')])
+def test_an_echo_that_tells_no_address_is_named_with_the_way_around_it(echo, answer):
+    _, said = echo
+    said.append(answer)
+    with pytest.raises(ProviderError, match=network.ADDRESS_VARIABLE):
+        network.RobotAddress()()
+
+
+def test_the_robots_address_can_be_named(monkeypatch):
+    monkeypatch.setenv(network.ADDRESS_VARIABLE, '2001:db8::7')
+    assert network.RobotAddress()() == '2001:db8::7/128'
+    monkeypatch.setenv(network.ADDRESS_VARIABLE, 'home')
+    with pytest.raises(ConfigurationError, match='home'):
+        network.RobotAddress()()
+
+
+# -- boot ---------------------------------------------------------------------------------------
+
+
+def config(**agent):
+    return boot.cloud_config(
+        name='planner', user='ubuntu', authorized_key='ssh-ed25519 AAAA robot',
+        host_key=one_time(TOKEN), agent_config=agent)
+
+
+def test_the_one_time_host_key_is_a_key_pair_and_always_the_same(tmp_path):
+    key = one_time(TOKEN)
+    assert key == one_time(TOKEN) != one_time('another')
+    assert 'PRIVATE' not in repr(key)
+    file = tmp_path / 'key'
+    file.write_text(key.private)
+    file.chmod(0o600)
+    shown = subprocess.run(['ssh-keygen', '-y', '-f', str(file)], capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.split()[:2] == key.public.split()
+
+
+def test_user_data_fits_and_is_the_same_for_the_same_request():
+    def data():
+        return boot.user_data(
+            name='planner', user='ubuntu', authorized_key='ssh-ed25519 AAAA robot',
+            host_key=one_time(TOKEN), agent_config=dict(REQUEST.agent_config))
+    # some room for what the agent learns yet
+    assert len(data()) < boot.LIMIT - 512
+    assert data() == data()
+    text = gzip.decompress(data()).decode()
+    assert text.startswith('#cloud-config\n')
+    assert yaml.safe_load(text) == config(**REQUEST.agent_config)
+
+
+def test_the_guard_is_armed_before_anything_else_runs():
+    told = config(**REQUEST.agent_config)
+    script, = (words[2] for words in told['bootcmd'])
+    assert '"end_command": ["shutdown", "-h", "now"]' in script
+    assert '"user": "ubuntu"' in script
+    assert 'apt' not in script
+    assert told['ssh_keys']['ed25519_public'] == one_time(TOKEN).public
+    assert 'bootcmd' not in config()
+
+
+@pytest.fixture
+def booted(tmp_path):
+    """Run what an instance runs at boot, in a folder instead of the root; ends what it starts."""
+    def run(told, **variables):
+        script = told['bootcmd'][0][2]
+        for path in ('/opt/fogros2', '/run/fogros2', '/var/log', '/root/.ssh'):
+            (tmp_path / path.lstrip('/')).parent.mkdir(parents=True, exist_ok=True)
+            script = script.replace(path, f'{tmp_path}{path}')
+        (tmp_path / 'var/log').mkdir(exist_ok=True)
+        for name, text in {'systemd-run': 'exit 1', 'shutdown': f'echo "$@" >{tmp_path}/ended',
+                           'getent': f'echo x:x:x:x:x:{tmp_path}/home:x'}.items():
+            program = tmp_path / 'bin' / name
+            program.parent.mkdir(exist_ok=True)
+            program.write_text(f'#!/bin/sh\n{text}\n')
+            program.chmod(0o755)
+        environment = {'PATH': f'{tmp_path}/bin:{os.environ["PATH"]}', 'INSTANCE_ID': 'i-1',
+                       **variables}
+        child = subprocess.Popen(['sh', '-c', script], env=environment, start_new_session=True,
+                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        output, _ = child.communicate(timeout=20)
+        assert child.returncode == 0, output
+        return tmp_path
+
+    yield run
+    for found in Path('/proc').glob('[0-9]*/cmdline'):
+        try:
+            words = found.read_bytes()
+        except OSError:
+            continue
+        if str(tmp_path).encode() in words and found.parent.name != str(os.getpid()):
+            os.kill(int(found.parent.name), signal.SIGKILL)
+
+
+def test_an_instance_that_boots_is_guarded_by_the_agent_it_was_sent(booted):
+    user = os.environ.get('USER') or subprocess.run(
+        ['id', '-un'], capture_output=True, text=True).stdout.strip()
+    told = boot.cloud_config(
+        name='planner', user=user, authorized_key='ssh-ed25519 AAAA', host_key=one_time(TOKEN),
+        agent_config={'machine': 'planner', 'launch': 'l1', 'directory': '/run/fogros2',
+                      'lifetime': 600.0})
+    top = booted(told)
+    server = top / 'run/fogros2/agent.sock'
+    wait_until(server.exists, timeout=20.0, what='the agent')
+    program = top / 'opt/fogros2/agent.py'
+    answer = subprocess.run(
+        [sys.executable, '-IS', str(program), 'connect', '--directory', str(server.parent)],
+        input=b'{"id": 1, "command": "status"}\n', capture_output=True, timeout=20)
+    status = json.loads(answer.stdout.splitlines()[0])
+    assert status['ok'] and status['machine'] == 'planner', status
+    assert oct((top / 'opt/fogros2/agent.json').stat().st_mode)[-3:] == '600'
+    assert len(program.read_text()) < 0.75 * len((ROOT / 'fogros2/agent.py').read_text())
+
+
+def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
+    keys = tmp_path / 'home/.ssh/authorized_keys'
+    keys.parent.mkdir(parents=True)
+    keys.write_text('of another robot')
+    told = config(machine='planner', directory='/run/fogros2')
+    booted(told)
+    assert not keys.exists()
+    keys.write_text('ours')
+    booted(told)
+    assert keys.read_text() == 'ours'
+
+
+def test_a_machine_that_can_not_be_guarded_ends(booted, monkeypatch):
+    monkeypatch.setattr(boot, 'UNGUARDED', 1)
+    told = boot.cloud_config(
+        name='planner', user='no-such-user', authorized_key='ssh-ed25519 AAAA',
+        host_key=one_time(TOKEN), agent_config={'machine': 'planner'})
+    top = booted(told)
+    wait_until((top / 'ended').exists, timeout=20.0, what='the end')
+    assert (top / 'ended').read_text() == '-h now\n'
+
+
+def test_a_program_is_shrunk_to_the_same_program():
+    source = 'x: int = 1\n"""Doc."""\n\ndef f(a: str, *, b: int = 2) -> None:\n    """Say."""\n' \
+        '    return f"""{a}\n    {b}"""\n'
+    plain, short = {}, {}
+    exec(compile(source, 'plain', 'exec'), plain)  # noqa: S102 - it is written above
+    exec(compile(boot.shrunk(source), 'short', 'exec'), short)  # noqa: S102
+    assert plain['f']('1') == short['f']('1')
+    assert 'Say' not in boot.shrunk(source) and 'int' not in boot.shrunk(source)
+
+
+@pytest.mark.parametrize(('answers', 'status'), [
+    ([(200, 'token'), (404, '')], 1),
+    ([(200, 'token'), (200, '{"action": "terminate", "time": "2026-01-01T00:02:00Z"}')], 0),
+    ([(403, '')], 1)])
+def test_the_notice_of_a_spot_instance_is_asked_for_with_a_token(echo, answers, status):
+    url, said = echo
+    said += answers
+    argv = [word.replace('http://169.254.169.254/', url) for word in AWSProvider.notice]
+    assert argv != list(AWSProvider.notice)
+    result = subprocess.run(argv, capture_output=True, text=True, timeout=20)
+    assert result.returncode == status, result.stderr
+    assert ('terminate' in result.stdout) == (status == 0)
+    assert not result.stderr
+
+
+# -- errors -------------------------------------------------------------------------------------
+
+
+def refused(code, message='', operation='RunInstances', decode=None):
+    return failures.refused({'Error': {'Code': code, 'Message': message}}, operation,
+                            "creating 'planner'", 'eu-central-1', decode)
+
+
+@pytest.mark.parametrize(('code', 'kind', 'words'), [
+    ('ExpiredToken', PrerequisiteError, 'aws sso login'),
+    ('RequestExpired', PrerequisiteError, 'timedatectl'),
+    ('AuthFailure', PrerequisiteError, 'get-caller-identity'),
+    ('SignatureDoesNotMatch', PrerequisiteError, 'clock'),
+    ('OptInRequired', PrerequisiteError, 'enable it'),
+    ('VcpuLimitExceeded', failures.AwsError, 'Service Quotas'),
+    ('InsufficientInstanceCapacity', failures.AwsError, 'regions='),
+    ('SpotMaxPriceTooLow', failures.AwsError, 'max_price='),
+    ('InvalidInstanceType', failures.AwsError, 'ros2 fog price'),
+    ('VPCIdNotSpecified', failures.AwsError, 'create-default-vpc'),
+    ('RequestLimitExceeded', failures.AwsError, 'fewer requests'),
+    ('SomethingNew', failures.AwsError, 'as AWS said'),
+])
+def test_every_known_refusal_says_what_to_do(code, kind, words):
+    error = refused(code, 'as AWS said')
+    assert isinstance(error, kind)
+    assert "creating 'planner' in eu-central-1 failed" in str(error)
+    assert words in str(error)
+    assert code in str(error)
+    assert '\n' not in str(error)
+
+
+def test_every_code_of_the_table_becomes_one_line():
+    for code in failures._FAILURES:
+        assert '\n' not in str(refused(code, 'said\nover  lines')), code
+        assert 'said over lines' in str(refused(code, 'said\nover  lines')) \
+            or failures._FAILURES[code].reason, code
+
+
+def test_the_action_that_a_policy_lacks_is_named():
+    plain = ('You are not authorized to perform this operation. User: arn:aws:iam::1:user/x is '
+             'not authorized to perform: ec2:CreateTags on resource: arn:aws:ec2:* because no '
+             'identity-based policy allows the ec2:CreateTags action.')
+    coded = ('You are not authorized to perform this operation. Encoded authorization failure '
+             'message: abc-DEF_123')
+    assert 'does not allow ec2:CreateTags' in str(refused('UnauthorizedOperation', plain))
+    told = json.dumps({'allowed': False, 'context': {'action': 'iam:PassRole'}})
+    asked = []
+    assert 'does not allow iam:PassRole' in str(refused(
+        'UnauthorizedOperation', coded, decode=lambda text: asked.append(text) or told))
+    assert asked == ['abc-DEF_123']
+    assert 'does not allow ec2:RunInstances' in str(refused(
+        'UnauthorizedOperation', coded, decode=lambda text: ''))
+    assert 'does not allow ssm:GetParameter' in str(refused(
+        'AccessDeniedException', 'no', operation='GetParameter'))
+
+
+@pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_PROFILE'])
+def test_whether_somebody_set_aws_up_is_seen_without_boto3(monkeypatch, tmp_path, name):
+    for variable in clients._VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    for variable in clients._FILES:
+        monkeypatch.setenv(variable, str(tmp_path / 'none'))
+    assert not clients.configured()
+    monkeypatch.setenv(name, 'x')
+    assert clients.configured()
+    monkeypatch.delenv(name)
+    (tmp_path / 'none').write_text('[default]\n')
+    assert clients.configured()
+
+
+def test_nothing_of_boto3_is_loaded_by_looking_at_the_provider():
+    code = ('import sys; from fogros2.plugin_system import load; '
+            "p = load('fogros2.provider', 'aws'); p(); "
+            "assert not {'boto3', 'botocore'} & set(sys.modules); print(p.name)")
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout == 'aws\n', result.stderr
+
+
+# -- rights -------------------------------------------------------------------------------------
+
+
+def test_the_policy_allows_each_action_once_and_the_documentation_has_it():
+    document = iam.policy()
+    listed = [action for statement in document['Statement'] for action in statement['Action']]
+    assert sorted(set(listed)) == sorted(set(iam.ACTIONS))
+    assert len(json.dumps(document, separators=(',', ':'))) < 6144  # what IAM takes
+    told = (ROOT / 'doc' / 'aws.md').read_text()
+    written = json.loads(re.search(r'```json\n(\{.*?\n\})\n```', told, re.DOTALL)[1])
+    assert written == document
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(('127.0.0.1', 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def test_no_way_to_aws_is_said_in_one_line(monkeypatch):
+    for name, value in {'AWS_ACCESS_KEY_ID': 'x', 'AWS_SECRET_ACCESS_KEY': 'x',
+                        'AWS_ENDPOINT_URL': f'http://127.0.0.1:{free_port()}'}.items():
+        monkeypatch.setenv(name, value)
+    provider = AWSProvider(clients.Account())
+    with pytest.raises(PrerequisiteError, match='AWS does not answer') as caught:
+        provider.answers()
+    assert 'AWS_ENDPOINT_URL' in caught.value.hint
