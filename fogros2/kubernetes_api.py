@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
-import functools
 import json
 import os
 from pathlib import Path
@@ -302,9 +301,8 @@ class _Watch:
         response.close()
 
 
-@functools.lru_cache(maxsize=8)
-def _cached(context: str, kubeconfig: Optional[str]) -> Api:
-    return Api(context)
+_apis: dict[tuple[str, str], Api] = {}
+_apis_lock = threading.Lock()
 
 
 def connect(context: str = '') -> Api:
@@ -315,7 +313,15 @@ def connect(context: str = '') -> Api:
 
     :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
     """
-    return _cached(context, os.environ.get('KUBECONFIG'))
+    kubeconfig = os.environ.get('KUBECONFIG', '')
+    with _apis_lock:
+        found = _apis.get((context, kubeconfig))
+        if found is None:
+            found = Api(context)
+            # by its name as well, if it was asked for as the current one
+            found = _apis.setdefault((found.context, kubeconfig), found)
+            _apis[context, kubeconfig] = found
+        return found
 
 
 def kubeconfig_files() -> list[Path]:

@@ -30,12 +30,13 @@ LOAD_BALANCER = 180.0
 #: Seconds in which a port of a node that is going to answer does.
 NODE_PORT = 6.0
 
-#: Versions of the API server that tell whose cluster it is, and that it makes load balancers.
-_VERSIONS = {r'-eks-': 'EKS', r'-gke\.': 'GKE', r'\+k3s': 'k3s', r'\+rke2': '', r'-aliyun': 'ACK'}
+#: Names of API servers that tell whose cluster it is, and that it makes load balancers.
 _SERVERS = {r'\.eks\.amazonaws\.com(\.cn)?$': 'EKS', r'\.azmk8s\.io$': 'AKS',
             r'\.gke\.goog$': 'GKE', r'\.k8s\.ondigitalocean\.com$': 'DigitalOcean'}
-#: API groups of what makes load balancers in clusters of one's own.
-_GROUPS = {'metallb.io': 'MetalLB', 'purelb.io': 'PureLB', 'loxilb.io': 'LoxiLB'}
+#: Ends of API groups that tell the same, and of what makes them in clusters of one's own.
+_GROUPS = {'metallb.io': 'MetalLB', 'purelb.io': 'PureLB', 'loxilb.io': 'LoxiLB',
+           'gke.io': 'GKE', 'k8s.aws': 'EKS', 'amazonaws.com': 'EKS', 'azmk8s.io': 'AKS',
+           'k3s.cattle.io': 'k3s'}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,24 +68,21 @@ class Exposure:
                    words[3] if len(words) > 3 else '')
 
 
-def load_balancers(version: str, server: str, groups: Iterable[str] = ()) -> str:
+def load_balancers(server: str, groups: Iterable[str] = ()) -> str:
     """
     Return who makes load balancers in a cluster, '' if nobody is known to.
 
     Asking for one where nobody makes any means waiting in vain.
 
-    :param version: ``gitVersion`` of the API server.
-    :param server: its URL.
+    :param server: URL of its API server.
     :param groups: the API groups it has.
     """
-    for pattern, name in _VERSIONS.items():
-        if re.search(pattern, version) and name:
-            return name
     host = urlsplit(server).hostname or ''
     for pattern, name in _SERVERS.items():
         if re.search(pattern, host):
             return name
-    return next((name for group, name in _GROUPS.items() if group in groups), '')
+    return next((name for end, name in _GROUPS.items() for group in groups
+                 if group == end or group.endswith(f'.{end}')), '')
 
 
 def ingress(service: Mapping[str, Any]) -> list[str]:

@@ -72,6 +72,13 @@ def is_running(pod: Mapping[str, Any]) -> bool:
         for each in (pod.get('status') or {}).get('containerStatuses') or ())
 
 
+def has_ended(pod: Mapping[str, Any]) -> bool:
+    """Return whether nothing of a pod runs any more, or has yet."""
+    status = pod.get('status') or {}
+    return status.get('phase') in ('Pending', 'Succeeded', 'Failed') and not any(
+        'running' in (each.get('state') or {}) for each in status.get('containerStatuses') or ())
+
+
 def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
     """Return why a machine has ended, in the cluster's words."""
     for condition in (job.get('status') or {}).get('conditions') or ():

@@ -114,6 +114,8 @@ class Start:
             raise self._error(self._trouble)
 
     def _events(self) -> None:
+        if self._pod is None:
+            self._again()
         meta = (self._pod or self._job)['metadata']
         found = items(self._api.request(
             'GET', path('events', self._where.namespace),

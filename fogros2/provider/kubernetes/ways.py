@@ -22,9 +22,9 @@ from fogros2.provider.kubernetes.options import Options
 def make(
     api: Api, namespace: str, spec: MachineSpec, request: CreateRequest, options: Options,
     job: Mapping[str, Any],
-) -> None:
+) -> Optional[dict[str, Any]]:
     """
-    Make the Service that ``options.expose`` takes; the Job owns it.
+    Make the Service that ``options.expose`` takes and return it; the Job owns it.
 
     Where the way is ours to choose, a cluster that allows no Service is no obstacle.
 
@@ -32,13 +32,13 @@ def make(
     """
     kind = _service_kind(api, options.expose)
     if not kind:
-        return
+        return None
     body = manifests.service(kind, spec, request, options, str(job['metadata']['uid']))
     try:
-        api.request('POST', path('services', namespace), body, cancel=request.cancel)
+        return api.request('POST', path('services', namespace), body, cancel=request.cancel)
     except ApiError as error:
         if error.reason == 'AlreadyExists' or options.expose == 'auto':
-            return
+            return None
         raise ProviderError(
             f"the cluster refused the Service of '{spec.name}': {error.args[0]}",
             hints.of_refusal(str(error.args[0]), namespace)) from error
@@ -53,11 +53,10 @@ def _service_kind(api: Api, expose: str) -> str:
 @functools.lru_cache(maxsize=8)
 def maker(api: Api) -> str:
     """Return who makes load balancers in a cluster, '' if nobody is known to."""
-    version = str(api.request('GET', '/version').get('gitVersion', ''))
-    if found := exposure.load_balancers(version, api.server):
+    if found := exposure.load_balancers(api.server):
         return found
     groups = api.request('GET', '/apis').get('groups') or ()
-    return exposure.load_balancers(version, api.server, [str(each['name']) for each in groups])
+    return exposure.load_balancers(api.server, [str(each['name']) for each in groups])
 
 
 def known(job: Mapping[str, Any]) -> Optional[Exposure]:
@@ -72,10 +71,12 @@ def robot_host(api: Api, job: Mapping[str, Any]) -> str:
 
 def find(
     api: Api, where: MachineId, job: Mapping[str, Any], pod: Mapping[str, Any], *,
-    timeout: float, cancel: threading.Event,
+    service: Optional[Mapping[str, Any]], timeout: float, cancel: threading.Event,
 ) -> Exposure:
     """
     Return the way that UDP takes to a pod that runs.
+
+    :param service: what ``make`` returned, None where that isn't known any more.
 
     :raises ProviderError: the one that was asked for doesn't work.
     """
@@ -86,7 +87,7 @@ def find(
         return Exposure('pod_dials_robot', '', 0, 'as asked')
     search = _Search(api, where, job, pod, cancel)
     try:
-        return search.run(asked, timeout)
+        return search.run(asked, service or search.service(), timeout)
     except ApiError as error:
         raise ProviderError(
             f"the Service of '{where.job}' can't be read: {error.args[0]}",
@@ -109,9 +110,11 @@ class _Search:
         self._path = path('services', where.namespace, where.job)
         self._failed: list[str] = []
 
-    def run(self, asked: str, timeout: float) -> Exposure:
+    def run(
+        self, asked: str, service: Optional[Mapping[str, Any]], timeout: float,
+    ) -> Exposure:
+        """Try them."""
         deadline = time.monotonic() + timeout
-        service = self._service()
         if service is not None and service['spec']['type'] == 'LoadBalancer':
             patience = min(exposure.LOAD_BALANCER, timeout * 0.8)
             if (found := self._load_balancer(patience)) is not None:
@@ -127,7 +130,8 @@ class _Search:
             f"no UDP gets to the pod of '{self._where.job}' by expose='{asked}': {reason}",
             "let UDP through on the way there, or take expose='pod_dials_robot'")
 
-    def _service(self) -> Optional[dict[str, Any]]:
+    def service(self) -> Optional[dict[str, Any]]:
+        """Return the Service, None if there is none."""
         try:
             return self._api.request('GET', self._path, cancel=self._cancel)
         except ApiError as error:
@@ -163,13 +167,18 @@ class _Search:
         if not port:
             self._failed.append('the Service has no port on the nodes')
             return None
-        hosts = list(dict.fromkeys([*self._node(), str(self._pod['status'].get('hostIP') or '')]))
-        places = [(host, port) for host in hosts if host]
+        hosts = [str(self._pod['status'].get('hostIP') or '')]
         answer = exposure.first_to_answer(
-            places, self._word, timeout=patience, cancel=self._cancel)
+            [(hosts[0], port)], self._word, timeout=min(1.0, patience), cancel=self._cancel)
         if answer is None:
-            self._failed.append(f"port {port} of the node ({', '.join(h for h in hosts if h)}) "
-                                f'answers nothing in {patience:.0f} s')
+            # the address that the pod tells is the node's inner one
+            hosts = list(dict.fromkeys([*self._node(), *hosts]))
+            answer = exposure.first_to_answer(
+                [(host, port) for host in hosts], self._word, timeout=patience,
+                cancel=self._cancel)
+        if answer is None:
+            self._failed.append(f"port {port} of the node ({', '.join(hosts)}) answers nothing in "
+                                f'{patience:.0f} s')
             return None
         why = '; '.join([*self._failed, f'the node {answer[0]} answers'])
         return Exposure('node_port', answer[0], port, why)
