@@ -52,6 +52,8 @@ MESSAGE = 1380
 LOOPBACK = '127.0.0.1'
 #: Interfaces of FogROS2's own, and the loopback.
 _NOT_LAN = re.compile('lo$|fog')
+#: <linux/if.h>
+_IFF_MULTICAST = 0x1000
 
 
 class CycloneDds(DdsVendor):
@@ -101,7 +103,8 @@ class CycloneDds(DdsVendor):
         :param user: the environment as the user has it; interfaces configured there are used in
             the LAN's place, peers make the LAN come first, or they couldn't be asked, and who
             keeps ROS 2 to this computer has no LAN.
-        :raises DdsError: the user's configuration can't be read, or can't be added to.
+        :raises DdsError: the user's configuration can't be read, can't be added to, or lets no
+            announcement of a machine in.
         """
         text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
         if '<NetworkInterfaceAddress' in text:
@@ -113,6 +116,7 @@ class CycloneDds(DdsVendor):
             lan = None
         has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
         listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
+        _check_multicast(listed)
         interfaces = []
         if not any(re.search(r'"lo"|"127\.', attributes) for attributes in listed):
             interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
@@ -231,6 +235,32 @@ def _fragments(uri: str) -> Iterator[str]:
                     f"CYCLONEDDS_URI names {path}, which can't be read: {error.strerror}",
                     'nodes would refuse to start; correct or unset CYCLONEDDS_URI') from error
         rest = rest.strip(' ,\n\t')
+
+
+def _check_multicast(listed: Sequence[str]) -> None:
+    """
+    Refuse an interface of the user's that takes multicast from all the others.
+
+    Cyclone 0.10, which ROS 2 Jazzy has, turns it off for the whole process then, and with it what
+    machines are found by.
+
+    :param listed: the attributes of each ``<NetworkInterface>``.
+    """
+    for attributes in listed:
+        name = re.search(r'\bname="([^"]*)"', attributes)
+        if name and 'multicast="true"' not in attributes and not _has_multicast(name[1]):
+            raise DdsError(
+                f"CYCLONEDDS_URI has nodes use {name[1]}, which knows no multicast: they would"
+                " hear of no machine",
+                f'write <NetworkInterface name="{name[1]}" multicast="true"/>')
+
+
+def _has_multicast(interface: str) -> bool:
+    try:
+        flags = Path('/sys/class/net', interface, 'flags').read_text()
+    except OSError:
+        return True  # Cyclone has its own word on one that isn't there
+    return bool(int(flags, 16) & _IFF_MULTICAST)
 
 
 def _interface(interface: DdsInterface) -> str:

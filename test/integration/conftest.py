@@ -33,6 +33,8 @@ def own_domain(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the tests' nodes among themselves and off the network of this computer."""
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    # of tests that run nodes in this process
+    monkeypatch.delenv('CYCLONEDDS_URI', raising=False)
     # by this, a process is known to be this run's
     monkeypatch.setenv(RUN, f'{os.getpid()}-{domain}')
 

@@ -120,7 +120,8 @@ def test_a_user_who_keeps_to_this_computer_gets_no_lan() -> None:
 
 def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
     path = tmp_path / 'dds.xml'
-    names = '<NetworkInterface name="lo"/><NetworkInterface name="wlan0"/>'
+    names = ('<NetworkInterface name="lo" multicast="true"/>'
+             '<NetworkInterface name="wlan0"/>')
     path.write_text('<CycloneDDS><Domain><General>'
                     f'<Interfaces>{names}</Interfaces></General></Domain></CycloneDDS>')
     for uri in (f'file://{path}', str(path), f'{path.read_text()},', f'{path},<CycloneDDS/>'):
@@ -134,6 +135,14 @@ def test_a_configuration_that_leaves_no_place_for_the_vpn_is_refused() -> None:
     uri = '<CycloneDDS><General><NetworkInterfaceAddress>eth0</NetworkInterfaceAddress></General>'
     with pytest.raises(DdsError, match='NetworkInterfaceAddress'):
         CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
+
+
+def test_a_loopback_that_turns_multicast_off_is_refused() -> None:
+    # Cyclone 0.10: 'selected interface "lo" is not multicast-capable: disabling multicast'
+    uri = '<CycloneDDS><General><Interfaces><NetworkInterface name="lo"/></Interfaces></General>'
+    with pytest.raises(DdsError, match='lo, which knows no multicast') as caught:
+        CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
+    assert 'name="lo" multicast="true"' in caught.value.hint
 
 
 def test_a_configuration_that_is_not_there_is_found_before_nodes_fail() -> None:
