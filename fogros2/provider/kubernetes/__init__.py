@@ -263,7 +263,8 @@ class KubernetesProvider(Provider):
                 'kind': 'DeleteOptions', 'apiVersion': 'v1', 'gracePeriodSeconds': grace},
                 labelSelector=labels)))
 
-        left = {str(pod['metadata']['uid']) for pod in delete(_GRACE) if not pods.has_ended(pod)}
+        found = delete(_GRACE)
+        left = {str(pod['metadata']['uid']) for pod in found if not pods.has_ended(pod)}
 
         def look(event: str, pod: dict[str, Any]) -> Optional[bool]:
             if event == 'DELETED' or pods.has_ended(pod):
@@ -279,6 +280,7 @@ class KubernetesProvider(Provider):
         if left:
             api.follow(target, look, again=again, timeout=_GONE, labelSelector=labels,
                        what=f"the pod of '{where.job}' to end")
+        if found:
             # nothing runs in it any more; the node would take seconds to tidy up first
             delete(0)
 
