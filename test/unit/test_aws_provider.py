@@ -468,6 +468,12 @@ def test_every_code_of_the_table_becomes_one_line():
             or failures._FAILURES[code].reason, code
 
 
+def test_a_page_of_a_proxy_is_told_without_its_markup():
+    page = '<!doctype html>\n<html><title>502</title>\n<h1>Bad gateway</h1>' + 'x' * 1000
+    told = str(refused('502', page))
+    assert '502 Bad gateway' in told and '<' not in told and len(told) < 400
+
+
 def test_the_action_that_a_policy_lacks_is_named():
     plain = ('You are not authorized to perform this operation. User: arn:aws:iam::1:user/x is '
              'not authorized to perform: ec2:CreateTags on resource: arn:aws:ec2:* because no '

@@ -76,6 +76,8 @@ _FAILURES = {
         PrerequisiteError),
     'Blocked': Failure('AWS has blocked this account', 'ask AWS Support', PrerequisiteError),
     # what was asked for
+    'IdempotentInstanceTerminated': Failure(
+        'the machine that was made under this token has ended', 'start the launch again'),
     'InvalidInstanceType': Failure(
         'the region has no such instance type', 'ros2 fog price shows what it has'),
     'InvalidParameterCombination': Failure('', ''),
@@ -146,6 +148,10 @@ _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)
 _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 
 
+#: Letters of AWS's own words that fit into one line.
+_LENGTH = 300
+
+
 class AwsError(ProviderError):
     """AWS refused; ``code`` is its error code."""
 
@@ -193,7 +199,7 @@ def refused(
     """Return the error for an answer of AWS's that says no; ``response`` as botocore has it."""
     details = response.get('Error') or {}
     code = str(details.get('Code', ''))
-    said = ' '.join(str(details.get('Message', '')).split())
+    said = _plain(str(details.get('Message', '')))
     where = f'{what} in {region}' if region else what
     if code in DENIED:
         action = denied_action(said, operation, decode)
@@ -209,6 +215,15 @@ def refused(
     if known.kind is not ProviderError:
         return known.kind(message, known.hint)
     return AwsError(message, known.hint, code=code)
+
+
+def _plain(text: str) -> str:
+    """Return a message in one line; a proxy's or balancer's answer is a whole page."""
+    if text.lstrip().startswith('<'):
+        text = re.sub(r'<[^>]*>', ' ', text)
+    words = ' '.join(text.split())
+    # an encoded message is as long as it is, and not for people
+    return words if _ENCODED.search(words) or len(words) <= _LENGTH else f'{words[:_LENGTH]}...'
 
 
 def denied_action(
