@@ -250,8 +250,8 @@ def _check_multicast(listed: Sequence[str]) -> None:
         name = re.search(r'\bname="([^"]*)"', attributes)
         if name and 'multicast="true"' not in attributes and not _has_multicast(name[1]):
             raise DdsError(
-                f"CYCLONEDDS_URI has nodes use {name[1]}, which knows no multicast: they would"
-                " hear of no machine",
+                f'CYCLONEDDS_URI has nodes use {name[1]}, which knows no multicast: they would'
+                ' hear of no machine',
                 f'write <NetworkInterface name="{name[1]}" multicast="true"/>')
 
 
