@@ -213,7 +213,8 @@ class AgentClient:
         if stream is not None:
             stream.close()
         if thread is not None and thread is not threading.current_thread():
-            thread.join(5.0)
+            # one that is connecting sees it later, and nobody needs what comes of that
+            thread.join(5.0 if stream is not None else 0.5)
 
     # -- the reader's thread --------------------------------------------------------------
 

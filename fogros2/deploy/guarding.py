@@ -28,8 +28,6 @@ from fogros2.waiting import wait_until
 AGENT_FOLDER = '/run/fogros2'
 #: Seconds between two looks for the provider's notice that it takes the machine away.
 NOTICE_INTERVAL = 5.0
-#: Seconds without a word after which a machine isn't taken to be there without asking it.
-QUIET = 3.0
 
 # One that was released has left; one that was never reached hasn't. Another robot's stays: the
 # agent says in its configuration whose it is. $1 folder, $2 launch, $3 our configuration.
@@ -94,7 +92,7 @@ class Guard:
                 timeout=job.timeouts.agent, cancel=job.cancel,
                 what=f"the agent of '{job.name}'")
             job.undo.callback(agent.close)
-            job.heard = lambda: agent.silent_for < QUIET
+            job.ask = lambda seconds: agent.request('ping', timeout=seconds)
             self.undo_nodes(agent)
             self._rearming = _Rearming(agent, job.launch.id, job.spec.robot_timeout / 4)
             job.undo.callback(self._rearming.close)
@@ -220,6 +218,7 @@ class Guard:
                 agent.request('release', timeout=job.patience(job.timeouts.command),
                               on_exit=job.spec.on_exit, exit=not job.provider.agent_program)
             except DeadlineExceeded as error:
+                job.hurry()
                 raise DeadlineExceeded(
                     f"'{job.name}' does not answer: its agent ends the nodes by itself, "
                     f'{job.spec.robot_timeout:g} s after it last heard of this launch') from error

@@ -10,7 +10,7 @@ import threading
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.deploy.robot import provider
-from fogros2.errors import ConnectError, DeadlineExceeded
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, MachineSpec
 from fogros2.report import step
 from fogros2.shell import Shell
@@ -48,8 +48,8 @@ class Job:
         #: Whether the provider has it no longer.
         self.gone = False
         self.shell: Optional[Shell] = None
-        #: Tells whether the machine was heard of in the last seconds.
-        self.heard: Callable[[], bool] = lambda: False
+        #: Asks the machine's agent for a sign of life, within so many seconds.
+        self.ask: Optional[Callable[[float], object]] = None
         self._hurried: Optional[bool] = None
         #: Set when the launch's is, or when a step failed: those beside it needn't go on.
         self.cancel = Either(launch.cancel)
@@ -97,8 +97,12 @@ class Job:
             try:
                 shell.run(command, timeout=self.patience(self.timeouts.vpn))
             except (ConnectError, DeadlineExceeded):
-                self._hurried = True
+                self.hurry()
                 raise
+
+    def hurry(self) -> None:
+        """Take it that the machine doesn't answer: the rest of the way down is tried shortly."""
+        self._hurried = True
 
     def patience(self, seconds: float) -> float:
         """
@@ -111,15 +115,22 @@ class Job:
         return min(seconds, HURRIED) if self._hurried else seconds
 
     def _answers(self) -> bool:
-        if self.heard():
-            return True
-        if self.shell is None:
-            return False
         try:
-            self.shell.run(Command(('true',), what='reach it'), timeout=ANSWER, check=False)
-            return True
-        except (ConnectError, DeadlineExceeded):
+            if self.ask is not None:
+                self.ask(ANSWER)
+                return True
+        except DeadlineExceeded:
             return False
+        except FogError:
+            pass  # the agent has gone, the machine may be there
+        try:
+            if self.shell is not None:
+                self.shell.run(
+                    Command(('true',), what='reach it'), timeout=ANSWER, check=False)
+                return True
+        except (ConnectError, DeadlineExceeded):
+            pass
+        return False
 
 
 class Either(threading.Event):

@@ -63,7 +63,9 @@ class RunningMachine:
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
-        self.agent.request('stop', nodes=None if ids is None else list(ids))
+        # at its end a launch doesn't wait for a machine that is out of reach
+        timeout = self._job.patience(30.0) if self._launch.cancel.is_set() else 30.0
+        self.agent.request('stop', timeout=timeout, nodes=None if ids is None else list(ids))
 
     def signal(self, node: str, name: str) -> None:
         """Send a node a signal, by its name (``SIGUSR1``)."""

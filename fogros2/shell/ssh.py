@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _DRAIN = 2.0
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 16
+#: Seconds to reach the machine for a stream: whoever waits tries again, and looks for a cancel.
+_OPEN = 15.0
 #: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
 MAX_LINE = 32 << 20
 
@@ -52,6 +54,9 @@ class SSHShell:
         self._timeout = timeout
         self._lock = threading.Lock()
         self._transport: Optional[paramiko.Transport] = None
+        # one attempt to connect at a time, on which close() doesn't wait
+        self._connecting = threading.Lock()
+        self._closings = 0
 
     # -- connection -----------------------------------------------------------------------------
 
@@ -83,11 +88,29 @@ class SSHShell:
             return None
 
     def _connected(self, patience: float) -> paramiko.Transport:
+        until = time.monotonic() + patience
         with self._lock:
-            if self._transport is None or not self._transport.is_alive():
-                self._transport = ssh_connection.connect(
-                    self.endpoint, name=self.name, timeout=patience)
-            return self._transport
+            transport = self._transport
+        if transport is not None and transport.is_alive():
+            return transport
+        if not self._connecting.acquire(timeout=patience):
+            raise ConnectError(f"'{self.name}' can not be reached: nothing has answered for "
+                               f'{patience:g} s', "check the robot's network")
+        try:
+            with self._lock:
+                transport, closings = self._transport, self._closings
+            if transport is not None and transport.is_alive():
+                return transport
+            transport = ssh_connection.connect(
+                self.endpoint, name=self.name, timeout=max(0.5, until - time.monotonic()))
+            with self._lock:
+                if closings == self._closings:
+                    self._transport = transport
+                    return transport
+            transport.close()
+            raise ConnectError(f"the connection to '{self.name}' was closed while it came up")
+        finally:
+            self._connecting.release()
 
     def _drop(self, transport: paramiko.Transport) -> None:
         with self._lock:
@@ -99,6 +122,7 @@ class SSHShell:
         """Drop the connection; the next call would open it again."""
         with self._lock:
             transport, self._transport = self._transport, None
+            self._closings += 1
         if transport is not None:
             transport.close()
 
@@ -234,7 +258,7 @@ class SSHShell:
 
     def open(self, command: Command) -> Stream:
         """Start a program there and return its streams; it ends with the stream."""
-        channel = self.start(command_line.remote_line(command, user=self.user))
+        channel = self.start(command_line.remote_line(command, user=self.user), _OPEN)
         _feed(channel, command.input, end=False)
         return SSHStream(channel, self.name)
 

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines that don't answer, and computers that two robots want at the same moment."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+import functools
+import os
+import shutil
+import threading
+import time
+import uuid
+
+import pytest
+
+from fogros2.agent_client import AgentClient
+from fogros2.deploy import Launch
+from fogros2.deploy.guarding import Guard
+from fogros2.deploy.job import Job
+from fogros2.errors import AgentError, FogError
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import container_machine
+from fogros2.shell.local import LocalShell
+from fogros2.store import Store
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+#: What a cut does on the way to a machine.
+CUT = """\
+table inet cut {
+  chain input { type filter hook input priority -200; policy accept; iifname != "lo" drop; }
+  chain output { type filter hook output priority -200; policy accept; oifname != "lo" drop; }
+}
+"""
+
+
+def test_the_end_does_not_wait_for_a_machine_that_is_out_of_reach(cloud_network):
+    store = Store()
+    spec = MachineSpec(f'away-{RUN}', 'container', {'network': cloud_network}, on_exit='keep')
+    launch = Launch(store=store)
+    machine = launch.up(spec)
+    engine, identity, _ = container_machine.parse_id(machine.machine.id)
+    engine.call('exec', identity, 'sh', '-c', 'printf %s "$1" | nft -f -', 'sh', CUT,
+                what='cut the way')
+    begin = time.monotonic()
+    launch.cancel.set()
+    with pytest.raises(FogError):
+        machine.stop()
+    failures = launch.down()
+    seconds = time.monotonic() - begin
+    engine.call('exec', identity, 'nft', 'delete', 'table', 'inet', 'cut', what='mend the way')
+    # the next launch knows the one that died, whatever its agent believes
+    again = Launch(store=store)
+    try:
+        assert again.up(MachineSpec(spec.name, spec.provider, spec.options)).machine.id \
+            == machine.machine.id
+    finally:
+        assert again.down() == []
+    assert seconds < 15, f'{seconds:.0f} s'
+    assert any(f'{spec.name}' in str(failure) for failure in failures)
+
+
+def arm(start, machine, job):
+    """Return the machine's agent, or why it isn't to be had."""
+    shell = LocalShell(Endpoint('local'), name=job.name)
+    start.wait(10)
+    try:
+        return Guard(job).arm(machine, shell)
+    except FogError as error:
+        job.undo.close()
+        return error
+
+
+def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
+    if os.geteuid() != 0:
+        pytest.skip('the agent is started here as root')
+    name = f'shared-{RUN}'
+    machine = Machine('ssh:', name, 'ssh', MachineState.RUNNING, owned=False,
+                      shell=Endpoint('local', user='root'))
+    for attempt in range(3):
+        robots = [Job(Launch(store=Store(tmp_path / f'{attempt}-{number}')),
+                      MachineSpec(name, 'ssh', {'host': 'localhost'})) for number in range(2)]
+        won: dict[int, AgentClient] = {}
+        refused: dict[int, FogError] = {}
+
+        with ThreadPoolExecutor(2) as pool:
+            for number, outcome in enumerate(pool.map(
+                    functools.partial(arm, threading.Barrier(2), machine), robots)):
+                if isinstance(outcome, AgentClient):
+                    won[number] = outcome
+                else:
+                    refused[number] = outcome
+        assert len(won) == len(refused) == 1, (won, refused)
+        (winner, agent), = won.items()
+        (_, error), = refused.items()
+        assert isinstance(error, AgentError), error
+        assert error.hint and name in str(error) or 'belongs to launch' in str(error), error
+        assert agent.request('status')['launch'] == robots[winner].launch.id
+        robots[winner].undo.close()
+        assert not os.path.exists(f'/run/fogros2/{name}')
