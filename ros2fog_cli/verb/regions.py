@@ -45,5 +45,5 @@ class RegionsVerb(VerbExtension):
 
 def _far(milliseconds: float | None, kilometres: float | None) -> str:
     if milliseconds is not None:
-        return f'{milliseconds:.0f} ms'
+        return f'{milliseconds:.{0 if milliseconds >= 10 else 1}f} ms'
     return 'no answer' if kilometres is None else f'{kilometres:.0f} km'

@@ -60,6 +60,22 @@ def test_a_region_that_hangs_holds_nobody_up() -> None:
     over.set()
 
 
+def test_who_wants_the_nearest_alone_waits_for_no_far_one() -> None:
+    over = threading.Event()
+
+    def connect(host: str, port: int, timeout: float) -> float:
+        if 'us-east-1' in host:
+            over.wait(30)
+        return 0.05
+
+    begin = time.monotonic()
+    found = regions.measure(['us-east-1', 'us-west-1', 'xx'], connect=connect, deadline=20,
+                            grace=0.1)
+    assert time.monotonic() - begin < 10
+    assert found[0].region == 'us-west-1' and found[-1].milliseconds is None
+    over.set()
+
+
 def test_all_are_asked_at_once() -> None:
     together = threading.Barrier(len(ENABLED), timeout=20)
 
@@ -99,7 +115,7 @@ def test_nobody_answers_at_all() -> None:
 def test_the_nearest_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = []
 
-    def table(names: list[str]) -> list[Latency]:
+    def table(names: list[str], grace: float) -> list[Latency]:
         measured.append(names)
         return [Latency('eu-west-3', 'Paris', 12.0)]
 

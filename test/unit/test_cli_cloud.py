@@ -521,7 +521,7 @@ def test_prices_of_all_regions(market: None, capsys: pytest.CaptureFixture[str])
 
 
 def test_regions(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(regions, 'measure', lambda names, connect: [
+    monkeypatch.setattr(regions, 'measure', lambda names, connect, grace: [
         Latency('us-west-1', 'San Francisco', 12.34), Latency('eu-west-1', 'Dublin', None)])
     assert run('regions') == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -536,7 +536,7 @@ def test_regions(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
 def test_regions_by_distance(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(regions, 'measure', lambda names, connect: [
+    monkeypatch.setattr(regions, 'measure', lambda names, connect, grace: [
         Latency(name, '') for name in names])
     monkeypatch.setattr(regions, 'geolocate', lambda: (37.8, -122.3))
     assert run('regions') == 0

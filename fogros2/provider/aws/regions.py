@@ -65,6 +65,9 @@ ATTEMPTS = 3
 CONNECT_TIMEOUT = 2.0
 #: Seconds that all of it may take; look-ups of names have no deadline of their own.
 DEADLINE = 5.0
+#: Seconds in which a region that is nearer than the first one to answer has answered as well:
+#: names take different times to look up.
+GRACE = 0.5
 #: Says where this computer is, roughly: ``{"loc": "48.2,16.4"}``.
 GEOLOCATION_URL = 'https://ipinfo.io/json'
 
@@ -144,12 +147,16 @@ def distance_km(one: tuple[float, float], other: tuple[float, float]) -> float:
 def measure(
     regions: Iterable[str] = ENABLED, *, connect: Connector = connect_time,
     attempts: int = ATTEMPTS, timeout: float = CONNECT_TIMEOUT, deadline: float = DEADLINE,
+    grace: Optional[float] = None,
 ) -> list[Latency]:
     """
     Return how far each region is, the nearest first, those that don't answer last.
 
     All are asked at once, each ``attempts`` times in a row; after ``deadline`` seconds those that
     have answered less often count with what they have.
+
+    :param grace: seconds for which the others are waited for once one has answered as often as
+        it should: who wants the nearest alone learns nothing from the far ones.
     """
     names = list(dict.fromkeys(regions))
     times: dict[str, list[float]] = {name: [] for name in names}
@@ -171,6 +178,9 @@ def measure(
     for _ in names:
         if not left.acquire(timeout=max(0.0, end - time.monotonic())):
             break
+        if grace is not None and any(len(list(times[name])) == attempts for name in names):
+            end = min(end, time.monotonic() + grace)
+            grace = None
     measured = [Latency(name, place_of(name), _median(list(times[name]))) for name in names]
     return sorted(measured, key=_by_time)
 
@@ -198,15 +208,16 @@ def by_distance(regions: Iterable[str], here: tuple[float, float]) -> list[Laten
 
 def table(
     regions: Iterable[str] = ENABLED, *, connect: Optional[Connector] = None,
-    locate: Optional[Locator] = None,
+    locate: Optional[Locator] = None, grace: Optional[float] = None,
 ) -> list[Latency]:
     """
     Return the regions with the nearest first: measured, or by geolocation where none answers.
 
+    :param grace: see :func:`measure`.
     :raises ProviderError: no region answers, and nobody knows where this computer is.
     """
     names = list(regions)
-    measured = measure(names, connect=connect or connect_time)
+    measured = measure(names, connect=connect or connect_time, grace=grace)
     if any(latency.milliseconds is not None for latency in measured):
         return measured
     try:
@@ -225,7 +236,7 @@ _measuring = threading.Lock()
 
 @functools.lru_cache(maxsize=8)
 def _nearest(regions: tuple[str, ...]) -> str:
-    return table(regions)[0].region
+    return table(regions, grace=GRACE)[0].region
 
 
 def nearest(regions: Optional[Sequence[str]] = None) -> str:
