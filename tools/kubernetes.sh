@@ -3,6 +3,7 @@
 # Builds the Kubernetes that the tests run, and prints the folder where its programs are.
 #
 #   tools/kubernetes.sh            build if it isn't there; the last line is the folder
+#   tools/kubernetes.sh --find     print the folder if all is there, else nothing
 #   tools/kubernetes.sh --why-not  print why this computer can't build it, nothing if it can
 #
 # The source is Debian's own package (1.20.2, with everything it needs), the compiler Debian's.
@@ -95,10 +96,10 @@ known_source() {
     return $found
 }
 
-if [ "${1:-}" = --why-not ]; then
-    why_not
-    exit 0
-fi
+case ${1:-} in
+    --why-not) why_not; exit 0 ;;
+    --find) if [ -d "$(folder)" ] && [ -z "$(missing_packages)" ]; then folder; fi; exit 0 ;;
+esac
 
 # --- the build ----------------------------------------------------------------------------------
 started=$(date +%s)

@@ -7,8 +7,9 @@ pods run; ``cluster`` runs it. All its processes, mounts, bridges and firewall r
 namespaces of their own and end with them, see ``node``; ``services`` says what it consists of.
 """
 
+from fogros2.testing.cluster.client import Client, Refused
 from fogros2.testing.cluster.cluster import Cluster, cluster
 from fogros2.testing.cluster.images import BARE, READY
 from fogros2.testing.cluster.node_process import ClusterError
 
-__all__ = ['BARE', 'Cluster', 'ClusterError', 'READY', 'cluster']
+__all__ = ['BARE', 'Client', 'Cluster', 'ClusterError', 'READY', 'Refused', 'cluster']

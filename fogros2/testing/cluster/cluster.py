@@ -12,7 +12,7 @@ import json
 import os
 from pathlib import Path
 import secrets
-from typing import Any
+from typing import Any, Optional
 
 from fogros2 import process
 from fogros2.model import Command, Result
@@ -32,10 +32,12 @@ class Cluster:
     A running cluster.
 
     :param folder: holds kubeconfig files, ``admin.conf`` and one for each user, and ``log/``.
+    :param images: containerd's folder that it began with; another cluster may as well.
     """
 
     folder: Path
     layout: services.Layout
+    images: Path
 
     @property
     def kubeconfig(self) -> Path:
@@ -78,7 +80,8 @@ class Cluster:
 
 @contextlib.contextmanager
 def cluster(
-    cache: Path, binaries: Path, say: Callable[[str], None] = print,
+    cache: Path, binaries: Path, *, store: Optional[Path] = None,
+    say: Callable[[str], None] = print,
 ) -> Iterator[Cluster]:
     """
     Run a cluster for the time of the block.
@@ -87,9 +90,11 @@ def cluster(
 
     :param cache: a folder for images, and for all nodes that run.
     :param binaries: folder with Kubernetes's programs, see ``tools/kubernetes.sh``.
+    :param store: another cluster's ``images``; those of today's sources unless given.
+    :param say: gets a line before something slow begins.
     :raises ClusterError: it didn't come up.
     """
-    store = images.store(cache, binaries, say)
+    store = store or images.store(cache, binaries, say)
     network = free_network()
     host, there = network.hosts()
     layout = services.Layout(str(there), str(host), network.prefixlen)
@@ -131,7 +136,7 @@ def cluster(
     try:
         if started.await_line(120.0) is None:
             raise ClusterError('the node ended before it had begun')
-        yield Cluster(started.folder, layout)
+        yield Cluster(started.folder, layout, store)
     finally:
         started.stop()
 

@@ -35,7 +35,11 @@ SANDBOX = 'fogros2.test/sandbox:1'
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
             'rsync', 'wireguard-go', 'wireguard-tools')
+#: Login user of pods; ``BARE`` has none, which is the machine's to make.
+USER, UID = 'fog', 1000
 _ARCHITECTURES = {'x86_64': 'amd64', 'aarch64': 'arm64'}
+_CONFIG = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'],
+           'Cmd': ['/bin/sh']}
 #: Takes documentation and apt's lists out: they are half of a small system.
 _SHRINK = ('rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/apt/* "$1"/usr/share/doc/* '
            '"$1"/usr/share/locale/* "$1"/usr/share/man/* "$1"/var/log/* "$1"/dev/*')
@@ -115,11 +119,13 @@ class RootShell:
         self, command: Command, *, timeout: float, check: bool = True,
         cancel: Optional[threading.Event] = None,
     ) -> Result:
-        """Run a command with the system as its root."""
+        """Run a command with the system as its root, as the login user if not as root."""
+        user, home = ('root', '/root') if command.sudo else (USER, f'/home/{USER}')
         words = [f'{name}={value}' for name, value in command.environment.items()]
-        return self._inside(('chroot', '.', 'env', '-i', 'HOME=/root',
-                             'PATH=/usr/sbin:/usr/bin:/sbin:/bin', *words, *command.argv),
-                            command, timeout, check, cancel)
+        return self._inside(
+            ('chroot', f'--userspec={user}', '.', 'env', '-i', '-C', home, f'HOME={home}',
+             'PATH=/usr/sbin:/usr/bin:/sbin:/bin', *words, *command.argv),
+            command, timeout, check, cancel)
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
@@ -127,8 +133,9 @@ class RootShell:
     ) -> SyncReport:
         """Copy a folder's contents; what was sent isn't counted."""
         words = [f'--exclude={pattern}' for pattern in excludes]
-        done = self._inside(('rsync', '-a', '--chown=0:0', *words, f'{source}/', f'.{target}/'),
-                            Command(('rsync',), what='copy files'), timeout, True, cancel)
+        done = self._inside(
+            ('rsync', '-a', f'--chown={UID}:{UID}', *words, f'{source}/', f'.{target}/'),
+            Command(('rsync',), what='copy files'), timeout, True, cancel)
         return SyncReport(0, 0, done.seconds)
 
     def _inside(
@@ -156,37 +163,51 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     """
     root = base(cache, say)
     packed = wheels.collect()
-    target = cache / f'images-{_checksum(f"3 {root.name} {packed.key}")}'
+    system = cache / f'system-{_checksum(f"1 {root.name}")}'
+    target = cache / f'images-{_checksum(f"1 {system.name} {packed.key}")}'
+    for path in (system, target):
+        if path.is_dir():
+            os.utime(path)
     if target.is_dir():
-        os.utime(target)
         return target
     say('packing the machine images')
     with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside, \
             contextlib.ExitStack() as undo:
-        upper = Path(aside, 'upper')
+        layers = [Path(aside, name) for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
+        upper, archive = Path(aside, 'upper'), Path(aside, 'images.tar')
         undo.callback(_remove, upper)
         upper.mkdir()
+        _tar(layers[0], root)
+        if not system.is_dir():
+            sandbox_layer(layers[2])
+            write_archive(archive, [
+                Image(BARE, (layers[0],), _CONFIG),
+                Image(SANDBOX, (layers[2],),
+                      {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']})])
+            _unpack(archive, system, binaries)
+        shell = RootShell(root, upper)
+        shell.run(Command(('useradd', '-m', '-s', '/bin/bash', '-u', str(UID), USER), sudo=True,
+                          what='add the login user'), timeout=30.0)
         if packed.embedded:
-            _add_embedded(RootShell(root, upper))
-        layers = [Path(aside, name) for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
-        _tar(layers[0], root, ['.'])
-        _tar(layers[1], upper / 'files', ['root'] if packed.embedded else [])
-        sandbox_layer(layers[2])
-        config = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'],
-                  'Cmd': ['/bin/sh']}
-        archive = Path(aside, 'images.tar')
-        write_archive(archive, [
-            Image(BARE, (layers[0],), config),
-            Image(READY, tuple(layers[:2]), config),
-            Image(SANDBOX, (layers[2],),
-                  {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']}),
-        ])
-        run_node(cache / 'runs', {
-            'commands': {'containerd': services.commands(services.NOWHERE)['containerd']},
-            'binaries': str(binaries), 'import': [str(archive)], 'keep': str(target),
-        }, {'containerd.toml': services.containerd(SANDBOX)}).wait()
+            _add_embedded(shell)
+        _tar(layers[1], upper / 'files')
+        # the lower layer is there already
+        write_archive(archive, [Image(READY, tuple(layers[:2]), _CONFIG)], leave_out=layers[:1])
+        _unpack(archive, target, binaries, system)
     _forget_old(cache, 'images-', keep=target)
+    _forget_old(cache, 'system-', keep=system)
     return target
+
+
+def _unpack(
+    archive: Path, target: Path, binaries: Path, begin: Optional[Path] = None,
+) -> None:
+    """Have containerd unpack an archive into a folder that has what ``begin`` has."""
+    first = {'images': str(begin)} if begin else {}
+    run_node(target.parent / 'runs', {
+        'commands': {'containerd': services.commands(services.NOWHERE)['containerd']},
+        'binaries': str(binaries), 'import': [str(archive)], 'keep': str(target), **first,
+    }, {'containerd.toml': services.containerd(SANDBOX)}).wait()
 
 
 def _add_embedded(shell: RootShell) -> None:
@@ -216,14 +237,18 @@ def _root_owned(info: tarfile.TarInfo) -> tarfile.TarInfo:
     return info
 
 
-def write_archive(target: Path, images: Iterable[Image]) -> None:
+def write_archive(
+    target: Path, images: Iterable[Image], *, leave_out: Iterable[Path] = (),
+) -> None:
     """
     Write images as one OCI archive (image-spec 1.0, image layout, in a tar file).
 
     Layers stay as they are, uncompressed: they only go from one folder to another.
+
+    :param leave_out: layers that whoever reads the archive has already.
     """
     manifests: list[dict[str, Any]] = []
-    written: set[str] = set()
+    written = {_digest(path) for path in leave_out}
     with tarfile.open(target, 'w') as archive:
         def put(name: str, data: bytes) -> None:
             info = tarfile.TarInfo(name)
@@ -273,14 +298,11 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _tar(target: Path, folder: Path, names: Sequence[str]) -> None:
-    """Pack what a folder has; much of it is root's alone."""
+def _tar(target: Path, folder: Path) -> None:
+    """Pack a folder; much of it is root's alone. The same files give the same archive."""
     process.run(Command(
-        ('sh', '-ec', 'tar --numeric-owner --one-file-system -C "$1" -cf "$2" -T /dev/null; '
-         'folder=$1 target=$2 owner=$3; shift 3; [ $# = 0 ] || '
-         'tar --numeric-owner --one-file-system -C "$folder" -cf "$target" "$@"; '
-         'chown "$owner" "$target"',
-         'sh', str(folder), str(target), str(os.getuid()), *names),
+        ('sh', '-ec', 'tar --numeric-owner --one-file-system --sort=name -C "$1" -cf "$2" .; '
+         'chown "$3" "$2"', 'sh', str(folder), str(target), str(os.getuid())),
         sudo=True, what='pack an image'), timeout=300.0)
 
 

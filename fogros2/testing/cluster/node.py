@@ -109,6 +109,18 @@ def forget(folder: Path) -> None:
     wait_until(removed, f'{folder} to be removable', 20.0)
 
 
+def forget_others(folder: Path) -> None:
+    """Take away what is left of nodes that were killed, all but this one and those that run."""
+    for other in sorted(folder.parent.iterdir()):
+        with contextlib.suppress(FileNotFoundError):  # another one tidies up as well
+            # one without a lock is about to start, or its test ended before it had
+            young = time.time() - other.stat().st_mtime < 600
+            if other != folder and not (young and not (other / 'lock').exists()):
+                with claimed(other) as free:
+                    if free:
+                        forget(other)
+
+
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[bool]:
     """Hold a node's folder; False if another process, or a child of one, holds it."""
@@ -129,13 +141,7 @@ def outside(folder: Path) -> int:
     # rather than SIG_IGN, which all that is started here would inherit, pods included
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: None)
-    for other in sorted(folder.parent.iterdir()):
-        # one without a lock is about to start, or its test ended before it had
-        young = time.time() - other.stat().st_mtime < 600
-        if other != folder and not (young and not (other / 'lock').exists()):
-            with claimed(other) as free:
-                if free:
-                    forget(other)
+    forget_others(folder)
     node = json.loads((folder / 'node.json').read_text())
     with claimed(folder) as free:
         if not free:

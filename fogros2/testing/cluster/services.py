@@ -89,7 +89,7 @@ def commands(layout: Layout) -> dict[str, list[str]]:
             f'--kubeconfig={HERE}/cluster.conf', '--leader-elect=false', '--port=0',
             f'--service-account-private-key-file={HERE}/accounts.key',
             f'--root-ca-file={HERE}/ca.crt', f'--flex-volume-plugin-dir={HERE}/plugins',
-            '--kube-api-qps=100', '--kube-api-burst=200', _GATES,
+            '--kube-api-qps=100', '--kube-api-burst=200', '--node-monitor-period=500ms', _GATES,
         ],
         'kube-scheduler': [
             f'--kubeconfig={HERE}/cluster.conf', '--leader-elect=false', '--port=0',
@@ -179,8 +179,9 @@ def kubelet(cgroup: str) -> dict[str, Any]:
         # the computer's disk may be as full as it likes, and images come from a file
         'evictionHard': never, 'imageGCHighThresholdPercent': 100,
         'serializeImagePulls': False, 'registryPullQPS': 0, 'eventRecordQPS': 0,
-        'kubeAPIQPS': 100, 'kubeAPIBurst': 200, 'nodeStatusUpdateFrequency': '5s',
-        'volumeStatsAggPeriod': '-1s',
+        'kubeAPIQPS': 100, 'kubeAPIBurst': 200, 'volumeStatsAggPeriod': '-1s',
+        # pods may run as soon as all is ready, not some seconds later
+        'nodeStatusUpdateFrequency': '1s',
     }
 
 
