@@ -64,3 +64,6 @@ class CloudGroup(GroupAction):
             # before the action's own execution, which may make a ROS node in this process
             Coordinator.of(context).engage()
             send(entity, self.machine, self._streams)
+        elif any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__):
+            # by name: importing it takes longer than most launches have use for
+            Coordinator.of(context).session(self.machine).loads_components()

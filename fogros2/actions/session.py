@@ -107,6 +107,7 @@ class Session:
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
+        self._components = False
         #: What was asked of the agent and isn't answered yet.
         self.requests: set[asyncio.Task[None]] = set()
         # requests reach the agent in the order they were made in
@@ -143,6 +144,22 @@ class Session:
                 f"{self.spec.name}: {', '.join(early)} started before {', '.join(new)} became a "
                 'stream and take it unencoded; use a FogROSLaunchDescription, or stream it where '
                 'the first node of the machine stands')
+        self._warn_of_components()
+
+    def loads_components(self) -> None:
+        """Remember that components are loaded there, which nobody can tell of new names."""
+        self._components = True
+        self._warn_of_components()
+
+    def _warn_of_components(self) -> None:
+        # streams may become known before components are loaded, or after
+        if self.names and self._components:
+            pairs = ', '.join(map(str, self.names.items()))
+            self._logger.warning(
+                f"{self.spec.name}: components aren't told what streamed topics are called there, "
+                'and would take them unencoded; give those that use one remappings=[...] with '
+                f'{pairs}')
+            self._components = False
 
     def give_up(self) -> None:
         """Take it that the machine won't come up any more, if it isn't up."""
@@ -225,6 +242,12 @@ class Session:
         runs, self._waiting = self._waiting, []
         if not runs or self.running is None:
             return
+        deaf = [run.node.name for run in runs if '--ros-args' not in run.node.arguments]
+        if self.names and deaf:
+            self._logger.warning(
+                f"{self.spec.name}: {', '.join(deaf)} takes no ROS arguments, so it isn't told "
+                f"that {', '.join(self.names)} is a stream; should it be a ROS node that uses "
+                "one, add '--ros-args' to its command")
         try:
             async with self._order:
                 await self._in_thread(

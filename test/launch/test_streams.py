@@ -9,7 +9,14 @@ import re
 import threading
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, RegisterEventHandler, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    GroupAction,
+    RegisterEventHandler,
+    TimerAction,
+)
+from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit, OnProcessStart
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node, PushROSNamespace, SetRemap
@@ -315,3 +322,40 @@ def test_values_that_are_known_late(run, fake, planner, whole):
         fake, FogROSLaunchDescription, DeclareLaunchArgument('topic', default_value='/front'),
         talker(planner, stream_topics=streams), **whole)) == 0
     assert here(fake) == ['front_h264_encoder']
+
+
+def test_a_program_that_takes_no_ros_arguments_is_named(run, fake, planner, caplog):
+    """It may be a node that would take the raw images over the VPN; or ``sleep``."""
+    ends_when_all_started(fake, 4)
+    assert run(watched(fake, FogROSLaunchDescription, CloudGroup(planner, [
+        ExecuteProcess(cmd=['true'], name='own_plain'),
+        ExecuteProcess(cmd=['true', '--ros-args'], name='own_node'),
+    ], stream_topics=[('/camera', 'h264')]))) == 0
+    said = [record.getMessage() for record in caplog.records
+            if 'takes no ROS arguments' in record.getMessage()]
+    assert len(said) == 1
+    assert re.match(r'planner: own_plain(-\d+)? takes .* that /camera, /camera_info is a stream',
+                    said[0])
+    assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_node')
+
+
+@pytest.mark.parametrize('streams', ['group', 'launch'])
+def test_components_are_named(run, fake, planner, caplog, streams):
+    """They are made by a service call, which nobody can add a remapping to."""
+    from launch_ros.actions import ComposableNodeContainer, LoadComposableNodes
+    from launch_ros.descriptions import ComposableNode
+    ends_when_all_started(fake, 3)
+    topics = [('/camera', 'h264')]
+    container = ComposableNodeContainer(
+        package='demo', executable='talker', exec_name='own', name='box', namespace='')
+    load = LoadComposableNodes(target_container='/box', composable_node_descriptions=[
+        ComposableNode(package='demo', plugin='demo::View', name='view')],
+        condition=IfCondition('false'))
+    group = CloudGroup(planner, [container, load],
+                       stream_topics=topics if streams == 'group' else [])
+    assert run(watched(fake, FogROSLaunchDescription, group,
+                       stream_topics=topics if streams == 'launch' else [])) == 0
+    said = [record.getMessage() for record in caplog.records
+            if "components aren't told" in record.getMessage()]
+    assert len(said) == 1
+    assert "remappings=[...] with ('/camera', '/fogros2/planner/camera')" in said[0]
