@@ -37,6 +37,8 @@ class Carrier(ExecuteProcess):
             cmd=command, name=spec.name, additional_env=environment, respawn=spec.respawn,
             respawn_delay=spec.respawn_delay, sigterm_timeout=str(spec.sigterm_timeout),
             sigkill_timeout=str(spec.sigkill_timeout))
+        #: The id by which its stream knows it.
+        self.node = spec.id
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
         """Return none: a launch whose own processes have all ended has no use for this one."""
@@ -48,8 +50,6 @@ class RobotCarrier(Carrier):
 
     def __init__(self, spec: NodeSpec, up: asyncio.Future[bool]) -> None:
         super().__init__(spec)
-        #: The id of what it carries out.
-        self.node = spec.id
         self._up = up
 
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:

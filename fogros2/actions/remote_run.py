@@ -136,6 +136,13 @@ class RemoteRun:
         self._session.forget(self)
         self.action.come_here(self._context)
 
+    def unseen(self) -> None:
+        """Take it that its end there won't be told of."""
+        if self._moving:
+            self._arrive()
+        else:
+            self.end()
+
     def end(self) -> None:
         """Tell launch that nothing more will happen."""
         if not self.complete.done():

@@ -61,6 +61,9 @@ class Run(Protocol):
     def end(self) -> None:
         """Take it that nothing more will happen."""
 
+    def unseen(self) -> None:
+        """Take it that its end there won't be told of."""
+
     def move(self, *, stop: bool) -> None:
         """Go on on the robot, once the machine has ended it if it has to ``stop`` it."""
 
@@ -184,6 +187,11 @@ class Session:
             if run in self._waiting:
                 self._waiting.remove(run)
             return False
+        for held in self._held:
+            if held[0] is run:
+                self._held.remove(held)
+                run.on_event(held[1])
+                return True
         self._to_stop.append(run)
         if len(self._to_stop) == 1:
             self._request(self._stop_collected)
@@ -267,7 +275,7 @@ class Session:
         except FogError as error:
             self._logger.error(f'{self.spec.name}: {error}; its agent ends the nodes by itself')
             for run in runs:
-                run.end()
+                run.unseen()
 
     async def _signal(self, run: Run, name: str) -> None:
         assert self.running is not None

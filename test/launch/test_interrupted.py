@@ -1,0 +1,437 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine that its provider takes away: what becomes of its nodes, and of the launch."""
+
+from __future__ import annotations
+
+import dataclasses
+from decimal import Decimal
+import functools
+import re
+import stat
+import threading
+
+from launch import EventHandler, LaunchDescription
+from launch.actions import (
+    EmitEvent,
+    ExecuteProcess,
+    LogInfo,
+    OpaqueFunction,
+    RegisterEventHandler,
+    Shutdown,
+    TimerAction,
+)
+from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown
+from launch.events import matches_action
+from launch.events.process import ShutdownProcess
+from launch_ros.actions import Node, PushROSNamespace, SetRemap
+import pytest
+
+from fogros2 import (
+    CloudGroup,
+    CloudNode,
+    ContainerInstance,
+    FogROSLaunchDescription,
+    MachineInterrupted,
+    plugin_system,
+    StreamTopic,
+)
+from fogros2.actions import session
+from fogros2.errors import AgentError, ProviderError
+from fogros2.image_transport.h264 import H264
+
+REASON = 'spot instance, at 12:00'
+#: Says where it runs, and ends when told to.
+HERE = """#!/bin/sh
+echo "here: $*"
+exec sleep 60
+"""
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='', on_interrupt='robot')
+
+
+@pytest.fixture
+def talker(package):
+    """Return what makes a cloud node that says on the robot how it was called."""
+    program = package / 'lib/demo/says'
+    program.write_text(HERE)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return functools.partial(CloudNode, package='demo', executable='says', output='screen')
+
+
+class Watch:
+    """Notes what launch says of processes, and does something at the n-th start."""
+
+    def __init__(self):
+        self.starts = []
+        self.exits = []
+        self.said = []
+        self.interrupted = []
+        self.shutdowns = []
+        self.at_start = {}
+
+    def __call__(self):
+        return [
+            RegisterEventHandler(OnProcessStart(on_start=self._start)),
+            RegisterEventHandler(OnProcessExit(on_exit=self._exit)),
+            RegisterEventHandler(OnProcessIO(on_stdout=self._io)),
+            RegisterEventHandler(OnShutdown(on_shutdown=self._shutdown)),
+            RegisterEventHandler(EventHandler(
+                matcher=lambda event: isinstance(event, MachineInterrupted),
+                entities=[OpaqueFunction(function=self._interrupted)])),
+        ]
+
+    def _start(self, event, context):
+        self.starts.append((plain(event.process_name), event.cmd[0]))
+        do = self.at_start.get(len(self.starts))
+        return None if do is None else do(event)
+
+    def _exit(self, event, context):
+        self.exits.append((plain(event.process_name), event.returncode))
+
+    def _io(self, event):
+        self.said.append(event.text.decode())
+
+    def _shutdown(self, event, context):
+        self.shutdowns.append(event.reason)
+
+    def _interrupted(self, context):
+        event = context.locals.event
+        self.interrupted.append((event.machine, event.reason, event.lost))
+
+
+@pytest.fixture
+def watch():
+    return Watch()
+
+
+def plain(name):
+    return name.rpartition('-')[0]
+
+
+def end(event=None):
+    return [Shutdown(reason='the test is over')]
+
+
+def says(fake, kind, **fields):
+    """Return what has the machine say something, once all there is to visit was visited."""
+    def do(event=None):
+        return [OpaqueFunction(function=lambda context: context.asyncio_loop.call_soon(
+            lambda: fake.machines['planner'].say(kind, **fields)) and None)]
+    return do
+
+
+def test_nodes_go_on_on_the_robot(run, fake, package, planner, talker, watch, capfd):
+    """With their names, namespaces, remappings, parameters; and launch sees them start again."""
+    node = talker(machine=planner, name='mapper', namespace='arm', parameters=[{'rate': 5}],
+                  remappings=[('in', 'out')], exec_name='says')
+    after = ExecuteProcess(cmd=['true'], name='after')
+    watch.at_start = {1: says(fake, 'notice', reason=REASON)}
+    started = RegisterEventHandler(OnProcessIO(
+        target_action=node, on_stdout=lambda event: [
+            after, Shutdown(reason='over')] if b'here' in event.text else None))
+    assert run(LaunchDescription([*watch(), started, node])) == 0
+    program = str(package / 'lib/demo/says')
+    assert watch.starts[:2] == [('says', '/there/program'), ('says', program)]
+    # the machine ended its own: no news, as the node goes on
+    (spec,) = fake.machines['planner'].all
+    assert fake.machines['planner'].stops == [[spec.id]]
+    assert len([name for name, _ in watch.exits if name == 'says']) == 1
+    here = ''.join(watch.said)
+    assert '-r __node:=mapper -r __ns:=/arm' in here and '-r in:=out' in here
+    assert '--params-file' in here
+    assert watch.interrupted == [('planner', REASON, False)]
+    said = capfd.readouterr().out
+    assert (f"the machine 'planner' is being taken away: {REASON}; "
+            'its nodes go on on the robot') in said
+    assert re.search(r'\[says-\d+\] here: ', said), 'not as the output of a machine'
+    assert said.index(REASON) < said.index('ERROR'), 'the end of the one here, by SIGINT'
+
+
+def test_the_launch_ends_unless_told_otherwise(run, fake, talker, watch, capfd):
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    watch.at_start = {1: says(fake, 'notice', reason=REASON)}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
+    (reason,) = watch.shutdowns
+    assert f"the machine 'planner' is being taken away: {REASON}" in reason
+    assert watch.interrupted == [('planner', REASON, False)]
+    assert len(watch.starts) == 1 and fake.noted('down')
+    errors = [line for line in capfd.readouterr().out.splitlines() if 'ERROR' in line]
+    assert "on_interrupt='robot' would" in errors[0]
+    assert 'says-' in errors[1] and len(errors) == 2, 'the node was ended, by SIGINT'
+
+
+def test_a_machine_that_is_gone_ends_the_launch(run, fake, talker, watch, capfd):
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    watch.at_start = {1: says(fake, 'lost', reason='it was deleted')}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
+    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
+    # nobody is asked there any more, and nobody waits for an answer
+    assert fake.machines['planner'].stops == []
+    errors = [line for line in capfd.readouterr().out.splitlines() if 'ERROR' in line]
+    assert len(errors) == 1
+
+
+def test_nodes_of_a_machine_that_is_gone_go_on(run, fake, package, planner, talker, watch):
+    watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert watch.starts[1][1] == str(package / 'lib/demo/says')
+    assert fake.machines['planner'].stops == []
+    assert watch.interrupted == [('planner', 'evicted', True)]
+    assert [code for _, code in watch.exits] == [-2], 'that of the one here, at the end'
+
+
+def test_notice_then_gone_before_the_nodes_ended(run, fake, planner, talker, watch):
+    """The machine vanishes while its nodes are being ended: they don't wait for it."""
+    def on_start(machine, node):
+        machine.exits_on_stop = False
+        original = machine.stop
+
+        def stop(ids):
+            original(ids)
+            machine.say('lost', reason='it was deleted')
+        machine.stop = stop
+
+    fake.on_start = on_start
+    watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(watch.starts) == 2 and watch.interrupted == [('planner', REASON, False)]
+
+
+def test_a_machine_that_does_not_end_its_nodes(run, fake, planner, talker, watch, monkeypatch):
+    from fogros2.actions import remote_run
+    monkeypatch.setattr(remote_run, 'GRACE', 0.0)
+
+    def on_start(machine, node):
+        machine.exits_on_stop = False
+
+    fake.on_start = on_start
+    watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
+    assert run(LaunchDescription([*watch(), talker(
+        machine=planner, sigterm_timeout='0.1', sigkill_timeout='0.1')])) == 0
+    assert len(watch.starts) == 2
+
+
+def test_requests_that_fail_meanwhile(run, fake, planner, talker, watch):
+    def on_start(machine, node):
+        def stop(ids):
+            raise AgentError('the agent is gone')
+        machine.stop = stop
+
+    fake.on_start = on_start
+    watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(watch.starts) == 2
+
+
+def test_respawn_goes_on_here(run, fake, package, planner, watch):
+    program = package / 'lib/demo/fails'
+    program.write_text('#!/bin/sh\nexit 3\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    watch.at_start = {1: says(fake, 'lost', reason='evicted')}
+    assert run(LaunchDescription([*watch(), CloudNode(
+        machine=planner, package='demo', executable='fails', respawn=True, respawn_delay=0.01,
+        respawn_max_retries=2)])) == 0
+    assert [cmd for _, cmd in watch.starts] == ['/there/program', *[str(program)] * 3]
+    assert [code for _, code in watch.exits] == [3, 3, 3]
+
+
+def test_one_that_waits_to_be_respawned_there(run, fake, planner, talker, watch):
+    """The machine must not start it again while it runs here."""
+    def on_start(machine, node):
+        machine.exits_on_stop = False
+        machine.say('exited', node, returncode=1, respawns=True)
+        machine.say('notice', reason=REASON)
+
+    fake.on_start = on_start
+    watch.at_start = {2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner, respawn=True)])) == 0
+    (spec,) = fake.machines['planner'].all
+    assert fake.machines['planner'].stops == [[spec.id]] and len(watch.starts) == 2
+
+
+def test_signals_and_shutdown_reach_the_process_here(run, fake, planner, talker, watch):
+    node = talker(machine=planner)
+    watch.at_start = {
+        1: says(fake, 'lost', reason='evicted'),
+        2: lambda event: [EmitEvent(event=ShutdownProcess(
+            process_matcher=matches_action(node)))]}
+    assert run(LaunchDescription([*watch(), node])) == 0
+    assert [code for _, code in watch.exits] == [-2]
+    assert fake.machines['planner'].signals == []
+
+
+def test_what_comes_later_runs_here_at_once(run, fake, package, planner, talker, watch):
+    late = talker(machine=planner, exec_name='late')
+    watch.at_start = {
+        1: says(fake, 'lost', reason='evicted'),
+        2: lambda event: [TimerAction(period=0.05, actions=[late])], 3: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert watch.starts[2] == ('late', str(package / 'lib/demo/says'))
+    assert len(fake.machines['planner'].all) == 1
+
+
+def test_groups_and_everything_in_them(run, fake, planner, watch, package):
+    """A group's names, and programs that are no nodes."""
+    program = package / 'lib/demo/says'
+    program.write_text(HERE)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    watch.at_start = {2: says(fake, 'lost', reason='evicted'), 4: lambda event: [
+        TimerAction(period=0.3, actions=end())]}
+    assert run(LaunchDescription([*watch(), CloudGroup(planner, [
+        PushROSNamespace('arm'), SetRemap('a', 'b'),
+        Node(package='demo', executable='says', name='mapper'),
+        ExecuteProcess(cmd=['sh', '-c', 'echo "no node"; exec sleep 60'], name='plain')])])) == 0
+    here = ''.join(watch.said)
+    assert '__node:=mapper' in here and '__ns:=/arm' in here and 'a:=b' in here
+    assert 'no node' in here
+
+
+def test_another_machine_is_left_alone(run, fake, planner, talker, watch):
+    other = ContainerInstance(name='other', ros_workspace='', on_interrupt='robot')
+    watch.at_start = {2: says(fake, 'lost', reason='evicted'), 3: end}
+    assert run(LaunchDescription([
+        *watch(), talker(machine=planner), talker(machine=other, exec_name='elsewhere')])) == 0
+    assert [name for name, _ in watch.starts].count('elsewhere') == 1
+    assert len(fake.machines['other'].stops) == 1, 'at the end'
+
+
+def test_a_program_that_the_robot_lacks_is_found_before_anything(run, fake, planner, capfd):
+    machine = ContainerInstance(
+        name='planner', ros_workspace='', image='has-it', on_interrupt='robot')
+    assert run(LaunchDescription([CloudNode(
+        machine=machine, package='there_only', executable='mapper')])) == 1
+    said = capfd.readouterr().out
+    assert "can't run on the robot, as on_interrupt='robot' wants it to" in said
+    assert "say on_interrupt='shutdown'" in said and not fake.noted('up')
+
+
+# -- ends that come before the news ---------------------------------------------------------------
+
+def last_words(machine, node, event):
+    machine.say(event, reason='SIGTERM')
+    machine.say('exited', node, returncode=-15, respawns=False)
+
+
+@pytest.mark.parametrize('event', ['ending', 'watchdog'])
+def test_nodes_that_end_because_their_machine_does(run, fake, planner, talker, watch, event):
+    """Seconds before it is known that the machine is gone."""
+    def on_start(machine, node):
+        last_words(machine, node, event)
+        machine.say('lost', reason='evicted')
+
+    fake.on_start = on_start
+    watch.at_start = {2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(watch.starts) == 2 and [code for _, code in watch.exits] == [-2]
+
+
+def test_they_have_ended_if_the_news_never_comes(run, fake, planner, talker, watch, monkeypatch):
+    monkeypatch.setattr(session, '_HOLD', 0.1)
+    fake.on_start = lambda machine, node: last_words(machine, node, 'ending')
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(watch.starts) == 1 and [code for _, code in watch.exits] == [-15]
+
+
+def test_a_shutdown_does_not_wait_for_the_news(run, fake, planner, talker, watch):
+    def on_start(machine, node):
+        last_words(machine, node, 'ending')
+        machine.exits_on_stop = False
+
+    fake.on_start = on_start
+    watch.at_start = {1: lambda event: [TimerAction(period=0.2, actions=end())]}
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(watch.starts) == 1
+
+
+# -- streams --------------------------------------------------------------------------------------
+
+class Harmless(H264):
+    """H.264's decisions, carried out by a program that only sleeps."""
+
+    def encoder(self, stream):
+        return dataclasses.replace(super().encoder(stream), package='demo', executable='talker')
+
+    def decoder(self, stream):
+        return dataclasses.replace(super().decoder(stream), package='demo', executable='talker')
+
+
+@pytest.fixture
+def harmless(monkeypatch):
+    names, load = plugin_system.names, plugin_system.load
+    ours = 'fogros2.image_transport'
+    monkeypatch.setattr(plugin_system, 'names', lambda group: (
+        ['h264', 'raw'] if group == ours else names(group)))
+    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
+        Harmless if group == ours else load(group, name)))
+
+
+def test_the_node_takes_topics_as_they_are(run, fake, harmless, planner, talker, watch):
+    """And nobody encodes them any more, unless another machine wants them."""
+    other = ContainerInstance(name='other', ros_workspace='')
+    both, one = ('/camera', 'h264'), ('/lidar', 'h264')
+    node = talker(machine=planner, remappings=[('image', '/camera')], stream_topics=[
+        both, one, StreamTopic('/seen', 'h264', 'to_robot')])
+    # two of the user's, three decoders, an encoder there; two encoders and a decoder here
+    watch.at_start = {
+        9: says(fake, 'lost', reason='evicted'),
+        10: lambda event: [TimerAction(period=0.3, actions=end())]}
+    assert run(FogROSLaunchDescription([
+        *watch(), node, talker(machine=other, exec_name='elsewhere', stream_topics=[both])])) == 0
+    there = [word for spec in fake.machines['planner'].all if spec.executable == 'says'
+             for word in spec.arguments]
+    assert 'image:=/fogros2/planner/camera' in there
+    here = ''.join(watch.said)
+    assert 'image:=/camera' in here and '/fogros2/' not in here
+    assert watch.starts[9][0] == 'says'
+    ended = [name for name, _ in watch.exits]
+    first = {name for name in ended if ended.index(name) < 2}
+    assert first == {'lidar_h264_encoder', 'seen_h264_decoder_from_planner'}
+
+
+# -- money ----------------------------------------------------------------------------------------
+
+def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
+    fake.costs = [('planner', Decimal('0.0416'), 5400.0)]
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=0, respawns=False)
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    assert run(LaunchDescription([talker(machine=machine)])) == 0
+    assert 'planner: 1.50 h at $0.0416 an hour, $0.0624' in capfd.readouterr().out
+
+
+# -- what takes a while to know -------------------------------------------------------------------
+
+def test_choices_are_made_in_threads(run, fake, talker, monkeypatch):
+    from fogros2 import AWSCloudInstance, find_nearest_aws_region
+    from fogros2.provider.aws import choices
+    where = []
+
+    def nearest(regions):
+        where.append(threading.current_thread())
+        return 'eu-north-1'
+
+    monkeypatch.setattr(choices, 'nearest_region', nearest)
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=0, respawns=False)
+    machine = AWSCloudInstance(region=find_nearest_aws_region(), name='cloud', ros_workspace='')
+    assert run(LaunchDescription([
+        talker(machine=machine), talker(machine=machine, exec_name='second')])) == 0
+    assert fake.machines['cloud'].spec.options == {'region': 'eu-north-1'}
+    assert len(where) == 1 and where[0] is not threading.main_thread()
+
+
+def test_a_choice_that_cannot_be_made(run, fake, talker, monkeypatch, capfd):
+    from fogros2 import AWSCloudInstance, find_nearest_aws_region
+    from fogros2.provider.aws import choices
+
+    def nearest(regions):
+        raise ProviderError('no region answers', 'is there a network?')
+
+    monkeypatch.setattr(choices, 'nearest_region', nearest)
+    machine = AWSCloudInstance(region=find_nearest_aws_region(), name='cloud', ros_workspace='')
+    assert run(LaunchDescription([LogInfo(msg='begins'), talker(machine=machine)])) == 1
+    assert 'no region answers (is there a network?)' in capfd.readouterr().out
+    assert not fake.noted('up')
