@@ -170,6 +170,8 @@ def run(fake, package, monkeypatch, tmp_path):
     # launch leaves the parameter files it makes
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     before = dict(os.environ)
+    # whoever logged before did so to streams and folders of another test
+    launch.logging.reset()
 
     def run(description, **arguments):
         service = LaunchService(noninteractive=True, **arguments)
