@@ -809,6 +809,63 @@ def test_what_was_kept_goes_with_the_launch_that_asked_for_it(rig, how):
     assert client.request('status')['kept'] == []
 
 
+def test_a_watch_tells_once_what_its_command_found(rig):
+    rig.serve()
+    client = rig.client()
+    notice = rig.folder / 'notice'
+    client.request('watch', what='notice', argv=['cat', str(notice)], interval=0.05)
+    client.request('ping')
+    aside = rig.folder / 'aside'
+    aside.write_text('terminate at noon\n' + 'x' * 5000)
+    aside.rename(notice)
+    reason = rig.wait('notice')['reason']
+    assert reason.startswith('terminate at noon\n') and len(reason) == 2000
+    # a second one, for another launch: by its time the first would have told again
+    client.request('configure', launch='def456', force='abc123')
+    client.request('watch', what='notice', argv=['echo', 'again'], interval=0.05)
+    rig.wait('notice', reason='again')
+    assert len([e for e in rig.events if e['event'] == 'notice']) == 2
+    for wrong in ({'what': 'output', 'argv': ['true']}, {'what': 'notice', 'argv': []},
+                  {'what': 'notice', 'argv': 'true'}, {'what': 'notice'}):
+        with pytest.raises(AgentError):
+            client.request('watch', **wrong)
+
+
+def test_a_watch_goes_with_its_launch(rig):
+    rig.serve(on_exit='keep')
+    client = rig.client()
+    notice = rig.folder / 'notice'
+    client.request('watch', what='notice', argv=['cat', str(notice)], interval=0.05)
+    client.request('release', on_exit='keep')
+    notice.write_text('too late')
+    client.request('configure', launch='def456')
+    client.request('watch', what='notice', argv=['echo', 'ours'], interval=0.05)
+    assert rig.wait('notice')['reason'] == 'ours'
+
+
+def test_an_agent_says_that_a_signal_ends_it_before_its_nodes_end(rig):
+    agent = rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', SLEEP)])
+    rig.wait('started', node='n')
+    agent.send_signal(signal.SIGTERM)
+    rig.wait('exited', node='n')
+    kinds = [e['event'] for e in rig.events]
+    assert kinds.count('ending') == 1
+    assert kinds.index('ending') < kinds.index('exited')
+
+
+@pytest.mark.parametrize('known', ['abc123', 'xyz789'])
+def test_a_launch_takes_a_machine_from_the_one_alone_that_it_knows_to_be_dead(rig, known):
+    rig.serve(boot_timeout=60.0)
+    client = rig.client()
+    if known == 'abc123':
+        client.request('configure', launch='def456', force=known)
+    else:
+        with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
+            client.request('configure', launch='def456', force=known)
+
+
 def test_an_end_command_that_fails_is_told(rig):
     rig.serve(boot_timeout=0.2, end_command=['false'])
     rig.client()

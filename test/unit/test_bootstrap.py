@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from fogros2 import bootstrap, host, process, wheels
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import PrerequisiteError, WorkspaceError
 from fogros2.host import HostFacts, Python
 from fogros2.model import Command, MachineSpec
 from fogros2.plan import Underlay
@@ -46,6 +46,43 @@ def plan(facts: HostFacts, mode: Any = 'auto', wheel: Wheels = WHEELS,
 
 def scripts(commands: tuple[Command, ...]) -> str:
     return '\n'.join(command.argv[-1] for command in commands)
+
+
+def needs(root: Path, *packages: tuple[str, str], **changes: Any) -> str:
+    for name, depends in packages:
+        folder = root / 'src' / name
+        folder.mkdir(parents=True, exist_ok=True)
+        words = ''.join(f'<exec_depend>{word}</exec_depend>' for word in depends.split())
+        (folder / 'package.xml').write_text(
+            f'<package><name>{name}</name><depend>rclpy</depend>{words}</package>')
+    spec = MachineSpec('m', 'aws', workspace=str(root), **changes)
+    return bootstrap.dependencies(spec, UNDER)
+
+
+def test_equal_needs_have_equal_digits_wherever_they_come_from(tmp_path: Path) -> None:
+    one = needs(tmp_path / '1', ('slam', 'cv_bridge eigen'), ('arm', 'slam'))
+    assert len(one) == 16 and set(one) <= set('0123456789abcdef')
+    assert needs(tmp_path / '2', ('arm', 'eigen'), ('slam', 'arm cv_bridge')) == one
+    # what travels with it changes nothing
+    (tmp_path / '1/src/slam/node.py').write_text('')
+    assert needs(tmp_path / '1', lifetime=60.0) == one
+
+
+def test_other_needs_have_other_digits(tmp_path: Path) -> None:
+    one = needs(tmp_path / '1', ('slam', 'cv_bridge'))
+    assert needs(tmp_path / '2', ('slam', 'cv_bridge eigen')) != one
+    assert needs(tmp_path / '1', bootstrap='apt') != one
+    other = dataclasses.replace(UNDER, environment={**UNDER.environment, 'ROS_DISTRO': 'kilted'})
+    spec = MachineSpec('m', 'aws', workspace=str(tmp_path / '1'))
+    assert bootstrap.dependencies(spec, other) != one
+    assert bootstrap.dependencies(dataclasses.replace(spec, workspace=None), UNDER) != one
+
+
+def test_a_broken_manifest_is_named(tmp_path: Path) -> None:
+    (tmp_path / 'src/arm').mkdir(parents=True)
+    (tmp_path / 'src/arm/package.xml').write_text('<package>')
+    with pytest.raises(WorkspaceError, match='package.xml is no package manifest'):
+        needs(tmp_path)
 
 
 def test_the_probe_works_here() -> None:

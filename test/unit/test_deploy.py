@@ -10,8 +10,8 @@ import time
 
 import pytest
 
-from fogros2 import plugin_system, process
-from fogros2.deploy import entering, job, Launch
+from fogros2 import plan, plugin_system, process
+from fogros2.deploy import entering, job, Launch, robot_vpn
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.deployment import Deployment
@@ -19,7 +19,7 @@ from fogros2.deploy.entering import Entrance
 from fogros2.deploy.guarding import Guard
 from fogros2.deploy.job import Job
 from fogros2.deploy.joining import Joining
-from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.deploy.robot_vpn import RobotVpn, VpnMember
 from fogros2.errors import (
     AgentError,
     Cancelled,
@@ -27,6 +27,7 @@ from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
     FogError,
+    HostKeyError,
     NameTaken,
     ProviderError,
     StoreError,
@@ -41,6 +42,7 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
+from fogros2.shell import host_key
 from fogros2.store import MachineDirectory, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2.waiting import Timeouts, wait_until
@@ -226,3 +228,82 @@ def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
     monkeypatch.setattr(robot._stop, 'wait', lambda timeout: robot._stop.is_set())
     robot._keep()
     assert len(seen) == 2
+
+
+class Members:
+    """Machines of a VPN whose commands a test answers."""
+
+    def __init__(self, robot):
+        self.robot = robot
+        self.away = set()
+        self.told = []
+
+    def add(self, number):
+        name = f'm{number}'
+        place = plan.Place(Peer(name, f'key {name}', f'198.18.7.{number}', f'{name}:1'))
+
+        def on(commands):
+            for peers in commands:
+                if name in self.away:
+                    raise ConnectError(f"'{name}' is out of reach")
+                self.told.append((name, peers))
+
+        member = VpnMember(place, ROBOT, on, lambda peers: None)
+        member.up(self.robot)
+        self.robot.admit(member)
+        self.robot.spread(member)
+
+
+@pytest.fixture
+def members(launch, monkeypatch):
+    robot = launch.robot_vpn()
+    names = staticmethod(lambda interface, peers: [sorted(peer.name for peer in peers)])
+    robot.vpn = type('Names', (), {'up': names, 'peers': names})()
+    monkeypatch.setattr(launch, 'robot', lambda commands: None)
+    return Members(robot)
+
+
+def test_a_new_machine_does_not_fail_as_another_cannot_be_told_of_it(members, monkeypatch):
+    monkeypatch.setattr(robot_vpn, 'TELLING', 0.2)
+    members.add(2)
+    members.away = {'m2'}
+    begin = time.monotonic()
+    members.add(3)
+    assert time.monotonic() - begin < 5
+    assert members.told[-1] == ('m3', ['m2', 'robot'])
+    members.away = set()
+    wait_until(lambda: ('m2', ['m3', 'robot']) in members.told, timeout=10,
+               what='the first machine to be told')
+
+
+def test_everybody_knows_of_a_new_machine_when_it_is_up(members):
+    members.add(2)
+    members.add(3)
+    members.add(4)
+    assert members.told[-2:] in (
+        [('m2', ['m3', 'm4', 'robot']), ('m3', ['m2', 'm4', 'robot'])],
+        [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
+
+
+def test_a_port_that_speaks_no_ssh_is_told_soon(launch, provider, monkeypatch):
+    monkeypatch.setattr(FakeProvider, 'owned', False)
+    monkeypatch.setattr(entering, 'LOGIN_ATTEMPT', 0.5)
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        def serve():
+            for _ in range(20):
+                connection, _ = server.accept()
+                connection.sendall(b'HTTP/1.1 400 Bad Request\r\n\r\n')
+                connection.close()
+
+        threading.Thread(target=serve, daemon=True).start()
+        begin = time.monotonic()
+        with pytest.raises(ConnectError, match='does not answer as an SSH server'):
+            reach(launch, server.getsockname()[1])
+        assert time.monotonic() - begin < 10
+
+
+def test_a_host_key_is_taken_from_what_the_machine_prints():
+    assert host_key.parse('motd\nssh-ed25519 AAAA+/x== planner\n') == 'ssh-ed25519 AAAA+/x=='
+    for said in ('', 'ssh-rsa AAAA x', 'ssh-ed25519 $(id)'):
+        with pytest.raises(HostKeyError, match='made no host key'):
+            host_key.parse(said)

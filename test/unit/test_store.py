@@ -11,7 +11,7 @@ import pytest
 
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
-from fogros2.store import process_start, Record, Store, write_private
+from fogros2.store import boot_id, process_start, Record, Store, write_private
 
 
 @pytest.fixture
@@ -121,6 +121,22 @@ def test_a_process_is_told_from_another_with_its_id():
     child.communicate()
     assert not record(pid=child.pid, pid_start=start).launch_alive
     assert not record().launch_alive
+
+
+def test_after_a_boot_no_process_is_one_from_before(monkeypatch):
+    mine = {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}
+    assert record(boot=boot_id(), **mine).launch_alive
+    assert not record(boot='another boot', **mine).launch_alive
+
+
+def test_options_are_remembered_as_they_were_asked_for(store):
+    spec = MachineSpec('planner', 'fake', {'size': 'small'})
+    folder = store.machine('planner')
+    folder.save(Record('planner', 'fake', spec, asked={'size': 'cheapest'}))
+    assert folder.load().asked_options == {'size': 'cheapest'}
+    # as an earlier version wrote it
+    folder.save(Record('planner', 'fake', spec))
+    assert folder.load().asked_options == {'size': 'small'}
 
 
 def test_a_zombie_counts_as_gone():

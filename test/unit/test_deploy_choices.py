@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of fogros2.deploy where a provider chooses, costs money, or is told what is needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from decimal import Decimal
+import threading
+
+import pytest
+
+from fogros2.deploy import job, Launch
+from fogros2.deploy import launch as launches
+from fogros2.deploy.creating import Creation
+from fogros2.deploy.job import Job
+from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.errors import NameTaken, ProviderError
+from fogros2.model import MachineSpec, VpnInterface
+from fogros2.report import StepDone, StepStarted
+from fogros2.store import Store
+from fogros2.testing.fakes import FakeProvider
+
+SPEC = MachineSpec('planner', 'fake', {'size': 'cheapest'})
+PRICES = {'large': Decimal(2), 'small': Decimal('0.5')}
+
+
+@pytest.fixture
+def provider(monkeypatch):
+    fake = FakeProvider(prices=PRICES)
+    for module in (job, launches):
+        monkeypatch.setattr(module, 'provider', lambda name: fake)
+    monkeypatch.setattr(launches, 'check_robot', lambda: None)
+    return fake
+
+
+@pytest.fixture
+def events():
+    return []
+
+
+@pytest.fixture
+def launch(tmp_path, monkeypatch, events):
+    def choose(self, launch, folder):
+        self._launch, self._lock, self._members = launch, threading.Lock(), {}
+        self.interface = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/no/key')
+
+    monkeypatch.setattr(RobotVpn, '__init__', choose)
+    monkeypatch.setattr('fogros2.shell.warm', lambda kind: None)
+    return Launch(store=Store(tmp_path), environment={}, report=events.append)
+
+
+def create(launch, spec=SPEC):
+    """Take a machine through its first steps; returns what they share."""
+    mine = Job(launch, spec)
+    Creation(mine).run()
+    return mine
+
+
+def test_choices_are_made_once_before_anything_is_created_and_shown_with_the_price(
+        launch, provider, events):
+    launch.prepare([SPEC])
+    assert 'create' not in provider.calls
+    assert events == [
+        StepStarted('planner', 'choices'),
+        dataclasses.replace(events[1], machine='planner', step='choices',
+                            detail='size small, $0.5000 an hour')]
+    mine = create(launch)
+    assert provider.calls.count('resolve') == 1
+    assert mine.spec.options == {'size': 'small'}
+    assert launch.store.machine('planner').load().spec == mine.spec
+    done = [event for event in events if isinstance(event, StepDone)][-1]
+    assert done.step == 'machine' and '$0.5000 an hour' in done.detail
+
+
+def test_a_choice_that_nothing_fits_ends_the_launch_before_anything_is_created(
+        launch, provider):
+    provider.failures['resolve'] = ProviderError('nothing costs less than $0.1')
+    with pytest.raises(ProviderError, match='nothing costs less'):
+        launch.prepare([SPEC])
+    assert 'create' not in provider.calls
+
+
+def keep(launch, spec):
+    mine = create(launch, dataclasses.replace(spec, on_exit='keep'))
+    mine.failed = False
+    mine.undo.close()
+
+
+def test_a_kept_machine_is_what_was_asked_for_though_another_would_be_chosen_now(
+        launch, provider, tmp_path):
+    keep(launch, SPEC)
+    provider.prices['tiny'] = Decimal('0.1')
+    provider.calls.clear()
+    again = Launch(store=Store(tmp_path), environment={})
+    again.prepare([SPEC])
+    mine = create(again)
+    assert mine.reused and 'resolve' not in provider.calls and 'create' not in provider.calls
+    assert mine.spec.options == {'size': 'small'}
+    assert again.cost()[0][:2] == ('planner', Decimal('0.5'))
+    mine.failed = False
+    mine.undo.close()
+    assert list(provider.find({})) == []
+
+
+def test_a_kept_machine_is_not_what_somebody_asks_for_by_its_chosen_value(
+        launch, provider, tmp_path):
+    keep(launch, SPEC)
+    again = Launch(store=Store(tmp_path), environment={})
+    with pytest.raises(NameTaken, match='another size'):
+        create(again, MachineSpec('planner', 'fake', {'size': 'small'}))
+
+
+def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(launches.time, 'monotonic', lambda: now[0])
+    mine = create(launch)
+    now[0] += 60
+    assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]
+    mine.undo.close()
+    now[0] += 60
+    assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]
+
+
+def test_a_machine_without_a_price_costs_nothing(launch, provider):
+    provider.prices.clear()
+    create(launch)
+    assert launch.cost() == []
+
+
+def test_a_provider_is_told_what_will_be_installed(launch, provider, monkeypatch):
+    requests = []
+    made = provider.create
+    monkeypatch.setattr(
+        provider, 'create', lambda spec, request: requests.append(request) or made(spec, request))
+    monkeypatch.setattr('fogros2.bootstrap.dependencies', lambda spec, under: 'a' * 16)
+    monkeypatch.setattr(Launch, 'underlay', lambda self, workspace: None)
+    create(launch)
+    assert requests[0].dependencies == requests[0].tags['fogros2-dependencies'] == 'a' * 16
