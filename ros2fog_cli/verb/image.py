@@ -29,26 +29,21 @@ class ImageVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         parser.usage = _USAGE
-        words = parser.add_argument(
-            'words', nargs='+', metavar='...',
-            help="'list', 'delete' with ids or names of images, or machines to make images of")
-        words.completer = (  # type: ignore[attr-defined]
+        first = parser.add_argument(
+            'first', metavar='list | delete | NAME',
+            help="'list', 'delete' with ids or names of images, or a machine to make an image of")
+        first.completer = (  # type: ignore[attr-defined]
             lambda prefix, **more: [
                 *complete_names(prefix, **more),
                 *(word for word in ('list', 'delete') if word.startswith(prefix))])
-        add_region(parser)
-        parser.add_argument('--dry-run', action='store_true', help='only say what would be done')
-        parser.add_argument('--image-name', metavar='NAME',
-                            help="the image's name (default: the machine's, and the time)")
-        parser.add_argument('--no-wait', action='store_true',
-                            help="don't wait until the image is ready")
-        parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
-        add_json(parser)
+        _add_options(parser)
+        parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
+                            help='more of them; options may come anywhere')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Do what the first word says."""
         from fogros2.errors import ConfigurationError
-        first, rest = args.words[0], args.words[1:]
+        first, rest = args.first, _among(args)
         if first == 'list':
             if rest:
                 raise ConfigurationError("'ros2 fog image list' takes no names")
@@ -60,7 +55,27 @@ class ImageVerb(VerbExtension):
             return _delete(args, rest)
         if args.image_name and rest:
             raise ConfigurationError('--image-name names the image of one machine alone')
-        return max(_make(args, name) for name in args.words)
+        return max(_make(args, name) for name in [first, *rest])
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add_region(parser)
+    parser.add_argument('--dry-run', action='store_true', help='only say what would be done')
+    parser.add_argument('--image-name', metavar='NAME',
+                        help="the image's name (default: the machine's, and the time)")
+    parser.add_argument('--no-wait', action='store_true',
+                        help="don't wait until the image is ready")
+    parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
+    add_json(parser)
+
+
+def _among(args: argparse.Namespace) -> list[str]:
+    """Take the options among the words after the first, and return the others."""
+    late = argparse.ArgumentParser(prog='ros2 fog image', usage=_USAGE)
+    _add_options(late)
+    late.add_argument('words', nargs='*')
+    words: list[str] = late.parse_intermixed_args(args.rest, args).words
+    return words
 
 
 def _list(args: argparse.Namespace) -> int:

@@ -453,6 +453,16 @@ def test_images_are_listed_and_deleted(capsys: pytest.CaptureFixture[str]) -> No
     assert 'there is no image two' in str(run('image', 'delete', 'two', '--yes'))
 
 
+@pytest.mark.parametrize('words', [
+    '--yes delete one two', 'delete --yes one two', 'delete one -y two', 'delete one two --yes',
+    'delete one two --yes --region eu-west-1'])
+def test_options_stand_where_people_write_them(words: str) -> None:
+    for name in ('one', 'two', 'three'):
+        Cloud.baked.append(Image(f'img-{name}', name, 'cloud', state='available'))
+    assert run('image', *words.split()) == 0
+    assert [image.name for image in Cloud.baked] == ['three']
+
+
 def test_an_image_that_is_still_there_was_not_deleted(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
