@@ -530,6 +530,46 @@ def test_a_launch_that_ends_meanwhile_tries_no_further_place(aws):
     assert left() == NOTHING
 
 
+def test_a_region_to_go_on_in_that_lacks_the_type_is_passed_over(aws):
+    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 20)
+    aws.refuse('DescribeInstanceTypes', None, 'InvalidInstanceType')
+    with pytest.raises(AwsError, match='no free machine of this type'):
+        aws.provider.create(*ask(region=HOME, regions=[AWAY]))
+    assert left(HOME) == left(AWAY) == NOTHING
+
+
+def test_an_answer_that_got_lost_may_have_been_a_yes(aws, monkeypatch):
+    spec, request = ask()
+    call = Account.call
+
+    def lost(self, service, region, operation, what, **words):
+        answer = call(self, service, region, operation, what, **words)
+        if operation == 'run_instances':
+            raise PrerequisiteError('AWS does not answer')
+        return answer
+
+    monkeypatch.setattr(Account, 'call', lost)
+    with pytest.raises(PrerequisiteError):
+        aws.provider.create(spec, request)
+    assert left() == NOTHING
+
+
+def test_the_nearest_region_has_neighbours_to_go_on_in(aws, monkeypatch):
+    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region', lambda: HOME)
+    spec, _ = ask(region='nearest')
+    assert aws.provider.resolve(spec).options == {
+        **spec.options, 'region': HOME, 'regions': ['eu-west-3', 'eu-west-2']}
+    named, _ = ask(region='nearest', regions=[AWAY])
+    assert aws.provider.resolve(named).options['regions'] == [AWAY]
+
+
+def test_all_providers_of_a_process_share_what_is_slow_to_make(monkeypatch):
+    one, other = AWSProvider(), AWSProvider()
+    assert one._account.client('ec2', HOME) is other._account.client('ec2', HOME)
+    monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'another')
+    assert AWSProvider()._account is not one._account
+
+
 def test_the_same_request_is_the_same_to_the_byte(aws):
     """EC2 knows a request again by its token only if everything else is the same too."""
     spec, request = ask()

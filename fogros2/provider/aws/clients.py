@@ -31,6 +31,25 @@ def configured() -> bool:
                for variable, usual in _FILES.items())
 
 
+_accounts: dict[tuple[tuple[str, str], ...], Account] = {}
+_accounts_lock = threading.Lock()
+
+
+def usual() -> Account:
+    """
+    Return the account of this computer's user, the same to everybody in this process.
+
+    Making a session and its clients takes half a second, and a launch asks from many sides.
+    """
+    settings = tuple(sorted((name, value) for name, value in os.environ.items()
+                            if name.startswith('AWS_') or name == 'HOME'))
+    with _accounts_lock:
+        if settings not in _accounts:
+            _accounts.clear()
+            _accounts[settings] = Account()
+        return _accounts[settings]
+
+
 class Account:
     """
     An AWS account as boto3 finds it (variables, files, roles); thread-safe.
@@ -42,6 +61,8 @@ class Account:
 
     def __init__(self, session: Optional[Any] = None) -> None:
         self._session = session
+        #: Instances that this process has made, and when (``time.monotonic``).
+        self.made: dict[str, float] = {}
         self._clients: dict[tuple[str, str, bool], Any] = {}
         # making clients of one session in several threads isn't safe; using them is
         self._lock = threading.RLock()

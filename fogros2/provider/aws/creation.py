@@ -15,12 +15,12 @@ from decimal import Decimal
 import time
 from typing import Any, Optional
 
-from fogros2.errors import Cancelled, FogError, NameTaken
+from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider import TAG_NAME, TAG_ROBOT
-from fogros2.provider.aws import images, instances, network
+from fogros2.provider.aws import ending, images, instances, network
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError, code_of, GONE, NO_ROOM, NO_ROOM_IN_REGION
+from fogros2.provider.aws.failures import AwsError, NO_ROOM, NO_ROOM_IN_REGION
 from fogros2.provider.aws.host_key import one_time
 from fogros2.provider.aws.images import Kind
 from fogros2.provider.aws.instances import MachineId, Place, TAG_ATTEMPT, TAG_MADE
@@ -29,6 +29,8 @@ from fogros2.provider.aws.user_data import user_data
 
 #: Returns what a machine costs by the hour (US dollars), None where nobody knows.
 Price = Callable[[str, str], Optional[Decimal]]
+#: Seconds that an undo waits for what is ending.
+PATIENCE = 120.0
 
 
 class Creation:
@@ -50,6 +52,7 @@ class Creation:
         self.attempt = instances.attempt_of(request.token)
         self._robot_address = robot_address
         self._price = price
+        self._images: dict[tuple[str, str, bool], Mapping[str, Any]] = {}
 
     def run(self, regions: list[str], types: list[str]) -> MachineId:
         """
@@ -58,14 +61,20 @@ class Creation:
         :raises NameTaken: a machine of that name is there, made under another token.
         :raises FogError: see :mod:`~fogros2.provider.aws.failures`; nothing is left behind.
         """
-        for number, region in enumerate(regions):
+        first: Optional[AwsError] = None
+        for region in regions:
             try:
                 return self._in_region(region, types)
-            except AwsError as error:
-                last = number == len(regions) - 1
-                if error.code not in NO_ROOM or last:
+            except ConfigurationError:
+                if first is None:
                     raise
-        raise AssertionError('no region to try')
+                # a region to go on in that lacks the type: what the first one said counts
+            except AwsError as error:
+                if error.code not in NO_ROOM:
+                    raise
+                first = first or error
+        assert first is not None, 'there is a region to try'
+        raise first
 
     def _in_region(self, region: str, types: list[str]) -> MachineId:
         with ThreadPoolExecutor(3, 'fog-aws') as pool:
@@ -106,11 +115,10 @@ class Creation:
     def _image(self, region: str, kind: Kind, kinds: list[Kind]) -> Mapping[str, Any]:
         """Return a kind's image, asked once for all kinds that take the same."""
         key = (region, kind.arch, kind.nvidia)
-        known: dict[Any, Mapping[str, Any]] = self.__dict__.setdefault('_images', {})
-        if key not in known:
-            known[key] = images.choose(
+        if key not in self._images:
+            self._images[key] = images.choose(
                 self.account, region, kind, self.options, self.request.dependencies)
-        return known[key]
+        return self._images[key]
 
     def _make(
         self, region: str, chosen: list[tuple[Kind, Mapping[str, Any]]], sources: list[str],
@@ -124,8 +132,12 @@ class Creation:
             agent_config=self.request.agent_config)
         with contextlib.ExitStack() as undo:
             # in this order: an undo of what was not made yet finds nothing, and that is fine
-            undo.callback(_attempt, lambda: self._drop_group(region))
-            undo.callback(_attempt, lambda: drop_key(self.account, region, self.attempt))
+            undo.callback(_attempt, lambda: ending.drop_groups(
+                self.account, region, self.attempt, timeout=PATIENCE))
+            undo.callback(_attempt, lambda: ending.drop_key(self.account, region, self.attempt))
+            # an answer that got lost may have been a yes
+            undo.callback(_attempt, lambda: ending.end_instances(
+                self.account, region, self.attempt))
             with ThreadPoolExecutor(1, 'fog-aws') as pool:
                 made = {**tags, TAG_MADE: str(int(time.time()))}
                 importing = pool.submit(self._import_key, region, made)
@@ -199,23 +211,6 @@ class Creation:
         except AwsError as error:
             if error.code != 'InvalidKeyPair.Duplicate':
                 raise
-
-    def _drop_group(self, region: str) -> None:
-        network.delete_groups(
-            self.account, region,
-            [str(group['GroupId'])
-             for group in network.find_groups(self.account, region, self.attempt)],
-            timeout=15.0)
-
-
-def drop_key(account: Account, region: str, attempt: str) -> None:
-    """Delete the key of an attempt; there may be none."""
-    try:
-        account.call('ec2', region, 'delete_key_pair', 'deleting the login key',
-                     KeyName=instances.own_name(attempt))
-    except AwsError as error:
-        if code_of(error) not in GONE:
-            raise
 
 
 def _attempt(undo: Callable[[], None]) -> None:

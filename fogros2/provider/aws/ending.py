@@ -9,7 +9,6 @@ from typing import Any
 from fogros2.provider import TAG_NAME
 from fogros2.provider.aws import instances, network
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.creation import drop_key
 from fogros2.provider.aws.failures import AwsError, code_of, GONE
 from fogros2.provider.aws.instances import MachineId, TAG_ATTEMPT, TAG_MADE
 from fogros2.waiting import wait_until
@@ -55,9 +54,7 @@ def _there(account: Account, machine: MachineId) -> bool:
 def sweep(account: Account, region: str, attempt: str) -> None:
     """Delete what an attempt made besides its instance: key, group, addresses, disks."""
     drop_key(account, region, attempt)
-    network.delete_groups(
-        account, region,
-        [str(group['GroupId']) for group in network.find_groups(account, region, attempt)])
+    drop_groups(account, region, attempt)
     mine = [{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]}]
     for address in account.call('ec2', region, 'describe_addresses', 'looking for addresses',
                                 Filters=mine)['Addresses']:
@@ -69,6 +66,30 @@ def sweep(account: Account, region: str, attempt: str) -> None:
     for volume in volumes:
         _gone_is_fine(account, region, 'delete_volume', 'deleting a disk',
                       VolumeId=volume['VolumeId'])
+
+
+def drop_key(account: Account, region: str, attempt: str) -> None:
+    """Delete the key of an attempt; there may be none."""
+    _gone_is_fine(account, region, 'delete_key_pair', 'deleting the login key',
+                  KeyName=instances.own_name(attempt))
+
+
+def drop_groups(account: Account, region: str, attempt: str, *, timeout: float = PATIENCE) -> None:
+    """Delete the group of an attempt, as soon as nothing uses it; there may be none."""
+    found = network.find_groups(account, region, attempt)
+    network.delete_groups(account, region, [str(group['GroupId']) for group in found],
+                          timeout=timeout)
+
+
+def end_instances(account: Account, region: str, attempt: str) -> None:
+    """Have the instances of an attempt end, without waiting; there may be none."""
+    found = instances.instances_in(account.call(
+        'ec2', region, 'describe_instances', 'looking for what was made', Filters=[
+            *instances.tag_filters({TAG_ATTEMPT: attempt}),
+            {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}])['Reservations'])
+    if found:
+        _gone_is_fine(account, region, 'terminate_instances', 'ending what was made',
+                      InstanceIds=[instance['InstanceId'] for instance in found])
 
 
 def leftovers(account: Account, region: str, now: float) -> dict[str, str]:

@@ -40,7 +40,7 @@ class RobotAddress:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known = ('', 0.0)
+        self._known = ('', '', 0.0)
 
     def __call__(self) -> str:
         """
@@ -52,15 +52,15 @@ class RobotAddress:
         told = os.environ.get(ADDRESS_VARIABLE, '')
         if told:
             return cidr(told)
+        url = os.environ.get(CHECKIP_VARIABLE, CHECKIP)
         with self._lock:
-            address, when = self._known
-            if not address or time.monotonic() - when > ADDRESS_AGE:
-                address = self._ask()
-                self._known = (address, time.monotonic())
+            address, asked, when = self._known
+            if asked != url or time.monotonic() - when > ADDRESS_AGE:
+                address = self._ask(url)
+                self._known = (address, url, time.monotonic())
             return address
 
-    def _ask(self) -> str:
-        url = os.environ.get(CHECKIP_VARIABLE, CHECKIP)
+    def _ask(self, url: str) -> str:
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
             with urllib.request.urlopen(url, timeout=5.0) as answer:

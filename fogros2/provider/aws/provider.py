@@ -23,6 +23,7 @@ from fogros2.errors import (
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider
 from fogros2.provider.aws import clients, ending, images, instances, network, user_data
+from fogros2.provider.aws import regions as places
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.creation import Creation
 from fogros2.provider.aws.failures import AwsError, code_of, DENIED, GONE
@@ -38,6 +39,10 @@ REGIONS_VARIABLE = 'FOGROS2_AWS_REGIONS'
 SETTLING = 60.0
 #: Regions asked at once.
 PARALLEL = 20
+#: Regions beside the nearest one to go on in where it has no room.
+NEIGHBOURS = 2
+#: One for all providers of this process, or each machine of a launch would ask anew.
+_ROBOT_ADDRESS = network.RobotAddress()
 
 # Runs on the machine every few seconds; asks only AWS's own metadata service, with a token.
 _NOTICE = """\
@@ -57,7 +62,7 @@ class AWSProvider(Provider):
     """
     EC2 instances.
 
-    :param account: who asks AWS; None for the account that boto3 finds.
+    :param account: who asks AWS; None for the account of this computer's user.
     """
 
     name: ClassVar[str] = instances.PROVIDER
@@ -69,12 +74,9 @@ class AWSProvider(Provider):
     notice: ClassVar[tuple[str, ...]] = ('python3', '-ISc', _NOTICE)
 
     def __init__(self, account: Optional[Account] = None) -> None:
-        self._account = account or Account()
-        self._robot_address = network.RobotAddress()
+        self._account = account or clients.usual()
+        self._robot_address = _ROBOT_ADDRESS
         self._regions: tuple[str, ...] = ()
-        #: Instances that this process has made, and when (monotonic).
-        self._made: dict[str, float] = {}
-        self._lock = threading.Lock()
 
     # -- before anything is made ----------------------------------------------------------------
 
@@ -109,6 +111,8 @@ class AWSProvider(Provider):
         region = self._region(options)
         if region == NEAREST:
             region = choices.nearest_region()
+            if not options.regions and not options.ami_image:
+                chosen['regions'] = neighbours(region)
         kind = options.ec2_instance_type
         market = Market(self._account.client)
         if options.chooses_type:
@@ -165,8 +169,7 @@ class AWSProvider(Provider):
             list(dict.fromkeys([self._region(options), *options.regions])),
             list(dict.fromkeys([options.ec2_instance_type or DEFAULT_TYPE,
                                 *options.instance_types])))
-        with self._lock:
-            self._made[machine.instance] = time.monotonic()
+        self._account.made[machine.instance] = time.monotonic()
         return str(machine)
 
     def _chosen(self, spec: MachineSpec) -> MachineSpec:
@@ -201,8 +204,7 @@ class AWSProvider(Provider):
             found = []
         if found:
             return found[0]
-        with self._lock:
-            made = self._made.get(machine.instance)
+        made = self._account.made.get(machine.instance)
         if made is not None and time.monotonic() - made < SETTLING:
             return None
         raise MachineNotFound(f'there is no {machine.instance} in {machine.region} any more')
@@ -375,3 +377,11 @@ class AWSProvider(Provider):
             if error is not None and (named or not found or code_of(error) not in DENIED):
                 raise error
         return found
+
+
+def neighbours(region: str) -> list[str]:
+    """Return the regions beside one, the nearest on the globe first."""
+    here = places.REGIONS.get(region)
+    others = [name for name in places.ENABLED if name != region]
+    return [] if here is None else [
+        found.region for found in places.by_distance(others, here[:2])][:NEIGHBOURS]
