@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch argument ``machine``: where the talker of the example launch files runs."""
+"""The launch argument ``machine``: where cloud nodes of the example launch files run."""
 
 from __future__ import annotations
 
@@ -13,35 +13,28 @@ from launch_ros.actions import Node
 
 from fogros2 import CloudNode, ContainerInstance, SSHInstance
 
+#: What begins the names of the arguments for the second machine alone.
+SECOND = 'second_'
 
-def talker(machine: str, name: str) -> list[LaunchDescriptionEntity]:
+
+def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchArgument]:
     """
-    Return the talker and the arguments that say where it runs.
+    Return the launch arguments that say where the machines are.
 
     :param machine: what ``machine:=`` is unless said: container, ssh or local.
     :param name: what the machine is called unless said.
+    :param second: the same of a second one; '' where there is none.
     """
-    def argument(argument: str, value: str, description: str) -> DeclareLaunchArgument:
-        return DeclareLaunchArgument(argument, default_value=value, description=description)
+    def argument(name: str, value: str, description: str) -> DeclareLaunchArgument:
+        return DeclareLaunchArgument(name, default_value=value, description=description)
 
-    def chosen(value: str) -> IfCondition:
-        return IfCondition(EqualsSubstitution(LaunchConfiguration('machine'), value))
-
-    program: dict[str, Any] = {'package': 'fogros2_examples', 'executable': 'talker',
-                               'output': 'screen'}
-    container = ContainerInstance(
-        name=LaunchConfiguration('name'), on_exit=LaunchConfiguration('on_exit'))
-    computer = SSHInstance(
-        host=LaunchConfiguration('host'), user=LaunchConfiguration('user'),
-        port=LaunchConfiguration('port'), key=LaunchConfiguration('key'),
-        host_key=LaunchConfiguration('host_key'), bootstrap=LaunchConfiguration('bootstrap'),
-        on_exit=LaunchConfiguration('on_exit'), name=LaunchConfiguration('name'))
-    return [
+    found = [
         DeclareLaunchArgument(
             'machine', default_value=machine, choices=['container', 'ssh', 'local'],
-            description='where the talker runs'),
+            description='where the cloud nodes run'),
         argument('name', name, 'what the machine is called'),
         argument('on_exit', 'delete', 'what becomes of it: delete, stop or keep'),
+        argument('network', '', "machine:=container: its network; '' for the engine's own"),
         argument('host', '', 'machine:=ssh: name or address of the computer'),
         argument('user', '', 'machine:=ssh: login user there'),
         argument('port', '22', 'machine:=ssh: port of its SSH server'),
@@ -49,6 +42,38 @@ def talker(machine: str, name: str) -> list[LaunchDescriptionEntity]:
         argument('host_key', '', 'machine:=ssh: its public host key; else known_hosts decides'),
         argument('bootstrap', 'auto',
                  'machine:=ssh: how ROS 2 gets there: auto, apt, embedded or none'),
+    ]
+    if second:
+        found += [
+            argument(f'{SECOND}name', second, 'what the second machine is called'),
+            argument(f'{SECOND}host', '', 'machine:=ssh: the second computer'),
+            argument(f'{SECOND}host_key', '', 'machine:=ssh: its public host key'),
+        ]
+    return found
+
+
+def node(executable: str, *, which: str = '', **kwargs: Any) -> list[LaunchDescriptionEntity]:
+    """
+    Return a node of this package on the machine that ``machine:=`` chooses, or here.
+
+    :param which: the machine: '' for the first, ``SECOND`` for the second.
+    :param kwargs: what launch_ros's Node takes besides.
+    """
+    def chosen(value: str) -> IfCondition:
+        return IfCondition(EqualsSubstitution(LaunchConfiguration('machine'), value))
+
+    def own(argument: str) -> LaunchConfiguration:
+        return LaunchConfiguration(f'{which}{argument}')
+
+    common: dict[str, Any] = {'name': own('name'), 'on_exit': LaunchConfiguration('on_exit')}
+    container = ContainerInstance(network=LaunchConfiguration('network'), **common)
+    computer = SSHInstance(
+        host=own('host'), user=LaunchConfiguration('user'), port=LaunchConfiguration('port'),
+        key=LaunchConfiguration('key'), host_key=own('host_key'),
+        bootstrap=LaunchConfiguration('bootstrap'), **common)
+    program: dict[str, Any] = {'package': 'fogros2_examples', 'executable': executable,
+                               'output': 'screen', **kwargs}
+    return [
         CloudNode(machine=container, condition=chosen('container'), **program),
         CloudNode(machine=computer, condition=chosen('ssh'), **program),
         Node(condition=chosen('local'), **program),

@@ -209,10 +209,13 @@ def _programs() -> Iterator[Trace]:
 def _agent_marks(process: Path, words: list[str]) -> Iterator[str]:
     """Yield the launches that an agent's configurations name, read in its own file system."""
     options = dict(zip(words, words[1:]))
+    program = next(word for word in words if word.endswith('agent.py'))
     first = _read_json(process, options.get('--config', ''))
-    # that one names the folder in which the agent keeps what it was told later
-    folder = options.get('--directory') or first.get('directory')
-    for config in (first, _read_json(process, f'{folder}/config.json' if folder else '')):
+    # the folder in which the agent keeps what it was told later: that of its program too, where
+    # the first configuration is gone by now
+    folders = {options.get('--directory'), first.get('directory'), os.path.dirname(program)}
+    for config in (first, *(_read_json(process, f'{folder}/config.json')
+                            for folder in folders if folder)):
         if config.get('launch'):
             yield str(config['launch'])
 

@@ -6,13 +6,14 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from fogros2 import FogROSLaunchDescription
-from fogros2_examples.choice import talker
+from fogros2_examples.choice import arguments, node
 
 
 def generate_launch_description():
     """Describe the pair; ``count:=20`` ends it after 20 messages, ``machine:=local`` is here."""
     return FogROSLaunchDescription([
-        *talker('container', 'talker-machine'),
+        *arguments('container', 'talker-machine'),
+        *node('talker'),
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),
         Node(package='fogros2_examples', executable='listener', output='screen',

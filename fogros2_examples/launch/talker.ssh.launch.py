@@ -6,13 +6,14 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from fogros2 import FogROSLaunchDescription
-from fogros2_examples.choice import talker
+from fogros2_examples.choice import arguments, node
 
 
 def generate_launch_description():
     """Describe the pair; ``host:=planner.local user:=robot`` says which computer."""
     return FogROSLaunchDescription([
-        *talker('ssh', 'ssh-machine'),
+        *arguments('ssh', 'ssh-machine'),
+        *node('talker'),
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),
         Node(package='fogros2_examples', executable='listener', output='screen',

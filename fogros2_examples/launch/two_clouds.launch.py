@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two machines at once: a talker on one, a listener on the other, a second listener here."""
 
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2 import FogROSLaunchDescription
+from fogros2_examples.choice import arguments, node, SECOND
 
 
 def generate_launch_description():
-    """Describe three hosts that talk to each other through the VPN."""
-    speaker = ContainerInstance(name='speaker')
-    hearer = ContainerInstance(name='hearer')
+    """Describe three hosts that talk to each other; ``count:=20`` ends it after 20 messages."""
     return FogROSLaunchDescription([
-        CloudNode(machine=speaker, package='fogros2_examples', executable='talker',
-                  output='screen'),
-        CloudNode(machine=hearer, package='fogros2_examples', executable='listener',
-                  output='screen'),
+        *arguments('container', 'speaker', 'hearer'),
+        *node('talker'),
+        *node('listener', which=SECOND),
+        DeclareLaunchArgument('count', default_value='0',
+                              description='messages after which the launch ends, 0 for never'),
         Node(package='fogros2_examples', executable='listener', name='robot_listener',
-             output='screen'),
+             output='screen', parameters=[{'count': LaunchConfiguration('count')}],
+             on_exit=Shutdown()),
     ])

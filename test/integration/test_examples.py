@@ -63,17 +63,9 @@ def test_the_demo(launch, engine):
     assert float(total) < 30
 
 
-def test_three_hosts_hear_each_other(launch, cloud_network, tmp_path):
-    # its names are fixed, and this computer may have such machines
-    text = example('two_clouds.launch.py').read_text()
-    for name in ('speaker', 'hearer'):
-        assert f"ContainerInstance(name='{name}')" in text
-        text = text.replace(
-            f"ContainerInstance(name='{name}')",
-            f"ContainerInstance(name='{name}-{RUN}', network='{cloud_network}')")
-    path = tmp_path / 'two_clouds.launch.py'
-    path.write_text(text)
-    run = launch(str(path))
+def test_three_hosts_hear_each_other(launch, cloud_network):
+    run = launch('fogros2_examples', 'two_clouds.launch.py', f'name:=speaker-{RUN}',
+                 f'second_name:=hearer-{RUN}', f'network:={cloud_network}')
     said = f'I heard: [Hello World from speaker-{RUN} '
     run.wait_for(f'[listener]: {said}')
     run.wait_for(f'[robot_listener]: {said}')
@@ -83,8 +75,9 @@ def test_three_hosts_hear_each_other(launch, cloud_network, tmp_path):
     assert run.errors == [], run.text
 
 
-def test_the_machine_is_chosen_at_launch_time(launch):
-    run = launch('fogros2_examples', 'talker.container.launch.py', 'machine:=local', 'count:=2')
+@pytest.mark.parametrize('name', ['talker.container.launch.py', 'two_clouds.launch.py'])
+def test_the_machine_is_chosen_at_launch_time(launch, name):
+    run = launch('fogros2_examples', name, 'machine:=local', 'count:=2')
     assert run.ended() == 0, run.text
     assert run.text.count('I heard: [Hello World') >= 2
     assert '[fogros2]' not in run.text, 'a machine was made'
@@ -92,12 +85,13 @@ def test_the_machine_is_chosen_at_launch_time(launch):
 
 
 @pytest.mark.parametrize('option', ['-s', '-p'])
-@pytest.mark.parametrize('name', ['talker.container.launch.py', 'talker.ssh.launch.py',
-                                  'two_clouds.launch.py'])
+@pytest.mark.parametrize('name', [
+    'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.container.launch.py',
+    'talker.kube.launch.py', 'talker.ssh.launch.py', 'two_clouds.launch.py'])
 def test_looking_at_a_launch_file_makes_nothing(name, option, state_home):
     shown = ros2('launch', str(example(name)), option, timeout=20)
     assert shown.returncode == 0, shown.stdout + shown.stderr
-    if option == '-s' and name != 'two_clouds.launch.py':
+    if option == '-s':
         assert "'count':" in shown.stdout
     assert list(state_home.iterdir()) == []
 

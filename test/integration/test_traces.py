@@ -73,11 +73,12 @@ def store(folder, launch_id, child):
         {'pid': child.pid, 'pid_start': process_start(child.pid)}))
 
 
-def fake_agent(folder, launch_id):
+def fake_agent(folder, launch_id, *, first=True):
     """Return the words of a process that looks like the agent of a launch."""
     program, config = folder / 'agent.py', folder / 'first.json'
     program.write_text(WAITS)
-    config.write_text(json.dumps({'directory': str(folder), 'launch': ''}))
+    if first:
+        config.write_text(json.dumps({'directory': str(folder), 'launch': ''}))
     (folder / 'config.json').write_text(json.dumps({'launch': launch_id}))
     return str(program), 'serve', '--config', str(config)
 
@@ -108,10 +109,13 @@ def test_an_agent_is_found(look, start, tmp_path, launch_id):
     assert found.startswith(f'process {child.pid} ') and words[0] in found
 
 
-def test_a_strangers_launch_is_his(look, tun, start, elsewhere, launch_id, tmp_path, request):
+@pytest.mark.parametrize('first', [True, False])
+def test_a_strangers_launch_is_his(
+    look, tun, start, elsewhere, launch_id, tmp_path, request, first,
+):
     traces = look()
     name = request.getfixturevalue('interface')
-    program = start(*fake_agent(tmp_path, launch_id))
+    program = start(*fake_agent(tmp_path, launch_id, first=first))
     (elsewhere / 'waits.py').write_text(WAITS)
     launch = start(
         str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere), **{RUN: 'another'})
