@@ -499,9 +499,11 @@ def market(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prices.Market, 'prices', prices_of)
     monkeypatch.setattr(prices.Market, 'spot', lambda self, region, names=None: {
         'm6i.2xlarge': {f'{region}a': Decimal('0.1')}})
-    monkeypatch.setattr(choices, 'enabled_regions', lambda account=None: [
+    monkeypatch.setattr(choices, 'enabled_regions', lambda account: [
         'eu-west-1', 'me-south-1', 'us-west-1'])
-    monkeypatch.setenv('AWS_REGION', 'eu-west-1')
+    for name, value in (('AWS_REGION', 'eu-west-1'), ('AWS_ACCESS_KEY_ID', 'testing'),
+                        ('AWS_SECRET_ACCESS_KEY', 'testing')):
+        monkeypatch.setenv(name, value)
 
 
 def test_prices(market: None, capsys: pytest.CaptureFixture[str]) -> None:
@@ -528,6 +530,20 @@ def test_prices_of_all_regions(market: None, capsys: pytest.CaptureFixture[str])
     assert lines[2].split()[:2] == ['g6.2xlarge', 'us-west-1']
     assert lines[3] == '3 more cost as much or more (--limit 0)'
     assert run('price', '--gpu', '--max-price', '5', '--arch', 'x86_64') not in (0, None)
+
+
+def test_prices_without_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(*_: Any) -> str:
+        raise AssertionError('took seconds, for nothing')
+
+    for name in list(os.environ):
+        if name.startswith('AWS_'):
+            monkeypatch.delenv(name)
+    for name in ('AWS_CONFIG_FILE', 'AWS_SHARED_CREDENTIALS_FILE'):
+        monkeypatch.setenv(name, os.devnull)
+    monkeypatch.setenv('AWS_EC2_METADATA_DISABLED', 'true')
+    monkeypatch.setattr(choices, 'nearest_region', measured)
+    assert 'there are no AWS credentials' in str(run('price'))
 
 
 def test_regions(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -339,21 +339,23 @@ def regions_named(names: Optional[Sequence[str]], account: Optional[Account] = N
 
     :raises FogError: AWS can't be asked, or no region answers.
     """
+    account = account or Account()
+    # looked for first: measuring takes seconds, and helps nobody who can't ask for prices
+    account.check_credentials()
     names = [name for name in names or () if name]
     if not names:
-        return [(account or Account()).region() or nearest_region()]
+        return [account.region() or nearest_region()]
     if {'all', '*'} & set(names):
         return enabled_regions(account)
     return list(dict.fromkeys(nearest_region() if name == 'nearest' else name for name in names))
 
 
-def enabled_regions(account: Optional[Account] = None) -> list[str]:
+def enabled_regions(account: Account) -> list[str]:
     """
     Return the regions that the account may use; one request.
 
     :raises FogError: AWS refused, or can't be reached.
     """
-    account = account or Account()
     answer = account.call('ec2', account.region() or 'us-east-1', 'describe_regions',
                           'asking for the regions of the account', hasty=True)
     return sorted(region['RegionName'] for region in answer['Regions'])

@@ -130,6 +130,9 @@ def geolocate() -> tuple[float, float]:
         answer.raise_for_status()
         latitude, longitude = str(answer.json()['loc']).split(',')
         return float(latitude), float(longitude)
+    except (requests.ConnectionError, requests.Timeout) as error:
+        raise ProviderError(f'{GEOLOCATION_URL}, which would know where this computer is, does '
+                            'not answer either', 'name a region') from error
     except (requests.RequestException, ValueError, KeyError, TypeError) as error:
         raise ProviderError(f"{GEOLOCATION_URL} doesn't say where this computer is: {error}",
                             'name a region') from error
