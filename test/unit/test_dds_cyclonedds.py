@@ -184,6 +184,15 @@ def test_the_receive_buffer_asks_for_no_minimum() -> None:
         {'max': '4194304 B'}]
 
 
+def test_what_is_lost_comes_again_soon() -> None:
+    """Both sides: the reader that misses something, the writer that asks whether it does."""
+    root = rendered(VPN, LOOPBACK)
+    assert texts(root, 'NackDelay') == ['5 ms']
+    assert texts(root, 'HeartbeatInterval') == ['20 ms']
+    assert attributes(root, 'HeartbeatInterval') == [
+        {'min': '5 ms', 'minsched': '10 ms', 'max': '1 s'}]
+
+
 def test_no_interface_is_an_error() -> None:
     with pytest.raises(DdsError):
         CYCLONE.render([], [])
