@@ -248,6 +248,8 @@ class VpnInterface:
     :param port: UDP port listened on.
     :param key_file: where this host keeps its private key (0600); never leaves the host.
     :param guarded: let in DDS and ping alone and forward nothing (the robot's side).
+    :param host_routes: lead to the peers' addresses alone: the host has a network of its own that
+        overlaps the launch's.
     """
 
     name: str
@@ -257,6 +259,7 @@ class VpnInterface:
     key_file: str
     mtu: int = 1420
     guarded: bool = False
+    host_routes: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

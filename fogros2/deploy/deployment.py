@@ -46,6 +46,7 @@ class Deployment:
                 interface = self.joining.interface()
                 agent = self.guard.arm(machine, shell)
                 ros = self.prepare_host(shell)
+                interface = self.joining.fit(interface, ros.facts.routes)
                 robot.result()
                 joining = pool.submit(self.joining.join, machine, shell, agent, interface)
                 syncing = pool.submit(self.sync, shell, ros)

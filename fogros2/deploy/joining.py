@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import dataclasses
 
 from fogros2 import plan
 from fogros2.agent_client import AgentClient
@@ -13,6 +14,7 @@ from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.errors import CommandError, VpnError
 from fogros2.model import Machine, Peer, VpnInterface
 from fogros2.shell import Shell
+from fogros2.vpn import addresses
 
 
 class Joining:
@@ -31,6 +33,19 @@ class Joining:
             job.launch.id, robot.network, job.launch.index(job.name), port,
             f'{self._guard.directory}/vpn.key')
         job.save(vpn=interface)
+        return interface
+
+    def fit(self, interface: VpnInterface, routes: Sequence[str]) -> VpnInterface:
+        """
+        Return the interface as it suits a machine with these routes, IPv4, in CIDR form.
+
+        The robot chose the launch's subnet before there was a machine, and its nodes may run. So
+        the launch isn't numbered anew where a machine has a network that overlaps; the machine
+        leads its peers' addresses alone into the VPN.
+        """
+        if addresses.overlapping(interface.network, routes):
+            interface = dataclasses.replace(interface, host_routes=True)
+            self._job.save(vpn=interface)
         return interface
 
     def join(
@@ -75,6 +90,11 @@ class Joining:
                     raise VpnError(
                         f"UDP port {interface.port} of '{job.name}' is in use already",
                         'launch again: each launch takes another port') from error
+                if 'in use already:' in error.result.stderr:
+                    raise VpnError(
+                        f"'{job.name}' uses addresses of the VPN's network itself: "
+                        f'{error.result.stderr.strip().splitlines()[-1]}',
+                        'launch again: each launch takes another network') from error
                 raise
             robot.spread(member)
             detail.append(interface.address)

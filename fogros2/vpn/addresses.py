@@ -61,6 +61,17 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
         f'{POOL_VARIABLE}=10.213.0.0/16 takes another pool')
 
 
+def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
+    """
+    Return those of the networks and addresses in use that overlap a launch's subnet.
+
+    :param used: as in :func:`choose_subnet`.
+    """
+    ours = _Network(subnet)
+    return [text for text in used
+            if (network := _network(text)) is not None and network.overlaps(ours)]
+
+
 def addresses(subnet: str) -> Iterator[str]:
     """Yield the addresses of a launch's subnet: the robot's (.1), then the machines' (.2, ...)."""
     return map(str, _Network(subnet).hosts())

@@ -2,6 +2,9 @@
 """
 WireGuard, in the kernel where it has the module, else ``wireguard-go`` on a persistent TUN.
 
+A machine whose own networks overlap the launch's (the robot's don't: that is how it was chosen)
+keeps them: it gets a route to each peer instead of one to the network (``host_routes``).
+
 Each host gets one short ``sh`` script per task, as each process costs milliseconds and a machine
 may be far away. A script is put together from steps, each written beside its undo; ``down`` runs
 the undos backwards.
@@ -83,7 +86,8 @@ class WireGuard(Vpn):
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield what makes these the peers, and leaves the sessions of those that stay."""
         yield Command.script(
-            _configure(interface, peers), sudo=True, what=_what('tell', interface, 'its peers'))
+            '\n'.join([_configure(interface, peers), *_routes(interface, peers)]), sudo=True,
+            what=_what('tell', interface, 'its peers'))
 
     def alive(self, interface: VpnInterface) -> Command:
         """
@@ -162,7 +166,7 @@ class WireGuard(Vpn):
         guard = [_guard(interface, self.domain)] if interface.guarded else []
         return [
             *guard, _link(interface), _Step(_configure(interface, peers, recall=recall)),
-            _address(interface)]
+            _address(interface, peers)]
 
 
 def dds_ports(domain: int) -> tuple[int, int]:
@@ -319,13 +323,40 @@ def _print(lines: Sequence[str]) -> str:
     return ' '.join(["printf '%s\\n'", *(shlex.quote(line) for line in lines)])
 
 
-def _address(interface: VpnInterface) -> _Step:
+def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     name = _name(interface)
     prefix = interface.network.rpartition('/')[2]
+    # without the network's route, one of the host's own that overlaps it goes on to hold
+    alone = ' noprefixroute' if interface.host_routes else ''
     lines = [
-        f'address replace {interface.address}/{prefix} dev {name}',
+        f'address replace {interface.address}/{prefix} dev {name}{alone}',
         f'link set dev {name} mtu {interface.mtu} multicast on up']
     do = f'{_print(lines)} | ip -batch -'
     if interface.guarded:
         do += f"\n{_ADDRESSES} | grep -v '^fog' >{_noted(interface)} || :"
-    return _Step(do)
+    own = [_free(interface, interface.address)] if interface.host_routes else []
+    return _Step('\n'.join([*own, do, *_routes(interface, peers)]))
+
+
+def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:
+    """
+    Return what leads to each peer where the network as a whole isn't led into the VPN.
+
+    Such a route is the most specific there is, so it wins over any network of the host's own, and
+    takes no more of that than these addresses. One that the host has for itself is refused.
+    """
+    if not interface.host_routes:
+        return []
+    lines = [f'route replace {peer.address}/32 dev {_name(interface)}' for peer in peers]
+    return [*(_free(interface, peer.address) for peer in peers),
+            f'{_print(lines)} | ip -batch -']
+
+
+def _free(interface: VpnInterface, address: str) -> str:
+    """Return the text that fails if the host leads an address of the VPN elsewhere or has it."""
+    # the robot's interface of the same launch, where the machine is the robot itself, is no other
+    launch = re.sub('m[0-9]+$', '', _name(interface))
+    exact = address.replace('.', '[.]')
+    return (f"taken=$(ip -4 route show table all match {address} | grep -E '^(local )?{exact} ' "
+            f"| grep -vE ' dev {launch}(m[0-9]+)?( |$)' || :)\n"
+            f'[ -z "$taken" ] || {{ echo "in use already: $taken" >&2; exit 1; }}')

@@ -11,6 +11,7 @@ import time
 import pytest
 
 from fogros2 import plan, plugin_system, process
+from fogros2.bootstrap import RosInstall
 from fogros2.deploy import entering, job, Launch, robot_vpn
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
@@ -138,7 +139,8 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
 
     stand_in = [
         (Creation, 'run', None), (Entrance, 'connect', None), (Joining, 'interface', None),
-        (Guard, 'arm', None), (Deployment, 'prepare_host', None),
+        (Joining, 'fit', None), (Guard, 'arm', None),
+        (Deployment, 'prepare_host', RosInstall('ros', ())),
         (Deployment, 'configure_dds', {})]
     for part, name, value in stand_in:
         monkeypatch.setattr(part, name, lambda self, *_, value=value: value)
@@ -307,3 +309,13 @@ def test_a_host_key_is_taken_from_what_the_machine_prints():
     for said in ('', 'ssh-rsa AAAA x', 'ssh-ed25519 $(id)'):
         with pytest.raises(HostKeyError, match='made no host key'):
             host_key.parse(said)
+
+
+def test_a_machine_with_a_network_that_overlaps_the_vpn_s_keeps_it(launch, provider):
+    launch.expect(['planner'])
+    mine = Job(launch, SPEC)
+    joining = Joining(mine, Guard(mine))
+    plain = joining.interface()
+    assert joining.fit(plain, ['10.0.0.0/8', '172.17.0.0/16']) == plain
+    fitted = joining.fit(plain, ['10.0.0.0/8', '198.18.0.0/16'])
+    assert fitted.host_routes and launch.store.machine('planner').load().vpn == fitted

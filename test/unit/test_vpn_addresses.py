@@ -36,6 +36,13 @@ def test_a_proxy_in_half_of_the_pool_leaves_the_other() -> None:
         assert subnet.startswith('198.19.')
 
 
+def test_networks_that_overlap_a_launch_are_found() -> None:
+    used = ['10.0.0.0/8', '198.18.7.9', '198.18.0.0/16', '198.18.7.128/25', '198.18.8.0/24',
+            '0.0.0.0/1', 'fe80::/64']
+    assert addresses.overlapping('198.18.7.0/24', used) == [
+        '198.18.7.9', '198.18.0.0/16', '198.18.7.128/25']
+
+
 @pytest.mark.parametrize('everything', ['0.0.0.0/0', '0.0.0.0/1', '128.0.0.0/1', '192.0.0.0/2',
                                         'fe80::1/64', '::/0'])
 def test_a_default_route_is_no_collision(everything: str) -> None:

@@ -125,6 +125,21 @@ def test_interfaces_without_a_proper_name_are_refused(name: str) -> None:
         list(WireGuard().up(dataclasses.replace(ROBOT, name=name), []))
 
 
+def test_a_machine_with_a_network_that_overlaps_keeps_it() -> None:
+    machine = dataclasses.replace(MACHINE, host_routes=True)
+    wireguard = WireGuard()
+    up, peers = script(*wireguard.up(machine, [TO_ROBOT])), script(
+        *wireguard.peers(machine, [TO_ROBOT, TO_MACHINE]))
+    assert "'address replace 198.18.7.2/24 dev foga1b2c3m0 noprefixroute'" in up
+    assert up.index('link set') < up.index("'route replace 198.18.7.1/32 dev foga1b2c3m0'")
+    assert "'route replace 198.18.7.2/32 dev foga1b2c3m0'" in peers
+    for plain in (wireguard.up(MACHINE, [TO_ROBOT]), wireguard.peers(MACHINE, [TO_ROBOT])):
+        text = script(*plain)
+        assert 'noprefixroute' not in text and 'route replace' not in text
+    for command in every_command(machine, TO_ROBOT):
+        subprocess.run(['sh', '-n', '-c', command.argv[-1]], check=True)
+
+
 def test_status_asks_for_nothing_secret_and_is_understood() -> None:
     wireguard = WireGuard()
     assert 'dump' not in script(wireguard.status(ROBOT))

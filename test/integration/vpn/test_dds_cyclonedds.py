@@ -7,6 +7,7 @@ The nodes run on whatever ROS 2 the tests run on, the embedded default or the re
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from typing import TYPE_CHECKING
 
@@ -52,6 +53,14 @@ def pause(seconds: float) -> tuple[float, float]:
     begin = time.monotonic()
     time.sleep(seconds)
     return begin, time.monotonic()
+
+
+def test_messages_cross_where_the_machine_has_a_network_that_overlaps(lab: Lab) -> None:
+    lab.link('machine', 'own0', '198.18.7.200/24', 'lan', 'own0', '198.18.7.201/24')
+    lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
+    lab.connect()
+    start(lab)
+    assert lab.ping('machine', '198.18.7.201')
 
 
 def test_the_lan_and_terminals_talk_with_robot_nodes_as_before(vpn: Lab) -> None:

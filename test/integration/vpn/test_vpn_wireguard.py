@@ -210,3 +210,24 @@ def test_the_failure_of_a_step_is_told(lab: Lab) -> None:
         lab.do('machine', lab.vpn.up(interface, []))
     lab.do('machine', lab.vpn.down(interface))
     assert traces(lab, 'machine') == []
+
+
+def test_a_machine_whose_own_network_overlaps_has_both(lab: Lab) -> None:
+    # the machine's own network is the very one that the launch has chosen
+    lab.link('machine', 'own0', '198.18.7.200/24', 'lan', 'own0', '198.18.7.201/24')
+    lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
+    lab.connect()
+    assert lab.ping('robot', MACHINE) and lab.ping('machine', ROBOT)
+    assert lab.ping('machine', '198.18.7.201')
+    assert lab.ping('lan', '198.18.7.200')
+    # and again, as a repair has it
+    lab.repair('machine')
+    assert lab.ping('machine', ROBOT) and lab.ping('machine', '198.18.7.201')
+
+
+@pytest.mark.parametrize('taken', [ROBOT, MACHINE])
+def test_a_machine_that_has_an_address_of_the_vpn_says_so(lab: Lab, taken: str) -> None:
+    lab.link('machine', 'own0', f'{taken}/24', 'lan', 'own0', '198.18.7.201/24')
+    lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
+    with pytest.raises(CommandError, match=f'in use already: local {taken} dev own0'):
+        lab.connect()
