@@ -75,11 +75,11 @@ class Traces:
         self._files = files
         self._run = run
         self._known_before = {known.mark for known in self._known_elsewhere()}
-        self._before = {trace.what for trace in look(state)}
+        self._before = {trace.what for trace in look(state, files)}
 
     def left(self) -> set[str]:
         """Return what wasn't there when this was made, and is nobody else's."""
-        new = [trace for trace in look(self._state) if trace.what not in self._before]
+        new = [trace for trace in look(self._state, self._files) if trace.what not in self._before]
         if not new:
             return set()
         others = self.others()
@@ -157,18 +157,23 @@ def nothing_left(traces: Traces, *, timeout: float) -> Iterator[None]:
         raise AssertionError(f'left behind: {sorted(left)}') from None
 
 
-def look(state: Path) -> set[Trace]:
-    """Return everything on this computer now that a launch may leave behind."""
+def look(state: Path, files: Path) -> set[Trace]:
+    """
+    Return everything on this computer now that a launch may leave behind.
+
+    :param files: see :class:`Traces`.
+    """
     found = {_named('interface', name) for name in os.listdir('/sys/class/net')
              if name.startswith('fog') and not name.startswith(_SINGLE)}
-    found |= set(_programs())
+    containers = _containers()
+    found |= {container.trace for container in containers.values() if container.of_a_launch}
+    found |= set(_programs(containers, files))
     for words, kind in (
         (('nft', 'list', 'tables'), 'nftables'),
         (('ip', 'route', 'show', 'table', 'all'), 'route'),
     ):
         found |= {_named(kind, line) for line in _output(*words)
                   if 'fog' in line and _SINGLE not in line}
-    found |= set(_containers())
     for line in Path('/proc/mounts').read_text().splitlines():
         target = line.split()[1]
         if 'fogros2' in target:
@@ -184,16 +189,43 @@ def _named(kind: str, line: str) -> Trace:
     return Trace(f'{kind} {line}', frozenset(_INTERFACE.findall(line)))
 
 
-def _containers() -> Iterator[Trace]:
-    labels = ['fogros2-launch', 'fogros2-token']
-    columns = ['{{.Names}}', *(f'{{{{index .Labels "{label}"}}}}' for label in labels)]
-    for line in _output('podman', 'ps', '-a', '--format', '\t'.join(columns)):
-        name, *marks = line.split('\t')
-        if 'fog' in name and _SINGLE not in name:
-            yield Trace(f'container {name}', frozenset(mark for mark in marks if mark))
+@dataclasses.dataclass(frozen=True)
+class _Container:
+    """A container, of a launch if it has the label that every launch gives its machines."""
+
+    name: str
+    launch: str
+    token: str
+
+    @property
+    def of_a_launch(self) -> bool:
+        return bool(self.launch) and _SINGLE not in self.name
+
+    @property
+    def trace(self) -> Trace:
+        return Trace(f'container {self.name}', frozenset({self.launch, self.token} - {''}))
+
+    def holds(self, files: Path) -> bool:
+        """Return whether it may be a machine of ours, or a computer among a test's own files."""
+        if _SINGLE not in self.name:
+            return self.of_a_launch
+        root = ''.join(_output('podman', 'inspect', '--format', '{{.Rootfs}}', self.name)).strip()
+        return bool(root) and Path(root).is_relative_to(files)
 
 
-def _programs() -> Iterator[Trace]:
+def _containers() -> dict[str, _Container]:
+    """Return containers by id."""
+    columns = ['{{.ID}}', '{{.Names}}', '{{index .Labels "fogros2-launch"}}',
+               '{{index .Labels "fogros2-token"}}']
+    found = {}
+    for line in _output('podman', 'ps', '-a', '--no-trunc', '--format', '\t'.join(columns)):
+        identity, *about = line.split('\t')
+        if len(about) == 3 and 'fog' in about[0]:
+            found[identity] = _Container(*about)
+    return found
+
+
+def _programs(containers: dict[str, _Container], files: Path) -> Iterator[Trace]:
     """Yield agents and VPN programs, in containers too."""
     for process in _processes():
         words = _words(process)
@@ -202,8 +234,22 @@ def _programs() -> Iterator[Trace]:
                 yield Trace(f'process {process.name} wireguard-go',
                             frozenset(_INTERFACE.findall(' '.join(words))))
         elif any(word.endswith('agent.py') for word in words[:3]):
-            yield Trace(f'process {process.name} {" ".join(words[:4])}',
-                        frozenset(_agent_marks(process, words)))
+            marks = set(_agent_marks(process, words))
+            container = containers.get(_container_of(process))
+            if container is not None:
+                if not container.holds(files):
+                    continue
+                marks |= container.trace.marks
+            yield Trace(f'process {process.name} {" ".join(words[:4])}', frozenset(marks))
+
+
+def _container_of(process: Path) -> str:
+    """Return the id of the container that a process is in, '' for none."""
+    try:
+        found = re.search('[0-9a-f]{64}', (process / 'cgroup').read_text())
+    except OSError:
+        return ''
+    return found[0] if found else ''
 
 
 def _agent_marks(process: Path, words: list[str]) -> Iterator[str]:

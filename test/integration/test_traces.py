@@ -101,6 +101,25 @@ def test_an_interface_of_ours_is_found(look, tun, request):
     assert traces.left() == {f'interface {name}'}
 
 
+def test_a_machine_is_found_and_its_owner(look, engine, launch_id, start, elsewhere, tmp_path):
+    """A container without a launch's label comes from the test of a provider alone."""
+    traces = look()
+    names = [f'fogros2-{launch_id}a', f'fogros2-{launch_id}b']
+    try:
+        for name, label in zip(names, (f'fogros2-launch={launch_id}', 'fogros2-token=x')):
+            run(Command((engine, 'create', '--name', name, '--label', label, '--network', 'none',
+                         '--ulimit', 'nofile=1024', '--ulimit', 'nproc=1024',
+                         '--rootfs', str(tmp_path), 'true'), sudo=True), timeout=30)
+        assert traces.left() == {f'container {names[0]}'}
+        (elsewhere / 'waits.py').write_text(WAITS)
+        stranger = start(
+            str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere), **{RUN: 'another'})
+        store(elsewhere, launch_id, stranger)
+        assert traces.left() == set()
+    finally:
+        run(Command((engine, 'rm', '-f', *names), sudo=True), timeout=30, check=False)
+
+
 def test_an_agent_is_found(look, start, tmp_path, launch_id):
     traces = look()
     words = fake_agent(tmp_path, launch_id)
