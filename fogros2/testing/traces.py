@@ -234,6 +234,9 @@ def _programs(containers: dict[str, _Container], files: Path) -> Iterator[Trace]
                 yield Trace(f'process {process.name} wireguard-go',
                             frozenset(_INTERFACE.findall(' '.join(words))))
         elif any(word.endswith('agent.py') for word in words[:3]):
+            if any(_of_a_test_run(Path(word)) and not Path(word).is_relative_to(files)
+                   for word in words):
+                continue  # its program is a file of another run's
             marks = set(_agent_marks(process, words))
             container = containers.get(_container_of(process))
             if container is not None:

@@ -128,6 +128,14 @@ def test_an_agent_is_found(look, start, tmp_path, launch_id):
     assert found.startswith(f'process {child.pid} ') and words[0] in found
 
 
+def test_an_agent_in_a_test_of_its_own_is_no_launchs(look, start, elsewhere, launch_id):
+    traces = look()
+    folder = elsewhere / 'pytest-of-somebody' / 'pytest-0'
+    folder.mkdir(parents=True)
+    start(*fake_agent(folder, launch_id))
+    assert traces.left() == set()
+
+
 @pytest.mark.parametrize('first', [True, False])
 def test_a_strangers_launch_is_his(
     look, tun, start, elsewhere, launch_id, tmp_path, request, first,
