@@ -59,13 +59,31 @@ def _through_sudo(command: Command) -> bool:
 
 def refresh_ticket(*, timeout: float = 10.0) -> bool:
     """
-    Put off the moment at which sudo wants the password again; False if it wants it now.
+    Put off the moment at which sudo wants the password again; False if it gives no root now.
 
     Where sudo asks nobody for one, there is nothing to put off.
     """
+    return not sudo_trouble(timeout=timeout)
+
+
+def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
+    """Return why sudo gives no root at this moment and what to do about it, None if it does."""
     if os.geteuid() == 0:
-        return True
-    return run(Command(('true',), sudo=True), timeout=timeout, check=False).returncode == 0
+        return None
+    asked = run(Command(('true',), sudo=True), timeout=timeout, check=False)
+    if asked.returncode == 0:
+        return None
+    said = asked.stderr
+    if 'password is required' in said:
+        # it says so to those, too, who may not use it at all; asked for a ticket alone it doesn't
+        said = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or said
+    if 'password is required' in said or 'terminal is required' in said:
+        return 'sudo wants a password', 'run `sudo -v` first'
+    if 'may not run sudo' in said or 'not in the sudoers' in said or 'not allowed' in said:
+        return ('this user may not use sudo',
+                "ask the computer's administrator, or let a user who may launch it")
+    reason = (said.strip().splitlines() or ['it says nothing'])[-1].removeprefix('sudo: ')
+    return f"sudo doesn't work here: {reason}", 'run it as root'
 
 
 def require(programs: Sequence[str], *, package_of: Optional[dict[str, str]] = None) -> None:

@@ -54,9 +54,9 @@ def check_sudo() -> None:
     if process.which('sudo') is None:
         raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
                                 'run the launch as root, or install sudo')
-    if not process.refresh_ticket():
-        raise PrerequisiteError('a VPN interface takes root, and sudo wants a password',
-                                'run `sudo -v` first, then launch again')
+    trouble = process.sudo_trouble()
+    if trouble is not None:
+        raise PrerequisiteError(f'a VPN interface takes root, and {trouble[0]}', trouble[1])
 
 
 def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:

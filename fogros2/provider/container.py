@@ -107,9 +107,10 @@ class ContainerProvider(Provider):
         """Look for the engine, the rights, TUN, and what the root without an image needs."""
         options = Options.parse(spec.options)
         engine = container_engine.select(options.engine, options.image or None)
-        if engine.sudo and not process.refresh_ticket():
-            raise PrerequisiteError(f'{engine.name} takes root on this computer',
-                                    'run `sudo -v` first, or allow it without a password')
+        trouble = process.sudo_trouble() if engine.sudo else None
+        if trouble is not None:
+            raise PrerequisiteError(
+                f'{engine.name} takes root on this computer, and {trouble[0]}', trouble[1])
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')

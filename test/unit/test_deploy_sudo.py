@@ -47,7 +47,7 @@ def test_the_folder_by_which_gc_finds_the_interface_stays_as_long(
     assert len(launch.down()) == refused
     assert folder.exists() == refused
     # what gc sees when this process has gone
-    monkeypatch.setattr(endings, 'process_start', lambda pid: None)
+    monkeypatch.setattr(endings, 'process_alive', lambda *noted: False)
     assert [found.launch for found in endings.leftovers(launch.store)] == [launch.id] * refused
 
 

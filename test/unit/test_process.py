@@ -13,7 +13,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.errors import DeadlineExceeded, PrerequisiteError
-from fogros2.model import Command
+from fogros2.model import Command, Result
 from fogros2.waiting import wait_until
 
 
@@ -80,3 +80,37 @@ def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):
     monkeypatch.setattr(process.subprocess, 'Popen', none_left)
     with pytest.raises(PrerequisiteError, match='processes and memory'):
         process.run(Command(('true',)), timeout=5.0)
+
+
+@pytest.mark.parametrize(('said', 'reason', 'hint'), [
+    (['sudo: a password is required', 'sudo: a password is required'],
+     'sudo wants a password', '`sudo -v`'),
+    (['sudo: a password is required', 'Sorry, user eve may not run sudo on robot.'],
+     'this user may not use sudo', 'administrator'),
+    (['eve is not in the sudoers file.'], 'this user may not use sudo', 'administrator'),
+    (['sudo: The "no new privileges" flag is set, which prevents sudo from running as root.'],
+     "sudo doesn't work here: The", 'as root'),
+    ([''], 'it says nothing', 'as root')])
+def test_it_is_said_why_sudo_gives_no_root(monkeypatch, said, reason, hint):
+    answers = list(said)
+    monkeypatch.setattr(process.os, 'geteuid', lambda: 1000)
+    monkeypatch.setattr(process, 'run', lambda command, **more: Result(1, '', answers.pop(0)))
+    trouble = process.sudo_trouble()
+    assert trouble is not None and not answers
+    assert reason in trouble[0] and hint in trouble[1]
+
+
+def test_a_user_who_may_not_use_sudo_is_told_so(root, monkeypatch):
+    if os.geteuid() != 0 or process.which('sudo') is None:
+        pytest.skip('takes root, to become a user who may not')
+
+    def as_nobody(command, **more):
+        words = ['sudo', '-n', *command.argv] if command.sudo else command.argv
+        done = subprocess.run(words, user='nobody', group='nogroup', extra_groups=[], text=True,
+                              capture_output=True, cwd='/')
+        return Result(done.returncode, done.stdout, done.stderr)
+
+    monkeypatch.setattr(process, 'run', as_nobody)
+    monkeypatch.setattr(process.os, 'geteuid', lambda: 65534)
+    trouble = process.sudo_trouble()
+    assert trouble is not None and trouble[0] == 'this user may not use sudo'
