@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import datetime
 from decimal import Decimal
 import logging
-from pathlib import Path
+import os
 import urllib.request
 
 import pytest
@@ -33,7 +33,7 @@ def moto_server() -> Iterator[str]:
 
 
 @pytest.fixture
-def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID
     from moto.ec2.models import ec2_backends
@@ -49,8 +49,8 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     for name, value in {
             'AWS_ENDPOINT_URL': moto_server, 'AWS_ACCESS_KEY_ID': 'test',
             'AWS_SECRET_ACCESS_KEY': 'test', 'AWS_DEFAULT_REGION': 'eu-central-1',
-            'AWS_EC2_METADATA_DISABLED': 'true', 'AWS_CONFIG_FILE': str(tmp_path / 'none'),
-            'AWS_SHARED_CREDENTIALS_FILE': str(tmp_path / 'none'),
+            'AWS_EC2_METADATA_DISABLED': 'true', 'AWS_CONFIG_FILE': os.devnull,
+            'AWS_SHARED_CREDENTIALS_FILE': os.devnull,
             'FOGROS2_ROBOT_ADDRESS': '198.51.100.7',
             'FOGROS2_AWS_REGIONS': ' '.join(MOTO_REGIONS)}.items():
         monkeypatch.setenv(name, value)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 from decimal import Decimal
+import functools
 import gzip
 import json
 import re
@@ -16,6 +17,7 @@ import uuid
 
 import boto3
 from botocore.awsrequest import AWSResponse
+import botocore.session
 import pytest
 
 from fogros2.errors import (
@@ -36,6 +38,8 @@ from fogros2.testing.provider_contract import PUBLIC_KEY
 
 pytestmark = pytest.mark.usefixtures('moto_aws')
 
+#: Knows the services' models, which take longest to read, for all tests.
+LOADER = botocore.session.get_session().get_component('data_loader')
 HOME, AWAY = 'eu-central-1', 'us-east-1'
 KEY = 'ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ3Tq0CrBqXbWb0bqzPkGrjsvC7OxUD3yAyRIqLHTNN9'
 
@@ -48,9 +52,13 @@ class Watched:
     """
 
     def __init__(self) -> None:
+        #: Codes of the refusals that were sent, each repetition anew.
+        self.sent: list[str] = []
         self.calls: list[tuple[str, dict]] = []
         self.refusals: dict[str, list[tuple[str, str] | None]] = {}
-        session = boto3.session.Session()
+        core = botocore.session.get_session()
+        core.register_component('data_loader', LOADER)
+        session = boto3.session.Session(botocore_session=core)
         session.events.register('provide-client-params', self._called)
         session.events.register('before-send', self._sent)
         self.account = Account(session)
@@ -74,7 +82,8 @@ class Watched:
         else:
             body = (f'<Response><Errors><Error><Code>{code}</Code><Message>{said}</Message>'
                     '</Error></Errors><RequestID>1</RequestID></Response>')
-        status = 503 if code in ('RequestLimitExceeded', 'Unavailable') else 400
+        self.sent.append(code)
+        status = 503 if code == 'RequestLimitExceeded' else 500 if 'Capacity' in code else 400
         return AWSResponse(request.url, status, {}, _Raw(body.encode()))
 
     def count(self) -> Counter[str]:
@@ -106,7 +115,9 @@ def ask(name='planner', *, dependencies='', on_exit='delete', **options):
         agent_config={'machine': name, 'directory': '/run/fogros2'}, dependencies=dependencies)
 
 
+@functools.lru_cache
 def ec2(region=HOME):
+    """Return the test's own client: what it asks isn't counted."""
     return boto3.client('ec2', region)
 
 
@@ -493,6 +504,8 @@ def test_no_room_in_a_zone_leads_to_the_next(aws):
     subnets = [params['NetworkInterfaces'][0]['SubnetId'] for params in tries[1:]]
     assert len(set(subnets)) == 2
     assert len({params['ClientToken'] for params in tries}) == 3
+    # EC2 says it with status 500, and isn't asked the same again
+    assert aws.sent == ['InsufficientInstanceCapacity', 'Unsupported']
     assert tries[1]['NetworkInterfaces'][0]['AssociatePublicIpAddress'] is True
     assert len(left()['groups']) == 1
 

@@ -11,10 +11,12 @@ import threading
 from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws.failures import translated
+from fogros2.provider.aws.failures import NO_ROOM, translated
 
 #: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
 ATTEMPTS = 8
+#: The same, where no answer comes at all.
+UNANSWERED = 2
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
 #: Variables and files that say that somebody has set AWS up on this computer.
 _VARIABLES = (
@@ -48,6 +50,24 @@ def usual() -> Account:
             _accounts.clear()
             _accounts[settings] = Account()
         return _accounts[settings]
+
+
+def _retry_less(
+    response: Any, attempts: int, caught_exception: Optional[BaseException], **_: Any,
+) -> None:
+    """
+    Keep botocore from asking again where that doesn't help; called before its own decision.
+
+    Throttling takes patience; but without a way to AWS a user would wait for minutes to hear of
+    it. And EC2 says with status 500, which botocore takes for a fault that passes in a moment,
+    that it has no machine left: the next zone may have.
+    """
+    if caught_exception is not None and attempts >= UNANSWERED:
+        raise caught_exception
+    if response is not None:
+        http, parsed = response
+        if http.status_code >= 500 and parsed.get('Error', {}).get('Code') in NO_ROOM:
+            http.status_code = 400
 
 
 class Account:
@@ -122,6 +142,8 @@ class Account:
                     user_agent_extra='fogros2', max_pool_connections=20)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
+                own = found.meta.service_model.service_id.hyphenize()
+                found.meta.events.register_first(f'needs-retry.{own}', _retry_less)
                 self._clients[(service, region, hasty)] = found
             return found
 
