@@ -112,6 +112,7 @@ class Machine:
     :param end_command: what the agent runs as root on the machine to end it; empty where it
         must not be ended.
     :param cost_per_hour: US dollars, None where unknown.
+    :param note: what the provider chose for it, and why: for people to read when it comes up.
     """
 
     id: str
@@ -132,6 +133,7 @@ class Machine:
     end_command: tuple[str, ...] = ()
     cost_per_hour: Optional[Decimal] = None
     stopped: Optional[float] = None
+    note: str = ''
 
 
 @dataclasses.dataclass(frozen=True)

@@ -64,6 +64,8 @@ class Creation:
                 detail.append(plan.price(price))
             job.save(shell=machine.shell)
             detail.append(machine.shell.host if machine.shell else machine.id[:20])
+            if machine.note:
+                detail.append(machine.note)
             return machine
 
     # -- one that is there ----------------------------------------------------------------------

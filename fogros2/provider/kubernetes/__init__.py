@@ -332,7 +332,8 @@ class KubernetesProvider(Provider):
             robot_host=ways.robot_host(api, job),
             inner_network=f'kubernetes {api.server}', inner_host=address,
             place=f'{where.context}/{where.namespace}'.lstrip('/'), kind=kind_of(job),
-            tags=tags, end_command=boot.END_COMMAND)
+            tags=tags, end_command=boot.END_COMMAND,
+            note='' if exposure is None else exposure.words())
 
 
 def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -58,6 +58,11 @@ class Exposure:
     def __str__(self) -> str:
         return f'{self.kind} {self.host or "-"} {self.port} {self.why}'
 
+    def words(self) -> str:
+        """Return which way was taken and why, for people."""
+        kind = self.kind.replace('_', ' ')
+        return f'UDP by {kind}: {self.why}' if self.why else f'UDP by {kind}'
+
     @classmethod
     def parse(cls, text: str) -> Optional[Exposure]:
         """Return what ``str`` has written down, None if it is no such text."""
