@@ -115,6 +115,7 @@ class ContainerProvider(Provider):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')
         container_engine.answers(engine)
+        container_options.check_network(engine, options)
         if not options.image:
             check_root()
 

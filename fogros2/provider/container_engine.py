@@ -97,6 +97,9 @@ def translate(error: CommandError) -> ProviderError:
         hint = 'sudo modprobe tun'
     elif 'address already' in low or 'already allocated' in low:
         hint = 'that address or port is taken: choose another'
+    elif 'network not found' in low or 'no such network' in low or (
+            'network' in low and 'not found' in low):
+        hint = 'podman network ls (or docker network ls) shows those there are'
     return ProviderError(f'{error.command.what} failed: {last_line(text)}', hint)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import dataclasses
+import ipaddress
+import json
 import os
 import re
 from typing import Any
@@ -80,14 +82,27 @@ def _check_values(options: Options) -> None:
         raise ConfigurationError("docker can't use this computer's own root",
                                  "name an image with image='...', or take engine='podman'")
     if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
-        raise ConfigurationError(f"'{options.user}' can't be a user name")
+        raise ConfigurationError(
+            f"'{options.user}' can't be a user name",
+            'user= takes small letters, digits, - and _, beginning with a letter')
     for name in ('image', 'network', 'ip', 'memory', 'gpus'):
         word = getattr(options, name)
         # the engine would take it for an option of its own
         if word.startswith('-') or any(c.isspace() for c in word):
-            raise ConfigurationError(f"option '{name}' can't be '{word}'")
-    if options.ip and not options.network:
-        raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
+            raise ConfigurationError(f"option '{name}' can't be '{word}'",
+                                     'it is one word, and none that begins with a hyphen')
+    if options.memory and not re.fullmatch(r'(?i)[0-9]+([.][0-9]+)?([bkmg]|[kmg]b)?',
+                                           options.memory):
+        raise ConfigurationError(f"'{options.memory}' is no amount of memory",
+                                 "memory= takes '2g' or '512m'")
+    if options.ip:
+        _check_address(options)
+    for port in options.ports:
+        _check_port(port)
+    for device in options.devices:
+        if not os.path.exists(device.split(':')[0]):
+            raise ConfigurationError(f"there is no device '{device.split(':')[0]}' here",
+                                     "devices= takes such as '/dev/video0'")
     for name, value in options.env.items():
         if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name) or '"' in value or '\n' in value:
             raise ConfigurationError(f"env= can't carry the variable {name!r}")
@@ -98,6 +113,59 @@ def _check_values(options: Options) -> None:
                                      "it takes '/path' or '/path:/path there'")
         if not os.path.exists(source):
             raise ConfigurationError(f"'{source}' of mounts= doesn't exist")
+
+
+def _check_address(options: Options) -> None:
+    try:
+        ipaddress.IPv4Address(options.ip)
+    except ValueError:
+        raise ConfigurationError(f"'{options.ip}' is no IPv4 address",
+                                 "ip= takes such as '10.89.0.7'") from None
+    if not options.network:
+        raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
+
+
+def _check_port(port: str) -> None:
+    """Refuse what isn't ``[address:][here:]there[/udp]``; both may be ranges."""
+    match = re.fullmatch(r'(?:[0-9]+(?:[.][0-9]+){3}:)?(?:([0-9]+)(?:-([0-9]+))?:)?([0-9]+)(?:-([0-9]+))?'
+                         r'(?:/(?:tcp|udp|sctp))?', port)
+    numbers = [int(number) for number in match.groups() if number] if match else []
+    if not numbers or not all(0 < number < 65536 for number in numbers):
+        raise ConfigurationError(f"ports= can't hold '{port}'",
+                                 "it takes '8080:80' or '8080:80/udp', numbers from 1 to 65535")
+
+
+def check_network(engine: Engine, options: Options) -> None:
+    """
+    Ask the engine whether an address that is asked for is one of the network's.
+
+    :raises ConfigurationError: it isn't, or there is no such network.
+    """
+    if not options.ip:
+        return
+    result = engine.call('network', 'inspect', options.network, what='looking at the network',
+                         check=False)
+    if result.returncode != 0:
+        raise ConfigurationError(f"{engine.name} has no network '{options.network}'",
+                                 f'{engine.name} network ls shows those there are')
+    subnets = network_subnets(result.stdout)
+    if subnets and not any(ipaddress.ip_address(options.ip) in subnet for subnet in subnets):
+        raise ConfigurationError(
+            f"{options.ip} is no address of the network '{options.network}'",
+            f"its addresses are in {', '.join(map(str, subnets))}")
+
+
+def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
+    """Return the IPv4 networks in what podman or docker tells of a network."""
+    found = []
+    for network in json.loads(output):
+        parts = [*(network.get('subnets') or ()), *(
+            (network.get('IPAM') or {}).get('Config') or ())]
+        for part in parts:
+            text = str(part.get('subnet') or part.get('Subnet') or '')
+            if '.' in text:
+                found.append(ipaddress.IPv4Network(text, strict=False))
+    return found
 
 
 def mount_flag(mount: str) -> str:

@@ -214,6 +214,11 @@ def test_a_root_that_can_t_be_overlaid_is_refused(monkeypatch):
     ({'mounts': ['/a/../b']}, "it takes '/path'"),
     ({'mounts': ['/no/such/folder']}, "doesn't exist"),
     ({'image': '--privileged'}, "option 'image' can't be '--privileged'"),
+    ({'memory': 'lots'}, "'lots' is no amount of memory .memory= takes '2g'"),
+    ({'ports': ['80:http']}, "ports= can't hold '80:http' .it takes '8080:80'"),
+    ({'ports': ['99999:80']}, "ports= can't hold '99999:80'"),
+    ({'ip': 'here', 'network': 'n'}, "'here' is no IPv4 address .ip= takes"),
+    ({'devices': ['/dev/no-such']}, "no device '/dev/no-such'"),
     ({'network': '-x'}, "option 'network' can't be '-x'"),
 ])
 def test_options_that_make_no_sense_are_refused(given, words):
@@ -277,6 +282,28 @@ def test_limits_never_ask_for_more_than_there_is():
         soft, hard = word.partition('=')[2].split(':')
         assert soft == hard
         assert int(hard) <= 1 << 22
+
+
+@pytest.mark.parametrize('options', [
+    {'memory': '2g'}, {'memory': '1.5GB'}, {'memory': '1048576'}, {'ports': ['8080:80/udp']},
+    {'ports': ['80', '127.0.0.1:8080:80', '9000-9005:9000-9005']}])
+def test_what_the_engine_takes_is_let_through(options):
+    Options.parse(options)
+
+
+@pytest.mark.parametrize('said', [
+    '[{"name": "n", "subnets": [{"subnet": "198.51.100.0/28", "gateway": "198.51.100.1"},'
+    ' {"subnet": "fd00::/64"}]}]',
+    '[{"Name": "n", "IPAM": {"Config": [{"Subnet": "198.51.100.0/28"}]}}]'])
+def test_an_address_out_of_the_network_is_refused_with_the_network_s(monkeypatch, said):
+    monkeypatch.setattr(Engine, 'call', lambda self, *words, **more: Result(0, said, ''))
+    engine = Engine('podman')
+    container_options.check_network(engine, Options(network='n', ip='198.51.100.7'))
+    with pytest.raises(ConfigurationError, match='10.0.0.7 is no.*are in 198.51.100.0/28'):
+        container_options.check_network(engine, Options(network='n', ip='10.0.0.7'))
+    monkeypatch.setattr(Engine, 'call', lambda self, *words, **more: Result(125, '', 'no such'))
+    with pytest.raises(ConfigurationError, match="no network 'n'.*network ls"):
+        container_options.check_network(engine, Options(network='n', ip='198.51.100.7'))
 
 
 @pytest.mark.parametrize('stderr, hint', [
