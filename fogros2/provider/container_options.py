@@ -127,8 +127,9 @@ def _check_address(options: Options) -> None:
 
 def _check_port(port: str) -> None:
     """Refuse what isn't ``[address:][here:]there[/udp]``; both may be ranges."""
-    match = re.fullmatch(r'(?:[0-9]+(?:[.][0-9]+){3}:)?(?:([0-9]+)(?:-([0-9]+))?:)?([0-9]+)(?:-([0-9]+))?'
-                         r'(?:/(?:tcp|udp|sctp))?', port)
+    ports = '([0-9]+)(?:-([0-9]+))?'
+    match = re.fullmatch(
+        rf'(?:[0-9]+(?:[.][0-9]+){{3}}:)?(?:{ports}:)?{ports}(?:/(?:tcp|udp|sctp))?', port)
     numbers = [int(number) for number in match.groups() if number] if match else []
     if not numbers or not all(0 < number < 65536 for number in numbers):
         raise ConfigurationError(f"ports= can't hold '{port}'",
