@@ -83,6 +83,9 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         record = entry.record
         if record is None:
             return
+        if entry.machine is None and entry.asked and record.machine_id is not None:
+            # it ended by itself, which takes nothing along that was made beside it
+            machines.load(record.provider).destroy(record.machine_id)
         if record.damage:
             store.machine(record.name).delete()
             return

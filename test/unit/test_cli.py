@@ -215,6 +215,18 @@ def test_delete_takes_the_machine_and_the_record(capsys: pytest.CaptureFixture[s
     assert "no machine 'a'" in capsys.readouterr().err
 
 
+def test_delete_of_one_that_ended_by_itself_takes_what_it_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    destroyed: list[str] = []
+    monkeypatch.setattr(Memory, 'destroy', lambda self, machine_id: destroyed.append(machine_id))
+    record('a', **dead())
+    record('b', machine_id=None, **dead())
+    assert run('delete', 'a', '--yes') == 0 and run('delete', 'b', '--yes') == 0
+    assert destroyed == ['id-a']
+    assert not Store().machine('a').exists()
+
+
 def test_delete_asks(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     machine('a')
     assert run('delete', 'a') == 1

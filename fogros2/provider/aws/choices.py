@@ -13,7 +13,7 @@ from typing import Optional, Union
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.provider.aws import regions as places
-from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.clients import Account, usual
 from fogros2.provider.aws.prices import cheapest_zone, InstanceType, Market
 
 #: What 'cheapest' means where nothing else is said: as much as the default type t3.medium has.
@@ -339,7 +339,7 @@ def regions_named(names: Optional[Sequence[str]], account: Optional[Account] = N
 
     :raises FogError: AWS can't be asked, or no region answers.
     """
-    account = account or Account()
+    account = account or usual()
     # looked for first: measuring takes seconds, and helps nobody who can't ask for prices
     account.check_credentials()
     names = [name for name in names or () if name]

@@ -16,7 +16,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import ProviderError, StoreError
-from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.clients import usual
 from fogros2.provider.aws.failures import translated
 from fogros2.provider.aws.regions import distance_km, REGIONS
 from fogros2.store import state_home, write_private
@@ -85,7 +85,7 @@ class Market:
         self, clients: Optional[Clients] = None, *, cache: Optional[Path] = None,
         clock: Callable[[], float] = time.time, refresh: bool = False,
     ) -> None:
-        self._clients = clients or Account().client
+        self._clients = clients or usual().client
         self._cache = cache
         self._clock = clock
         self._refresh = refresh
