@@ -15,6 +15,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
+from image_transport_h264 import memory
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.receivers import make_receiver
@@ -49,6 +50,7 @@ class DecoderNode(LazyNode):
 
 def main() -> None:
     """Run until interrupted."""
+    memory.keep()
     rclpy.init()
     node = DecoderNode()
     try:

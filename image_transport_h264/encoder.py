@@ -14,6 +14,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
+from image_transport_h264 import memory
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
@@ -50,6 +51,7 @@ class EncoderNode(LazyNode):
 
 def main() -> None:
     """Run until interrupted."""
+    memory.keep()
     rclpy.init()
     node = EncoderNode()
     try:
