@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from typing import Optional
 
 from fogros2.waiting import wait_until
@@ -31,6 +32,8 @@ class Launched:
         prefix: Sequence[str] = (),
     ) -> None:
         self.said: list[str] = []
+        #: When each line came, on ``time.monotonic``'s clock.
+        self.times: list[float] = []
         self.child = subprocess.Popen(
             [*_WITH_SIGINT, *prefix, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
@@ -41,7 +44,13 @@ class Launched:
     def _read(self) -> None:
         assert self.child.stdout is not None
         for line in self.child.stdout:
+            self.times.append(time.monotonic())
             self.said.append(line)
+
+    def since(self, begin: float, words: str) -> list[tuple[float, str]]:
+        """Return the lines with ``words`` that came after ``begin``, each with its time."""
+        return [(at, line) for at, line in zip(list(self.times), list(self.said))
+                if at > begin and words in line]
 
     @property
     def text(self) -> str:
@@ -128,8 +137,8 @@ def ros2(
 ) -> subprocess.CompletedProcess[str]:
     """Run ``ros2`` with these words and return what it left; nobody is there to be asked."""
     return subprocess.run(
-        [*prefix, ROS2, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout,
-        env=None if environment is None else dict(environment))
+        [*prefix, ROS2, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        timeout=timeout, env=None if environment is None else dict(environment))
 
 
 #: A shell that starts something in the background has SIGINT ignored, and all that it starts.
