@@ -31,6 +31,8 @@ def data_files():
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
 
 
+#: What pods as machines need.
+KUBERNETES = ['kubernetes']
 #: What machines at AWS take; `import fogros2` and `ros2 fog` work without.
 AWS = ['boto3', 'requests']
 #: What nodes that handle images need; a robot that streams none doesn't.
@@ -50,10 +52,11 @@ setup(
     extras_require={
         'aws': AWS,
         'bench': ['matplotlib'],
-        'kubernetes': ['kubernetes'],
+        'kubernetes': KUBERNETES,
         'test': [
-            'hypothesis', 'moto[server]', 'mypy', 'pytest', 'pytest-timeout', 'ruff',
-            'types-paramiko', 'types-PyYAML', *AWS, *VIDEO],
+            'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy', 'pytest',
+            'pytest-timeout', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS, *KUBERNETES,
+            *VIDEO],
         'video': VIDEO,
     },
     zip_safe=False,

@@ -38,7 +38,7 @@ def of_refusal(message: str, namespace: str) -> str:
     if 'violates PodSecurity' in message:
         return ('a VPN takes NET_ADMIN, which the namespace forbids: kubectl label namespace '
                 f'{namespace} pod-security.kubernetes.io/enforce=privileged --overwrite')
-    if 'pod security policy' in message.lower():
+    if re.search('pod ?security ?policy', message, re.I):
         return ('a VPN takes NET_ADMIN: let the service account use a PodSecurityPolicy whose '
                 'allowedCapabilities has it')
     if 'admission webhook' in message:
