@@ -1,0 +1,428 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of a cluster, and what its answers mean: by value, without a cluster."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import socket
+import subprocess
+import threading
+from typing import Any
+
+import pytest
+import yaml
+
+from fogros2.errors import ConfigurationError, MachineNotFound
+from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.provider.kubernetes import (
+    boot,
+    exposure,
+    hints,
+    kind_of,
+    KubernetesProvider,
+    manifests,
+    names,
+    pods,
+)
+from fogros2.provider.kubernetes.exposure import Exposure
+from fogros2.provider.kubernetes.names import MachineId
+from fogros2.provider.kubernetes.options import Options
+from fogros2.testing.shell_contract import raised
+
+ROOT = Path(__file__).resolve().parents[2]
+#: What the manifests have to hold in, beside the real cluster of the tests (1.20).
+VERSIONS = ('1.25', '1.30', '1.33', '')
+REQUEST = CreateRequest(
+    token='4f5b2a9c-0001-4000-8000-000000000001', authorized_key='ssh-ed25519 AAAA',
+    tags={TAG_NAME: 'Talker', TAG_LAUNCH: 'a1b2c3', TAG_ROBOT: "Anna's robot"}, vpn_port=51830)
+
+
+def made(**options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the Job for some options, and its pod's specification."""
+    spec = MachineSpec('Talker', 'kubernetes', options, lifetime=90.5)
+    job = manifests.job(spec, REQUEST, Options.parse(options))
+    return job, job['spec']['template']['spec']
+
+
+def valid(manifest: dict[str, Any]) -> None:
+    """Hold a manifest against the schemas of several versions, unknown names included."""
+    validate = pytest.importorskip('kubernetes_validate', reason='needs kubernetes-validate')
+    for version in VERSIONS:
+        validate.validate(manifest, version or validate.latest_version(), strict=True)
+
+
+EVERYTHING: dict[str, Any] = {
+    'container_image': 'registry.example/robots/slam:1', 'namespace': 'robots', 'mcpu': 1500,
+    'mb': 2048, 'gpus': 2, 'gpu_resource': 'amd.com/gpu', 'zone': 'us-central1-a',
+    'node_selector': {'pool': 'gpu'}, 'tolerations': [{'key': 'gpu', 'operator': 'Exists'}],
+    'runtime_class': 'nvidia', 'image_pull_secrets': ['registry'], 'service_account': 'machines',
+    'env': {'LANG': 'C.UTF-8'}, 'annotations': {'example.com/load-balancer-scheme': 'internal'}}
+
+
+@pytest.mark.parametrize('options', [{}, EVERYTHING], ids=['defaults', 'everything'])
+def test_manifests_are_valid_in_old_and_new_versions(options):
+    job, _ = made(**options)
+    valid(job)
+    spec = MachineSpec('Talker', 'kubernetes', options)
+    for kind in ('NodePort', 'LoadBalancer'):
+        valid(manifests.service(kind, spec, REQUEST, Options.parse(options), 'a-uid'))
+    pod = manifests.pod(spec, REQUEST, Options.parse(options))
+    valid({**pod, 'metadata': {**pod['metadata'], 'name': 'x'}})
+
+
+@pytest.mark.parametrize('name', ['role.yaml', 'networkpolicy.yaml'])
+def test_what_a_cluster_s_keeper_applies_is_valid(name):
+    documents = list(yaml.safe_load_all((ROOT / 'deploy' / 'kubernetes' / name).read_text()))
+    assert documents
+    for document in documents:
+        if name == 'networkpolicy.yaml':
+            # a range of ports is newer than 1.20
+            pytest.importorskip('kubernetes_validate').validate(document, '1.30', strict=True)
+        else:
+            valid(document)
+
+
+def test_the_sample_role_has_what_is_looked_for():
+    documents = yaml.safe_load_all((ROOT / 'deploy' / 'kubernetes' / 'role.yaml').read_text())
+    role, = (d for d in documents if d['kind'] == 'Role')
+    assert hints.missing_rights(role['rules']) == []
+    for number, rule in enumerate(role['rules']):
+        for verb in rule['verbs']:
+            less = [dict(each) for each in role['rules']]
+            less[number]['verbs'] = [each for each in rule['verbs'] if each != verb]
+            missing = hints.missing_rights(less)
+            resource = rule['resources'][0]
+            if (resource, verb) not in (('jobs/finalizers', 'update'), ('services', 'watch')):
+                assert [each.split('.')[0] for each in missing] == [f'{verb} {resource}']
+
+
+def test_rights_on_everything_are_rights():
+    assert hints.missing_rights([{'verbs': ['*'], 'apiGroups': ['*'], 'resources': ['*']}]) == []
+    assert 'create pods/exec' in hints.missing_rights(
+        [{'verbs': ['*'], 'apiGroups': ['*'], 'resources': ['pods', 'jobs']}])
+    assert hints.missing_rights(
+        [{'verbs': ['*'], 'apiGroups': ['*'], 'resources': ['*'], 'resourceNames': ['one']}])
+
+
+def test_a_job_guards_itself():
+    job, pod = made()
+    assert job['spec']['activeDeadlineSeconds'] == 91
+    assert job['spec']['ttlSecondsAfterFinished'] <= 300
+    assert job['spec']['backoffLimit'] == 0
+    assert pod['restartPolicy'] == 'Never'
+
+
+def test_a_pod_has_net_admin_and_no_other_right():
+    _, pod = made(**EVERYTHING)
+    container, = pod['containers']
+    assert container['securityContext']['capabilities'] == {'add': ['NET_ADMIN']}
+    assert container['securityContext']['privileged'] is False
+    assert pod['automountServiceAccountToken'] is False
+    for word in ('hostNetwork', 'hostPID', 'hostIPC', 'volumes'):
+        assert word not in pod
+    assert container['imagePullPolicy'] == 'IfNotPresent'
+    # nothing secret in what everybody in the namespace can read
+    assert REQUEST.token not in json.dumps(pod)
+    assert REQUEST.authorized_key not in json.dumps(pod)
+
+
+def test_options_reach_the_pod():
+    job, pod = made(**EVERYTHING)
+    container, = pod['containers']
+    assert container['image'] == 'registry.example/robots/slam:1'
+    assert container['resources']['limits'] == container['resources']['requests'] == {
+        'cpu': '1500m', 'memory': '2048Mi', 'amd.com/gpu': '2'}
+    assert container['env'] == [{'name': 'LANG', 'value': 'C.UTF-8'}]
+    assert pod['nodeSelector'] == {'pool': 'gpu'}
+    assert pod['tolerations'] == [{'key': 'gpu', 'operator': 'Exists'}]
+    assert pod['runtimeClassName'] == 'nvidia'
+    assert pod['imagePullSecrets'] == [{'name': 'registry'}]
+    assert pod['serviceAccountName'] == 'machines'
+    assert kind_of(job) == '2 amd.com/gpu, 1500m cpu, 2048Mi memory, slam:1'
+
+
+def test_a_zone_that_the_cluster_lacks_keeps_nothing_from_running():
+    _, pod = made(zone='us-central1-a')
+    affinity = pod['affinity']['nodeAffinity']
+    assert list(affinity) == ['preferredDuringSchedulingIgnoredDuringExecution']
+
+
+def test_nothing_asked_for_is_nothing_demanded():
+    _, pod = made()
+    container, = pod['containers']
+    assert 'resources' not in container
+    assert container['image'] == 'docker.io/library/ros:jazzy-ros-base'
+    assert not {'affinity', 'nodeSelector', 'tolerations', 'runtimeClassName'} & set(pod)
+
+
+def test_a_service_carries_udp_alone_and_belongs_to_the_job():
+    spec = MachineSpec('Talker', 'kubernetes')
+    service = manifests.service('LoadBalancer', spec, REQUEST, Options(), 'a-uid')
+    assert [port['protocol'] for port in service['spec']['ports']] == ['UDP']
+    owner, = service['metadata']['ownerReferences']
+    assert (owner['kind'], owner['name'], owner['uid']) == ('Job', 'fogros2-talker', 'a-uid')
+    job, _ = made()
+    assert service['spec']['selector'].items() <= \
+        job['spec']['template']['metadata']['labels'].items()
+
+
+@pytest.mark.parametrize('expose, port', [
+    ('auto', 51830), ('node_port', 51830), ('load_balancer', 51830), ('pod_dials_robot', 0),
+    ('pod_ip', 0)])
+def test_a_pod_answers_where_the_way_is_to_be_found_out(expose, port):
+    _, pod = made(expose=expose)
+    assert pod['containers'][0]['command'][6] == str(port)
+
+
+def test_tags_survive_even_where_they_can_be_no_label():
+    job, _ = made()
+    assert names.tags_of(job) == dict(REQUEST.tags)
+    assert TAG_ROBOT not in job['metadata']['labels']
+    assert job['metadata']['labels'][TAG_LAUNCH] == 'a1b2c3'
+    assert names.wanted({TAG_ROBOT: "Anna's robot", TAG_LAUNCH: 'x'}) == {
+        **names.MANAGED, TAG_LAUNCH: 'x'}
+    assert names.tags_of({'metadata': {'annotations': {names.TAGS: 'no JSON'}}}) == {}
+
+
+def test_names_fit_where_a_cluster_has_less_room():
+    assert names.job_name('Talker') == 'fogros2-talker'
+    assert len(names.job_name('a' * 80)) + len('-abcde') <= 63
+
+
+def test_an_id_carries_its_place():
+    where = MachineId('robots', 'fogros2-talker', '1b-2c', 'arn:aws:eks:x:1:cluster/y@z')
+    assert MachineId.parse(str(where)) == where
+    for wrong in ('no-such-machine', 'a/b/c@d', 'podman:0123456789ab:token'):
+        raised(MachineNotFound, lambda text=wrong: MachineId.parse(text))
+
+
+@pytest.mark.parametrize('options, word', [
+    ({'sizee': 1}, 'sizee'), ({'mcpu': -1}, 'mcpu'), ({'mb': '2g'}, 'mb'),
+    ({'expose': 'nodeport'}, 'nodeport'), ({'tolerations': 'gpu'}, 'tolerations'),
+    ({'tolerations': [{'kez': 'gpu'}]}, 'tolerations'), ({'container_image': 'a b'}, 'a b'),
+    ({'namespace': 'Robots'}, 'Robots'), ({'user': 'A B'}, 'A B'),
+    ({'node_selector': ['pool']}, 'node_selector'), ({'env': {'a-b': 'c'}}, 'a-b'),
+    ({'robot_host': 'a b'}, 'a b')])
+def test_options_that_make_no_sense_are_named(options, word):
+    error = raised(ConfigurationError, lambda: Options.parse(options))
+    assert word in str(error)
+
+
+def test_a_pod_can_not_be_asked_to_stop():
+    spec = MachineSpec('planner', 'kubernetes', on_exit='stop')
+    error = raised(ConfigurationError, lambda: KubernetesProvider().check(spec))
+    assert "on_exit='keep'" in error.hint
+
+
+#: What API servers have said, and a word that the remedy has to hold.
+REFUSALS = [
+    ('jobs.batch is forbidden: User "robot" cannot create resource "jobs" in API group "batch" '
+     'in the namespace "robots"', "let 'robot' create jobs.batch in the namespace 'robots'"),
+    ('nodes "a" is forbidden: User "robot" cannot get resource "nodes" in API group "" at the '
+     'cluster scope', "let 'robot' get nodes in the whole cluster"),
+    ('pods "fogros2-a" is forbidden: violates PodSecurity "baseline:latest": non-default '
+     'capabilities (container "machine" must not include "NET_ADMIN" in '
+     'securityContext.capabilities.add)',
+     'kubectl label namespace robots pod-security.kubernetes.io/enforce=privileged'),
+    ('pods "a" is forbidden: PodSecurityPolicy: unable to admit pod: '
+     '[spec.containers[0].securityContext.capabilities.add: Invalid value: "NET_ADMIN"]',
+     'PodSecurityPolicy'),
+    ('pods "a" is forbidden: unable to validate against any pod security policy: []',
+     'allowedCapabilities'),
+    ('admission webhook "policy.example" denied the request: no NET_ADMIN here', 'policy'),
+    ('pods "a" is forbidden: exceeded quota: q, requested: pods=1, used: pods=4, limited: pods=4',
+     'quota'),
+    ('pods "a" is forbidden: failed quota: q: must specify limits.cpu', 'mcpu= and mb='),
+    ('pods "a" is forbidden: [maximum cpu usage per Container is 1, but limit is 2]', 'limits'),
+    ('namespaces "robots" not found', 'kubectl create namespace robots'),
+    ('pods "a" is forbidden: error looking up service account robots/x: serviceaccount "x" not '
+     'found', 'service_account='),
+    ('pods "a" is forbidden: pod rejected: RuntimeClass "nvidia" not found', 'runtime_class='),
+    ('unable to create new content in namespace robots because it is being terminated',
+     'deleted')]
+
+
+@pytest.mark.parametrize('message, word', REFUSALS, ids=[word[:20] for _, word in REFUSALS])
+def test_a_refusal_has_a_remedy(message, word):
+    assert word in hints.of_refusal(message, 'robots')
+
+
+def job_of(**status: Any) -> dict[str, Any]:
+    return {'metadata': {'uid': 'j', 'name': 'fogros2-a', 'namespace': 'robots'},
+            'status': status}
+
+
+def pod_of(phase: str = 'Running', name: str = 'p', created: str = '2026-01-01T00:00:00Z',
+           state: Any = None, **status: Any) -> dict[str, Any]:
+    container = {'image': 'x/y:z', 'state': state if state is not None else {'running': {}}}
+    return {'metadata': {'uid': name, 'name': name, 'creationTimestamp': created,
+                         'ownerReferences': [{'uid': 'j'}]},
+            'spec': {}, 'status': {'phase': phase, 'containerStatuses': [container], **status}}
+
+
+def condition(kind: str, **values: str) -> dict[str, Any]:
+    return {'type': kind, 'status': 'True', **values}
+
+
+def test_where_a_machine_is_in_its_life():
+    assert pods.state_of(job_of(), None) is MachineState.PENDING
+    assert pods.state_of(job_of(), pod_of('Pending', state={'waiting': {}})) \
+        is MachineState.PENDING
+    assert pods.state_of(job_of(), pod_of()) is MachineState.RUNNING
+    assert pods.state_of(job_of(), pod_of('Failed', state={})) is MachineState.STOPPING
+    assert pods.state_of(job_of(conditions=[condition('Failed')]), None) is MachineState.STOPPING
+    deleted = job_of()
+    deleted['metadata']['deletionTimestamp'] = 'now'
+    assert pods.state_of(deleted, pod_of()) is MachineState.STOPPING
+
+
+def test_the_first_pod_is_the_machine():
+    later = pod_of(name='b', created='2026-01-01T00:10:00Z')
+    first = pod_of(name='a')
+    other = pod_of(name='c', created='2025-01-01T00:00:00Z')
+    other['metadata']['ownerReferences'] = [{'uid': 'another'}]
+    found = pods.pod_of(job_of(), [later, other, first])
+    assert found is not None
+    assert found['metadata']['name'] == 'a'
+    assert pods.pod_of(job_of(), [other]) is None
+
+
+def test_why_a_machine_has_ended():
+    over = job_of(conditions=[condition('Failed', reason='DeadlineExceeded')])
+    assert pods.end_of(over, None) == 'its lifetime is over'
+    assert 'Evicted: low on memory' in pods.end_of(
+        job_of(), pod_of('Failed', reason='Evicted', message='low on memory'))
+    ended = {'terminated': {'reason': 'Error', 'exitCode': 127}}
+    assert 'exit status 127' in pods.end_of(job_of(), pod_of('Failed', state=ended))
+    assert pods.end_of(job_of(), None) == 'its pod is gone'
+
+
+@pytest.mark.parametrize('reason, message, final, word', [
+    ('ErrImagePull', 'rpc error: code = NotFound desc = failed to pull and unpack image '
+     '"docker.io/library/ros:jazy": not found', True, 'its tag'),
+    ('ImagePullBackOff', 'Back-off pulling image "x"', False, 'reach the registry'),
+    ('ErrImagePull', 'pull access denied, repository does not exist or may require '
+     'authorization', True, 'image_pull_secrets='),
+    ('ErrImagePull', 'dial tcp 1.2.3.4:443: i/o timeout', False, 'reach the registry'),
+    ('InvalidImageName', "couldn't parse image reference", True, "no image's name"),
+    ('CreateContainerConfigError', 'secret "x" not found', True, '')])
+def test_an_image_that_can_not_be_had_is_told(reason, message, final, word):
+    trouble = pods.trouble_of(pod_of(
+        'Pending', state={'waiting': {'reason': reason, 'message': message}}))
+    assert trouble is not None
+    assert trouble.what == f'{reason}: {message}'
+    assert trouble.final is final
+    assert word in trouble.hint
+
+
+def test_a_container_that_is_being_made_is_no_trouble():
+    assert pods.trouble_of(pod_of(
+        'Pending', state={'waiting': {'reason': 'ContainerCreating'}})) is None
+
+
+@pytest.mark.parametrize('message, word', [
+    ('0/3 nodes are available: 3 Insufficient nvidia.com/gpu.', 'nvidia.com/gpu'),
+    ('0/1 nodes are available: 1 Insufficient cpu.', 'mcpu='),
+    ("0/1 nodes are available: 1 node(s) didn't match Pod's node affinity/selector.",
+     'node_selector='),
+    ('0/1 nodes are available: 1 node(s) had untolerated taint {gpu: true}.', 'tolerations=')])
+def test_a_pod_that_fits_on_no_node_is_told(message, word):
+    trouble = pods.trouble_of(pod_of('Pending', state={}, conditions=[
+        {'type': 'PodScheduled', 'status': 'False', 'reason': 'Unschedulable',
+         'message': message}]))
+    assert trouble is not None
+    assert trouble.what == f'FailedScheduling: {message}'
+    assert not trouble.final
+    assert word in trouble.hint
+
+
+def test_events_tell_what_a_pod_does_not():
+    def event(reason: str, message: str) -> dict[str, Any]:
+        return {'reason': reason, 'message': message, 'metadata': {'namespace': 'robots'}}
+
+    assert pods.trouble_in([]) is None
+    assert pods.trouble_in([event('Scheduled', 'fine')]) is None
+    none, = (pods.trouble_in([event('NotTriggerScaleUp', "pod didn't trigger scale-up")]),)
+    assert none is not None and none.final
+    quota = pods.trouble_in([event('FailedCreate', 'exceeded quota: q')])
+    assert quota is not None and not quota.final and 'quota' in quota.hint
+    assert pods.scales_up([event('TriggeredScaleUp', '')])
+
+
+@pytest.mark.parametrize('server, groups, maker', [
+    ('https://ABCD.gr7.eu-north-1.eks.amazonaws.com', [], 'EKS'),
+    ('https://robots-dns-1.hcp.westeurope.azmk8s.io:443', [], 'AKS'),
+    ('https://34.1.2.3', ['apps', 'networking.gke.io'], 'GKE'),
+    ('https://192.168.1.2:6443', ['helm.cattle.io', 'k3s.cattle.io'], 'k3s'),
+    ('https://192.168.1.2:6443', ['metallb.io'], 'MetalLB'),
+    ('https://192.168.1.2:6443', ['apps', 'helm.cattle.io', 'notgke.io'], ''),
+    ('https://eks.amazonaws.com.example', [], '')])
+def test_who_makes_load_balancers(server, groups, maker):
+    assert exposure.load_balancers(server, groups) == maker
+
+
+def test_a_load_balancer_has_an_address_or_a_name():
+    def service(*ingress: dict[str, str]) -> dict[str, Any]:
+        return {'status': {'loadBalancer': {'ingress': list(ingress)}}}
+
+    assert exposure.ingress({'status': {'loadBalancer': {}}}) == []
+    assert exposure.ingress(service({'ip': '198.51.100.7'})) == ['198.51.100.7']
+    assert exposure.ingress(service({'hostname': 'a.elb.example'}, {'ip': ''})) == \
+        ['a.elb.example']
+
+
+def test_an_outer_address_of_a_node_comes_first():
+    assert exposure.node_addresses({'status': {'addresses': [
+        {'type': 'InternalIP', 'address': '10.0.0.4'}, {'type': 'Hostname', 'address': 'a'},
+        {'type': 'ExternalIP', 'address': '198.51.100.4'}]}}) == ['198.51.100.4', '10.0.0.4']
+
+
+@pytest.mark.parametrize('way', [
+    Exposure('node_port', '198.51.100.4', 31234, 'the node answers'),
+    Exposure('pod_dials_robot', '', 0, 'no load balancer came in 180 s; port 1 answers nothing'),
+    Exposure('pod_ip', '10.1.2.3')])
+def test_a_way_can_be_written_down(way):
+    assert Exposure.parse(str(way)) == way
+
+
+def test_what_was_written_down_by_somebody_else_is_no_way():
+    assert Exposure.parse('') is None
+    assert Exposure.parse('node_port 1.2.3.4 x') is None
+
+
+@pytest.fixture
+def echo(tmp_path):
+    """Return the port at which a pod's own answering program listens, here."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(('127.0.0.1', 0))
+        port = link.getsockname()[1]
+    program = boot.ECHO.replace("'/run/fogros2'", repr(str(tmp_path)))
+    child = subprocess.Popen(['python3', '-ISc', program, str(port), 'word', '20'])
+    yield port
+    (tmp_path / 'an agent').mkdir()
+    # it leaves the port to the VPN as soon as an agent has come
+    assert child.wait(5.0) == 0
+
+
+def test_the_place_that_answers_is_found(echo):
+    places = [('127.0.0.1', 9), ('no-such-host.invalid', echo), ('127.0.0.1', echo)]
+    assert exposure.first_to_answer(places, 'word', timeout=10.0) == ('127.0.0.1', echo)
+    # another launch's question isn't answered
+    assert exposure.first_to_answer(places, 'other', timeout=0.3) is None
+
+
+def test_looking_for_a_way_ends_with_the_launch():
+    from fogros2.errors import Cancelled
+    cancel = threading.Event()
+    cancel.set()
+    raised(Cancelled, lambda: exposure.first_to_answer(
+        [('127.0.0.1', 9)], 'word', timeout=10.0, cancel=cancel))
+
+
+def test_the_pod_s_program_is_one_that_sh_reads():
+    subprocess.run(['sh', '-n', '-c', boot.SCRIPT], check=True)
+    command = boot.arguments('fog', 600.0, 51830, 'word', 180.0)
+    assert command[:2] == ['/bin/sh', '-c']
+    assert command[4:9] == ['fog', '600', '51830', 'word', '180']

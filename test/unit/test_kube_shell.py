@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The multiplexer that runs in pods, and the robot's end of it, over pipes of this computer."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from fogros2 import kubernetes_api
+from fogros2.errors import ConnectError, ShellError
+from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.model import Command, Endpoint
+from fogros2.shell import kubernetes_link
+from fogros2.shell.kubernetes import KubernetesShell
+from fogros2.testing.shell_contract import raised
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.skipif(
+    os.geteuid() != 0, reason='needs root: the multiplexer changes to other users')
+
+
+class Pipe:
+    """What ``exec`` and a WebSocket do: a program's streams, in numbered messages."""
+
+    def __init__(self, argv: list[str]) -> None:
+        self.sock, self._far = socket.socketpair()
+        self.child = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        threading.Thread(target=self._pump, daemon=True).start()
+
+    def _pump(self) -> None:
+        with contextlib.suppress(OSError), self._far:
+            while data := os.read(self.child.stdout.fileno(), 1 << 15):
+                self._far.sendall(len(data).to_bytes(4, 'big') + data)
+
+    def settimeout(self, timeout: float | None) -> None:
+        self.sock.settimeout(timeout)
+
+    def send_binary(self, data: bytes) -> None:
+        assert data[0] == 0
+        self.child.stdin.write(data[1:])
+        self.child.stdin.flush()
+
+    def recv(self) -> bytes:
+        head = self._exactly(4)
+        return b'\1' + self._exactly(int.from_bytes(head, 'big')) if head else b''
+
+    def _exactly(self, size: int) -> bytes:
+        data = b''
+        while len(data) < size:
+            more = self.sock.recv(size - len(data))
+            if not more:
+                return b''
+            data += more
+        return data
+
+    def cut(self) -> None:
+        """Lose both ends' streams, whatever was under way."""
+        with contextlib.suppress(OSError):
+            self.sock.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError):
+            self.child.stdin.close()
+
+    def close(self, timeout: float | None = None) -> None:
+        self.cut()
+        self.sock.close()
+        self.child.kill()
+        self.child.wait()
+
+
+class FakeApi:
+    """An API server that runs what it is told here, or refuses."""
+
+    def __init__(self) -> None:
+        self.links: list[Pipe] = []
+        self.sessions: set[str] = set()
+        self.refusals: list[Exception] = []
+
+    def websocket(self, path: str, query: dict, *, timeout: float) -> Pipe:
+        assert path == '/api/v1/namespaces/robots/pods/a-pod/exec'
+        if self.refusals:
+            raise self.refusals.pop(0)
+        self.sessions.add(query['command'][3])
+        self.links.append(Pipe([sys.executable, *query['command'][1:]]))
+        return self.links[-1]
+
+    def cut(self) -> None:
+        """Break the connection, as an API server does that restarts."""
+        self.links[-1].cut()
+
+
+@pytest.fixture
+def api(monkeypatch):
+    fake = FakeApi()
+    monkeypatch.setattr(kubernetes_api, 'connect', lambda context='': fake)
+    yield fake
+    for link in fake.links:
+        link.close()
+    for process in Path('/proc').glob('[0-9]*'):
+        with contextlib.suppress(OSError):
+            words = (process / 'cmdline').read_text().split('\0')
+            if fake.sessions & set(words):
+                # one that was lost would wait a minute for somebody to come back
+                os.kill(int(process.name), signal.SIGKILL)
+
+
+@pytest.fixture
+def shell(api):
+    found = KubernetesShell(
+        Endpoint('kubernetes', 'robots/a-pod@a context', user='root'), name='talker')
+    yield found
+    found.close()
+
+
+def test_commands_share_one_exec(api, shell):
+    for number in range(20):
+        assert shell.run(Command(('echo', str(number))), timeout=10.0).stdout == f'{number}\n'
+    assert len(api.links) == 1
+
+
+def test_what_runs_goes_on_where_it_was_when_the_connection_breaks(api, shell, tmp_path):
+    lines: list[str] = []
+    gate = tmp_path / 'gate'
+
+    def took(line: str) -> None:
+        lines.append(line)
+        if line in ('100', '200', '300'):
+            api.cut()
+            gate.write_text(line)
+
+    script = (f'i=0; while [ $i -lt 400 ]; do echo $i; case $i in 100|200|300) '
+              f'until grep -qx $i {gate} 2>/dev/null; do sleep 0.02; done;; esac; '
+              'i=$((i + 1)); done; exit 3')
+    result = shell.run(Command(('sh', '-c', script)), timeout=30.0, check=False, on_output=took)
+    assert result.returncode == 3
+    assert lines == [str(n) for n in range(400)]
+    assert len(api.links) == 4
+
+
+def test_what_is_sent_arrives_once_when_the_connection_breaks(api, shell, tmp_path):
+    data = os.urandom(20_000_000)
+    target = tmp_path / 'file'
+    shell.run(Command(('true',)), timeout=10.0)
+
+    def cut() -> None:
+        # aside first: it grows while it comes
+        wait_until(lambda: any(p.stat().st_size > 1_000_000 for p in tmp_path.glob('file.*')),
+                   timeout=20.0, what='some of it to come', longest=0.01)
+        api.cut()
+
+    thread = threading.Thread(target=cut)
+    thread.start()
+    shell.put(data, str(target), mode=0o600, timeout=60.0)
+    thread.join()
+    assert target.read_bytes() == data
+    assert len(api.links) == 2
+
+
+def test_an_api_server_that_restarts_is_waited_for(api, shell):
+    api.refusals = [Unreachable('refused'), ApiError('no', status=503), Unreachable('refused')]
+    assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
+
+
+def test_a_pod_that_is_gone_is_told_at_once(api, shell):
+    api.refusals = [ApiError('pods "a-pod" not found', status=404, reason='NotFound')]
+    error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
+    assert 'is gone' in str(error)
+
+
+def test_rights_that_lack_are_named(api, shell):
+    api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)]
+    error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
+    assert 'pods/exec' in error.hint
+
+
+def test_a_pod_that_dies_ends_what_ran_there(api, shell):
+    started = threading.Event()
+
+    def die(_: str) -> None:
+        api.refusals = [ApiError('pods "a-pod" not found', status=404)] * 3
+        api.cut()
+        started.set()
+
+    error = raised(ConnectError, lambda: shell.run(
+        Command(('sh', '-c', 'echo begun; exec sleep 30')), timeout=30.0, on_output=die))
+    assert started.is_set()
+    assert 'lost' in str(error)
+
+
+def test_closing_ends_what_runs_there(api, shell, tmp_path):
+    pid = tmp_path / 'pid'
+    stream = shell.open(Command(('sh', '-c', f'echo $$ >{pid}; echo up; exec sleep 60')))
+    assert stream.readline() == b'up\n'
+    shell.close()
+    number = int(pid.read_text())
+    wait_until(lambda: not Path(f'/proc/{number}').exists() or
+               'Z' in Path(f'/proc/{number}/stat').read_text().split()[2], timeout=10.0,
+               what='the command to end')
+    assert stream.readline() == b''
+
+
+def test_commands_run_as_the_login_user_and_as_root_where_they_ask(api):
+    shell = KubernetesShell(Endpoint('kubernetes', 'robots/a-pod@', user='nobody'), name='talker')
+    with contextlib.closing(shell):
+        assert shell.run(Command(('id', '-un')), timeout=10.0).stdout == 'nobody\n'
+        assert shell.run(Command(('id', '-un'), sudo=True), timeout=10.0).stdout == 'root\n'
+        told = shell.run(Command(('sh', '-c', 'echo $USER $FOGROS2_ROOT')), timeout=10.0)
+        assert told.stdout == 'nobody yes\n'
+
+
+def test_what_nobody_reads_stops_the_program_and_nothing_else(api, shell):
+    stream = shell.open(Command(('yes',)))
+    assert stream.readline() == b'y\n'
+    for _ in range(50):
+        assert shell.run(Command(('echo', 'x')), timeout=10.0).stdout == 'x\n'
+    stream.close()
+    # all that came before it was stopped fits into what a channel may have under way
+    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+
+
+def test_a_terminal_has_the_user_s_size_and_follows_it(api, shell):
+    link = shell._connected(10.0)
+    channel = link.open(Command(('sh',)), terminal=(24, 80, 'xterm'))
+
+    def answer(text: bytes, word: bytes) -> bytes:
+        channel.sendall(text)
+        got = b''
+        while word not in got:
+            out, _, ended = channel.read(10.0)
+            assert out or not ended, got
+            got += out
+        return got
+
+    assert b'24 80' in answer(b'stty size; echo do""ne\n', b'done')
+    channel.resize_pty(132, 43)
+    assert b'43 132' in answer(b'stty size; echo a""gain\n', b'again')
+    assert b'xterm' in answer(b'echo $TERM; echo la""st\n', b'last')
+    answer(b'exit 7\n', b'exit 7')
+    assert channel.recv_exit_status() == 7
+    channel.close()
+
+
+@pytest.mark.parametrize('host, told', [
+    ('robots/pod@ctx', ('ctx', 'robots', 'pod')),
+    ('robots/pod@', ('', 'robots', 'pod')),
+    ('robots/pod@arn:aws:eks:x:1:cluster/a@b', ('arn:aws:eks:x:1:cluster/a@b', 'robots', 'pod'))])
+def test_an_endpoint_s_host_names_a_pod(host, told):
+    assert kubernetes_link.parse_host(host) == told
+
+
+def test_a_host_of_another_kind_is_refused():
+    raised(ConnectError, lambda: kubernetes_link.parse_host('198.51.100.7'))
