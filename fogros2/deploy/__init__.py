@@ -7,6 +7,7 @@ the steps of the paper; several run in parallel, each in a thread of its caller.
 pushed before its step runs. In the order of the steps:
 
 ``launch``      what all machines share, checks before anything is created, the way down
+``choosing``    what providers choose before anything is created, and what it costs
 ``robot``       what this computer needs to have; ``robot_vpn``: its VPN interface
 ``deployment``  one machine's way up, step by step; ``job``: what its steps share
 ``creating``    steps 1 to 3: create or take a kept one, wait until it can be reached

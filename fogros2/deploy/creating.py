@@ -55,12 +55,15 @@ class Creation:
                 detail.append('kept from before')
             else:
                 self._create()
-            price = job.launch.price(job.spec)
+            choices = job.launch.choices
+            price = choices.price(job.spec)
+            choices.begin(job.name, price)
             machine = job.provider.reachable(
                 job.machine_id, name=job.name, timeout=job.timeouts.boot, cancel=job.cancel)
-            price = machine.cost_per_hour if machine.cost_per_hour is not None else price
+            if machine.cost_per_hour is not None:
+                price = machine.cost_per_hour
+                choices.begin(job.name, price)
             if price is not None:
-                job.launch.begin_cost(job.name, price)
                 detail.append(plan.price(price))
             job.save(shell=machine.shell)
             detail.append(machine.shell.host if machine.shell else machine.id[:20])
@@ -122,7 +125,7 @@ class Creation:
 
     def _create(self) -> None:
         job = self._job
-        job.spec = job.launch.resolved(job.spec)
+        job.spec = job.launch.choices.resolved(job.spec)
         token = str(uuid.uuid4())
         job.folder.delete()
         job.record = dataclasses.replace(job.record, spec=job.spec)
@@ -181,7 +184,7 @@ class Creation:
         """End the machine by its ``on_exit``; the record goes only when the machine has gone."""
         job = self._job
         mode = job.spec.on_exit
-        if job.gone or job.failed and not job.reused:
+        if job.deleted or job.failed and not job.reused:
             mode = 'delete'
         try:
             with job.step(mode if job.provider.owned else 'let go'):
@@ -194,7 +197,7 @@ class Creation:
                     job.provider.stop(job.record.machine_id)
                 job.save(launch='', pid=0, pid_start=0, robot_vpn=None)
         finally:
-            job.launch.end_cost(job.name)
+            job.launch.choices.end(job.name)
 
     def _made(self) -> list[str]:
         """Return the id of the machine; a creation that failed half-way is found by its tags."""

@@ -37,7 +37,7 @@ class Entrance:
         self._job = job
         self._shell: Optional[MovableShell] = None
         self._allowed = ''
-        self._looked = time.monotonic()
+        self._looked = 0.0
 
     def connect(self, machine: Machine) -> Shell:
         """
@@ -122,6 +122,7 @@ class Entrance:
         """
         job = self._job
         last: Optional[FogError] = None
+        self._looked = time.monotonic()
         patience = job.timeouts.ssh if job.provider.owned else min(
             job.timeouts.ssh, LOGIN_ATTEMPT)
 

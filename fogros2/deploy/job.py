@@ -9,7 +9,6 @@ import dataclasses
 import threading
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.deploy.robot import provider
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, MachineSpec
 from fogros2.report import step
@@ -36,7 +35,7 @@ class Job:
         self.spec = spec
         self.name = spec.name
         self.timeouts = launch.timeouts
-        self.provider = provider(spec.provider)
+        self.provider = launch.provider(spec.provider)
         self.folder: MachineDirectory = launch.store.machine(spec.name)
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
         self.undo = contextlib.ExitStack()
@@ -45,8 +44,8 @@ class Job:
         self.former = ''
         #: Until the machine is up.
         self.failed = True
-        #: Whether the provider has it no longer.
-        self.gone = False
+        #: Whether it runs no longer, by the provider's word, and whether it is no more at all.
+        self.gone = self.deleted = False
         self.shell: Optional[Shell] = None
         #: Asks the machine's agent for a sign of life, within so many seconds.
         self.ask: Optional[Callable[[float], object]] = None

@@ -18,6 +18,7 @@ from typing import Optional
 from fogros2 import model, plan, plugin_system, process, workspace
 from fogros2 import shell as shells
 from fogros2.dds import DdsVendor
+from fogros2.deploy.choosing import Choices
 from fogros2.deploy.deployment import Deployment
 from fogros2.deploy.robot import check_robot, provider
 from fogros2.deploy.robot_vpn import RobotVpn
@@ -31,7 +32,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, MachineSpec
 from fogros2.provider import Provider
-from fogros2.report import Reporter, silent, step, StepFailed
+from fogros2.report import Reporter, silent, StepFailed
 from fogros2.store import boot_id, check_name, process_start, Store, write_private
 from fogros2.waiting import Timeouts
 
@@ -61,8 +62,8 @@ class Launch:
         self._failures: list[FogError] = []
         self._indices: dict[str, int] = {}
         self._ups: dict[str, Future[RunningMachine]] = {}
-        self._resolved: dict[str, MachineSpec] = {}
-        self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
+        self._providers: dict[str, Provider] = {}
+        self.choices = Choices(self.provider, report)
         self._robot: Optional[RobotVpn] = None
         self._rmw = ''
         self._robot_environment: Optional[dict[str, str]] = None
@@ -90,7 +91,7 @@ class Launch:
                                          'give each a name= of its own')
         prefixes = plan.ament_prefixes(self.user_environment)
         for spec in specs:
-            machines = provider(spec.provider)
+            machines = self.provider(spec.provider)
             shells.warm(machines.shell_kind)
             machines.check(spec)
             if spec.on_exit == 'stop' and not machines.owned:
@@ -104,7 +105,8 @@ class Launch:
                     plan.check_program(package, executable, prefixes)
         choosing = [spec for spec in specs if not self._may_be_kept(spec)]
         with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
-            for choice in [pool.submit(self.resolved, spec) for spec in choosing]:
+            for choice in [
+                    pool.submit(self.choices.resolved, spec) for spec in choosing]:
                 choice.result()
 
     def _may_be_kept(self, spec: MachineSpec) -> bool:
@@ -117,48 +119,16 @@ class Launch:
         return before is not None and before.machine_id is not None \
             and before.provider == spec.provider
 
-    def resolved(self, spec: MachineSpec) -> MachineSpec:
+    def provider(self, name: str) -> Provider:
         """
-        Return a spec with every open choice made, once in a launch.
+        Return the provider of that name, one for all machines of the launch.
 
-        :raises FogError: nothing fits.
+        :raises ConfigurationError: there is none.
         """
         with self._lock:
-            known = self._resolved.get(spec.name)
-        if known is not None:
-            return known
-        machines = provider(spec.provider)
-        if type(machines).resolve is Provider.resolve:
-            return spec
-        with step(self.report, spec.name, 'choices') as detail:
-            chosen = machines.resolve(spec)
-            detail += [f'{key} {value}' for key, value in sorted(chosen.options.items())
-                       if spec.options.get(key) != value]
-            price = self.price(chosen)
-            if price is not None:
-                detail.append(plan.price(price))
-        with self._lock:
-            self._resolved[spec.name] = chosen
-        return chosen
-
-    def price(self, spec: MachineSpec) -> Optional[Decimal]:
-        """Return what a machine of a resolved spec costs an hour (US dollars), None if unknown."""
-        try:
-            return provider(spec.provider).cost_per_hour(spec)
-        except FogError:
-            return None  # a price is for people to read; what limits it was checked
-
-    def begin_cost(self, name: str, price: Decimal) -> None:
-        """Take it that a machine costs money from now on."""
-        with self._lock:
-            self._costs[name] = (price, time.monotonic(), None)
-
-    def end_cost(self, name: str) -> None:
-        """Take it that a machine costs this launch nothing more; harmless twice."""
-        with self._lock:
-            known = self._costs.get(name)
-            if known is not None and known[2] is None:
-                self._costs[name] = (known[0], known[1], time.monotonic())
+            if name not in self._providers:
+                self._providers[name] = provider(name)
+            return self._providers[name]
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
         """
@@ -166,10 +136,7 @@ class Launch:
 
         Name, US dollars per hour, and the seconds that this launch has had it.
         """
-        now = time.monotonic()
-        with self._lock:
-            return [(name, price, (now if end is None else end) - begin)
-                    for name, (price, begin, end) in sorted(self._costs.items())]
+        return self.choices.cost()
 
     def dds(self) -> DdsVendor:
         """

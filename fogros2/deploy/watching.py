@@ -64,9 +64,10 @@ class Watch:
         try:
             machine = job.provider.describe(job.machine_id)
         except MachineNotFound as error:
-            job.gone = True
+            job.gone = job.deleted = True
             return str(error.args[0])
         except FogError:
             return ''  # no network here, maybe: asked again
-        job.gone = machine.state is MachineState.DELETED
+        job.gone = machine.state in _ENDED
+        job.deleted = machine.state is MachineState.DELETED
         return _ENDED.get(machine.state, '')

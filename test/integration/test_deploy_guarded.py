@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
 import ipaddress
 import shutil
 import socket
@@ -12,12 +14,13 @@ import uuid
 
 import pytest
 
-from fogros2.deploy import job, Launch
+from fogros2.deploy import Launch
 from fogros2.deploy import launch as launches
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.provider import container_machine
 from fogros2.provider.container import ContainerProvider
+from fogros2.report import StepDone
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 
@@ -78,8 +81,7 @@ def cloud(monkeypatch, cloud_network):
     subnet = run(Command(('podman', 'network', 'inspect', cloud_network, '--format',
                           '{{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60).stdout
     provider.robot = f'{next(ipaddress.ip_network(subnet.strip()).hosts())}/32'
-    for module in (job, launches):
-        monkeypatch.setattr(module, 'provider', lambda name: provider)
+    monkeypatch.setattr(launches, 'provider', lambda name: provider)
     return provider
 
 
@@ -194,3 +196,36 @@ def test_what_takes_a_machine_away_is_told(cloud, spec, monkeypatch):
     assert [e['event'] for e in told] == ['notice', 'lost']
     assert told[0]['reason'] == 'soon gone'
     assert identity in told[1]['reason'] or 'stopped' in told[1]['reason']
+
+
+def test_machines_that_nobody_can_dial_dial_the_robot_and_each_other(
+        cloud, spec, monkeypatch):
+    robot = cloud.robot.partition('/')[0]
+    for name in ('firewall', 'one_time_host_key', 'notice'):
+        monkeypatch.setattr(CloudLike, name, getattr(ContainerProvider, name))
+    describe = cloud.describe
+
+    def hidden(machine_id):
+        machine = describe(machine_id)
+        return dataclasses.replace(machine, vpn_host='', robot_host=robot, inner_network='pods',
+                                   inner_host=machine.vpn_host)
+
+    monkeypatch.setattr(cloud, 'describe', hidden)
+    events = []
+    launch = Launch(report=events.append)
+    names = [spec(name).name for name in ('one', 'two')]
+    launch.expect(names)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            machines = list(pool.map(lambda name: launch.up(spec(name)), ('one', 'two')))
+        one, two = machines
+        assert one.heartbeat.round_trip is not None
+        one.shell.run(Command(('ping', '-c', '1', '-W', '8', two.vpn_address)), timeout=20)
+        two.shell.run(Command(('ping', '-c', '1', '-W', '8', one.vpn_address)), timeout=20)
+    finally:
+        assert launch.down() == []
+    done = [event for event in events if isinstance(event, StepDone) and event.step == 'VPN']
+    assert all(f'dials {robot}:' in event.detail for event in done) and len(done) == 2
+    # the robot takes a handshake that comes before it knows the machine for nobody's
+    agents = [event for event in events if isinstance(event, StepDone) and event.step == 'agent']
+    assert all(event.seconds < 3 for event in agents), agents

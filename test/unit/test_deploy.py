@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import threading
@@ -12,7 +13,7 @@ import pytest
 
 from fogros2 import plan, plugin_system, process
 from fogros2.bootstrap import RosInstall
-from fogros2.deploy import entering, job, Launch, robot_vpn
+from fogros2.deploy import entering, Launch, robot_vpn
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.deployment import Deployment
@@ -55,8 +56,7 @@ ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/ke
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider()
-    for module in (job, launches):
-        monkeypatch.setattr(module, 'provider', lambda name: fake)
+    monkeypatch.setattr(launches, 'provider', lambda name: fake)
     return fake
 
 
@@ -292,16 +292,20 @@ def test_a_port_that_speaks_no_ssh_is_told_soon(launch, provider, monkeypatch):
     monkeypatch.setattr(entering, 'LOGIN_ATTEMPT', 0.5)
     with socket.create_server(('127.0.0.1', 0)) as server:
         def serve():
-            for _ in range(20):
-                connection, _ = server.accept()
-                connection.sendall(b'HTTP/1.1 400 Bad Request\r\n\r\n')
-                connection.close()
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    connection.sendall(b'HTTP/1.1 400 Bad Request\r\n\r\n')
+                    connection.close()
 
-        threading.Thread(target=serve, daemon=True).start()
+        thread = threading.Thread(target=serve)
+        thread.start()
         begin = time.monotonic()
         with pytest.raises(ConnectError, match='does not answer as an SSH server'):
             reach(launch, server.getsockname()[1])
         assert time.monotonic() - begin < 10
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join(10)
 
 
 def test_a_host_key_is_taken_from_what_the_machine_prints():

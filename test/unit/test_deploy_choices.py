@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from fogros2.deploy import job, Launch
+from fogros2.deploy import choosing, Launch
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.job import Job
@@ -27,8 +27,7 @@ PRICES = {'large': Decimal(2), 'small': Decimal('0.5')}
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider(prices=PRICES)
-    for module in (job, launches):
-        monkeypatch.setattr(module, 'provider', lambda name: fake)
+    monkeypatch.setattr(launches, 'provider', lambda name: fake)
     monkeypatch.setattr(launches, 'check_robot', lambda: None)
     return fake
 
@@ -112,7 +111,7 @@ def test_a_kept_machine_is_not_what_somebody_asks_for_by_its_chosen_value(
 
 def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(launches.time, 'monotonic', lambda: now[0])
+    monkeypatch.setattr(choosing.time, 'monotonic', lambda: now[0])
     mine = create(launch)
     now[0] += 60
     assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]

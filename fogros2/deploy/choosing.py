@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What providers choose for the machines of a launch, before any is made, and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from decimal import Decimal
+import threading
+import time
+from typing import Optional
+
+from fogros2 import plan
+from fogros2.errors import FogError
+from fogros2.model import MachineSpec
+from fogros2.provider import Provider
+from fogros2.report import Reporter, step
+
+
+class Choices:
+    """
+    The choices and the cost of one launch; thread-safe.
+
+    :param provider: returns a provider by its name.
+    """
+
+    def __init__(self, provider: Callable[[str], Provider], report: Reporter) -> None:
+        self._provider = provider
+        self._report = report
+        self._lock = threading.Lock()
+        self._resolved: dict[str, MachineSpec] = {}
+        self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
+
+    def resolved(self, spec: MachineSpec) -> MachineSpec:
+        """
+        Return a spec with every open choice made, once in a launch.
+
+        :raises FogError: nothing fits.
+        """
+        with self._lock:
+            known = self._resolved.get(spec.name)
+        if known is not None:
+            return known
+        provider = self._provider(spec.provider)
+        if type(provider).resolve is Provider.resolve:
+            return spec
+        with step(self._report, spec.name, 'choices') as detail:
+            chosen = provider.resolve(spec)
+            detail += [f'{key} {value}' for key, value in sorted(chosen.options.items())
+                       if spec.options.get(key) != value]
+            price = self.price(chosen)
+            if price is not None:
+                detail.append(plan.price(price))
+        with self._lock:
+            self._resolved[spec.name] = chosen
+        return chosen
+
+    def price(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return what a machine of a resolved spec costs an hour (US dollars), None if unknown."""
+        try:
+            return self._provider(spec.provider).cost_per_hour(spec)
+        except FogError:
+            return None  # a price is for people to read; what limits it was checked
+
+    def begin(self, name: str, price: Optional[Decimal]) -> None:
+        """Take it that a machine costs money since the first time that this is called."""
+        if price is None:
+            return
+        with self._lock:
+            begin = self._costs[name][1] if name in self._costs else time.monotonic()
+            self._costs[name] = (price, begin, None)
+
+    def end(self, name: str) -> None:
+        """Take it that a machine costs this launch nothing more; harmless twice."""
+        with self._lock:
+            known = self._costs.get(name)
+            if known is not None and known[2] is None:
+                self._costs[name] = (known[0], known[1], time.monotonic())
+
+    def cost(self) -> list[tuple[str, Decimal, float]]:
+        """Return name, US dollars per hour and seconds of each machine whose price is known."""
+        now = time.monotonic()
+        with self._lock:
+            return [(name, price, (now if end is None else end) - begin)
+                    for name, (price, begin, end) in sorted(self._costs.items())]
