@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine that vanishes under a running launch."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import uuid
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.process import argv
+from fogros2.testing.launched import launching
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+LAUNCH = """
+from fogros2 import (
+    CloudNode, ContainerInstance, FogROSLaunchDescription, MachineInterrupted)
+from launch import EventHandler
+from launch.actions import LogInfo, OpaqueFunction, RegisterEventHandler
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = ContainerInstance(
+        name={name!r}, network={network!r}, on_interrupt={on_interrupt!r})
+
+    def say(context):
+        event = context.locals.event
+        return [LogInfo(msg=f'noticed: {{event.machine}} lost {{event.lost}}')]
+
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  name='speaker', namespace='arm', remappings=[('chatter', '/chatter')],
+                  parameters=[{{'period': 0.2}}], output='screen'),
+        Node(package='fogros2_examples', executable='listener', output='screen'),
+        RegisterEventHandler(EventHandler(
+            matcher=lambda event: isinstance(event, MachineInterrupted),
+            entities=[OpaqueFunction(function=say)])),
+    ])
+"""
+
+
+def remove(engine: str, name: str, *how: str) -> None:
+    """End a machine as somebody would who knows nothing of the launch."""
+    words = argv(Command((engine, *how, f'fogros2-{name}'), sudo=True))
+    subprocess.run(words, check=True, capture_output=True, timeout=60)
+
+
+@pytest.fixture
+def launched(cloud_network, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    with launching() as launch:
+        def start(name, on_interrupt):
+            path = tmp_path / 'interrupted.launch.py'
+            path.write_text(LAUNCH.format(
+                name=name, network=cloud_network, on_interrupt=on_interrupt))
+            return launch(str(path))
+        yield start
+
+
+# at once, and with some seconds for the agent to end the nodes first
+@pytest.mark.parametrize('how', [('rm', '-f', '-t', '0'), ('stop', '-t', '5')],
+                         ids=['killed', 'stopped'])
+def test_nodes_go_on_on_the_robot(launched, engine, how):
+    name = f'gone-{RUN}-{how[0]}'
+    run = launched(name, 'robot')
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    remove(engine, name, *how)
+    run.wait_for(f'noticed: {name} lost True', timeout=30)
+    run.wait_for(f"the machine '{name}' is gone")
+    # the robot's own name and address stand in what the node says now
+    here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
+    run.wait_for(f'I heard: [Hello World from {here} ', times=3)
+    assert f'[{name}.talker' in run.text and '[arm.speaker]' in run.text
+    # the same process to launch: it never exited
+    assert 'process has' not in run.text and run.errors == [], run.text
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
+def test_the_launch_ends_with_the_machine(launched, engine):
+    name = f'gone-{RUN}'
+    run = launched(name, 'shutdown')
+    run.wait_for('I heard')
+    remove(engine, name, 'rm', '-f', '-t', '0')
+    assert run.ended(60) == 1, run.text
+    assert len(run.errors) == 1 and f"the machine '{name}' is gone" in run.errors[0], run.text
+    assert f'noticed: {name} lost True' in run.text and 'Traceback' not in run.text
