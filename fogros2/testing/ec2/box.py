@@ -34,6 +34,8 @@ class Instance:
     What a box knows of an instance.
 
     :param computer: whether its computer is on.
+    :param asked: when its start was asked for (seconds since the epoch).
+    :param ready: when its SSH server answered, 0 before.
     :param reason: code of what made it end.
     """
 
@@ -48,6 +50,8 @@ class Instance:
     private: str
     reason: str
     computer: bool
+    asked: float
+    ready: float
     tags: Mapping[str, str]
 
 
@@ -245,6 +249,18 @@ class Ec2Box:
     def console(self, instance: str) -> str:
         """Return what an instance's first process has said, until it ends."""
         return str(self._ask({'do': 'console', 'instance': instance}))
+
+    def publish(
+        self, image: str, *, region: str, name: str = 'published', architecture: str = 'x86_64',
+        files: Optional[Mapping[str, str]] = None,
+    ) -> None:
+        """
+        Let a region have a public AMI of this id, a fresh disk as Ubuntu's is.
+
+        :param files: programs that it has besides, or in the place of others: path and text.
+        """
+        self._ask({'do': 'publish', 'image': image, 'region': region, 'name': name,
+                   'architecture': architecture, 'files': dict(files or {})})
 
     # -- what goes wrong ------------------------------------------------------------------
 

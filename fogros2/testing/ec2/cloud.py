@@ -13,11 +13,13 @@ from collections.abc import Callable, Mapping
 import dataclasses
 import sys
 import threading
+import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError
 from fogros2.testing.ec2 import cloud_config, computer, guest, metadata, network
 from fogros2.testing.ec2.computer import Boot, Computer
+from fogros2.waiting import wait_until
 
 #: Seconds after which an instance that was asked to go down is cut off.
 _PATIENCE = 2.0
@@ -39,6 +41,8 @@ class Machine:
 
     :param wanted: run, stop or terminate; ``news`` is set when it changes.
     :param notice: what the metadata service says of an interruption.
+    :param asked: when it was told to start (seconds since the epoch); ``ready`` when its SSH
+        server answered.
     """
 
     instance: Any
@@ -53,6 +57,8 @@ class Machine:
     notice: str = ''
     runs: bool = False
     again: bool = False
+    asked: float = 0.0
+    ready: float = 0.0
     news: threading.Event = dataclasses.field(default_factory=threading.Event)
     thread: Optional[threading.Thread] = None
 
@@ -99,6 +105,7 @@ class Cloud:
 
     def _begin(self, machine: Machine) -> None:
         _set_state(machine.instance, 'pending')
+        machine.asked, machine.ready = time.time(), 0.0
         # EC2 tells the address when the instance runs
         nic = machine.instance.nics[0]
         machine.public, nic.public_ip = nic.public_ip or '', None
@@ -187,14 +194,19 @@ class Cloud:
             machine.space, lambda: self._metadata(machine),
             lambda: bool(instance.metadata_options.http_tokens == 'required'))
         try:
+            plan = self._plan(machine)
             machine.computer.start(Boot(
-                f'fogt{self.mark}{link}', f"ip-{private.replace('.', '-')}",
-                machine.space, self._plan(machine)))
+                f'{network.PREFIX}{self.mark}{link}',
+                plan['hostname'] or f"ip-{private.replace('.', '-')}", machine.space, plan))
             with self._lock:
                 machine.runs = True
                 asked = machine.wanted != 'run'
             if asked:
                 self._press(machine)
+            public = machine.host.public
+            wait_until(lambda: machine.computer.ended() or self.net.answers(public, 22),
+                       timeout=600.0, longest=0.02, what='its SSH server')
+            machine.ready = time.time()
             machine.computer.wait()
         finally:
             machine.runs = False

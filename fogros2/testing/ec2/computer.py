@@ -14,6 +14,7 @@ import dataclasses
 import json
 import os
 from pathlib import Path
+import select
 import signal
 import threading
 from typing import Any, Optional
@@ -117,6 +118,19 @@ def _root(path: str) -> str:
     return f'root/{path}'
 
 
+def put_files(folder: Path, files: Mapping[str, str]) -> None:
+    """Put programs on a disk: absolute path there, and text."""
+    archive = container_root.Archive()
+    layers = sorted(container_root.system_mounts(), key=len, reverse=True)
+    for path, text in files.items():
+        layer = next((top for top in layers if path.startswith(f'{top}/')), '')
+        place = f'layers{layer}/upper{path[len(layer):]}' if layer else _root(path[1:])
+        archive.file(place, text.encode(), 0o755)
+    process.run(
+        Command(('tar', '-xpf', '-', '--numeric-owner', '-C', str(folder)), sudo=True,
+                input=archive.data(), what='put files on a disk'), timeout=60.0)
+
+
 def copy_disk(source: Path, target: Path) -> None:
     """
     Copy a disk, aside first: ``target`` is there as a whole or not at all.
@@ -208,13 +222,20 @@ class Computer:
 
     def wait(self) -> None:
         """Wait until its first process has ended."""
-        import select
+        self._look(None)
+
+    def ended(self) -> bool:
+        """Return whether its first process has ended."""
+        return self._look(0)
+
+    def _look(self, milliseconds: Optional[int]) -> bool:
         with self._lock:
             handle = self._handle
-        if handle is not None:
-            poll = select.poll()
-            poll.register(handle, select.POLLIN)
-            poll.poll()
+        if handle is None:
+            return True
+        poll = select.poll()
+        poll.register(handle, select.POLLIN)
+        return bool(poll.poll(milliseconds))
 
     def exit_status(self) -> int:
         """Return how its first process ended."""
@@ -306,4 +327,4 @@ def started(pid: int) -> str:
 
 
 __all__ = ['Boot', 'Computer', 'DISKS', 'FogError', 'USER', 'copy_disk', 'left_over', 'new_disk',
-           'remove_disk', 'started', 'sweep']
+           'put_files', 'remove_disk', 'started', 'sweep']

@@ -24,7 +24,8 @@ PRICES: Mapping[str, str] = {
     't4g.large': '0.0672', 'm5.large': '0.0960', 'm5.xlarge': '0.1920', 'm6i.large': '0.0960',
     'm7g.large': '0.0816', 'c5.large': '0.0850', 'c5.xlarge': '0.1700', 'c5.2xlarge': '0.3400',
     'c5.4xlarge': '0.6800', 'c6i.2xlarge': '0.3400', 'c7g.xlarge': '0.1450',
-    'r5.large': '0.1260', 'g4dn.xlarge': '0.5260', 'g5.xlarge': '1.0060', 'g6.xlarge': '0.8048',
+    'c7a.large': '0.1026', 'm7a.large': '0.1159', 't2.medium': '0.0464', 'r5.large': '0.1260',
+    'g4dn.xlarge': '0.5260', 'g5.xlarge': '1.0060', 'g6.xlarge': '0.8048',
 }
 #: How much dearer other regions are; those not named cost a quarter more.
 _FACTORS: Mapping[str, str] = {

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import contextlib
 import ctypes
 import os
 from pathlib import Path
@@ -13,26 +15,54 @@ FOLDER = Path('/run/netns')
 _CLONE_NEWNET = 0x40000000
 
 
-def listener(space: str, address: str, port: int, *, backlog: int = 64) -> socket.socket:
+def listener(space: str, address: str, port: int) -> socket.socket:
     """
     Return a TCP socket that listens in the namespace ``space``, served by this process.
 
-    A socket stays in the namespace that its thread was in when it was made (setns(2)), so a
-    thread that lives for this alone goes over.
-
     :raises OSError: there is no such namespace or address, or this process isn't root.
+    """
+    return _made_in(space, lambda: socket.create_server((address, port), backlog=64))
+
+
+def answers(space: str, address: str, port: int) -> bool:
+    """
+    Return whether something in the namespace ``space`` can connect there by TCP at once.
+
+    :raises OSError: there is no such namespace, or this process isn't root.
+    """
+    def connect() -> socket.socket:
+        probe = socket.socket()
+        probe.settimeout(0.5)
+        with contextlib.suppress(OSError):
+            probe.connect((address, port))
+        return probe
+
+    with _made_in(space, connect) as probe:
+        try:
+            probe.getpeername()
+        except OSError:
+            return False
+        return True
+
+
+def _made_in(space: str, make: Callable[[], socket.socket]) -> socket.socket:
+    """
+    Return a socket that was made in a namespace.
+
+    It stays in the one that its thread was in when it was made (setns(2)), so a thread that lives
+    for this alone goes over.
     """
     made: list[socket.socket] = []
     trouble: list[OSError] = []
 
-    def make() -> None:
+    def work() -> None:
         try:
             _enter(space)
-            made.append(socket.create_server((address, port), backlog=backlog))
+            made.append(make())
         except OSError as error:
             trouble.append(error)
 
-    thread = threading.Thread(target=make)
+    thread = threading.Thread(target=work)
     thread.start()
     thread.join()
     if trouble:

@@ -22,6 +22,7 @@ from typing import Optional
 
 from fogros2 import process
 from fogros2.model import Command
+from fogros2.testing.ec2 import netns
 
 #: Of TEST-NET-2 (RFC 5737): nobody's.
 ROUTER = '198.51.100.1'
@@ -187,6 +188,10 @@ class Network:
             ip -n {self.router} route add {host.public} dev {host.link}
             ip -n {self.router} route add {host.private} dev {host.link}
             """, 'give an instance its addresses')
+
+    def answers(self, address: str, port: int) -> bool:
+        """Return whether a TCP port of an instance takes a connection from the router."""
+        return netns.answers(self.router, address, port)
 
     def protect(self, hosts: Sequence[Host]) -> None:
         """Put the router's rules in force, all at once."""

@@ -135,7 +135,9 @@ class Box:
             server.shutdown()
 
     def _do(self, order: Mapping[str, Any]) -> Any:
+        from fogros2.testing.ec2 import hooks
         from fogros2.testing.ec2.api import Fault
+        from fogros2.testing.ec2.market import PublicImage
         what = order['do']
         if what == 'fault':
             self.api.faults.append(Fault(**order['fault']))
@@ -157,6 +159,12 @@ class Box:
             return self.cloud.machines[order['instance']].computer.console()
         elif what == 'move_robot':
             self.net.move_robot(order['address'])
+        elif what == 'publish':
+            hooks.publish(order['region'], PublicImage(
+                order['image'], order['name'], order['architecture'], '099720109477'))
+            if order['files']:
+                computer.new_disk(self.cloud.disks / order['image'])
+                computer.put_files(self.cloud.disks / order['image'], order['files'])
         elif what == 'boot_delay':
             self.cloud.boot_delay = float(order['seconds'])
         else:
@@ -178,6 +186,7 @@ def _shown(machine: Any) -> dict[str, Any]:
         'zone': str(instance.availability_zone), 'spot': machine.spot,
         'public': instance.public_ip or '', 'private': instance.private_ip or '',
         'reason': instance.state_reason.code or '', 'computer': machine.runs,
+        'asked': machine.asked, 'ready': machine.ready,
         'tags': {tag['key']: tag['value'] for tag in instance.get_tags()},
     }
 

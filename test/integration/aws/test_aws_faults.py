@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What goes wrong at AWS: no room, no rights, no answer; and robots that vanish."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import uuid
+
+import pytest
+
+from fogros2.testing.colcon_workspace import colcon_workspace
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.timeout(120)
+
+TALKER = ('fogros2_examples', 'talker.aws.launch.py')
+
+
+def complaint(run):
+    """Return the one line of error that a failed launch has, with what it failed with."""
+    assert run.ended() != 0, run.text
+    assert 'Traceback' not in run.text, run.text
+    assert len(run.errors) == 1, run.text
+    return run.errors[0]
+
+
+def test_a_launch_gets_round_what_passes(robot, box, name):
+    """No room in the first zones, throttling, and an answer that gets lost."""
+    box.fail('InsufficientInstanceCapacity', action='RunInstances', times=2)
+    box.fail('RequestLimitExceeded', action='CreateSecurityGroup')
+    box.fail('RequestLimitExceeded', action='DescribeInstances')
+    run = robot.launch(*TALKER, f'name:={name}', 'count:=1')
+    assert run.ended() == 0, run.text
+    assert run.errors == [] and 'Traceback' not in run.text, run.text
+    tried = [call.error for call in box.calls() if call.action == 'RunInstances']
+    assert tried == ['InsufficientInstanceCapacity'] * 2 + ['']
+    # the answer to a request that was carried out
+    box.fail('InternalError', action='RunInstances', after=True)
+    run = robot.launch(*TALKER, f'name:={name}-b', 'count:=1')
+    assert run.ended() == 0, run.text
+    made = [found for found in box.instances() if found.tags['fogros2-name'] == f'{name}-b']
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize('code, action, words', [
+    ('InsufficientInstanceCapacity', 'RunInstances', ('us-east-1', 't3.medium')),
+    ('VcpuLimitExceeded', 'RunInstances', ('us-east-1',)),
+    ('UnauthorizedOperation', 'RunInstances', ('ec2:RunInstances',)),
+    ('UnauthorizedOperation', 'CreateSecurityGroup', ('ec2:CreateSecurityGroup',)),
+    ('RequestExpired', 'DescribeInstances', ('clock',)),
+    ('AuthFailure', 'DescribeInstances', ('credentials',)),
+])
+def test_what_stays_is_said_in_one_line(robot, box, name, code, action, words):
+    box.fail(code, action=action, times=0)
+    said = complaint(robot.launch(*TALKER, f'name:={name}'))
+    box.heal()
+    for word in words:
+        assert word in said
+    assert all(found.state == 'terminated' for found in box.instances())
+
+
+@pytest.mark.parametrize('arguments, word', [
+    (('region:=xx-nowhere-1',), 'xx-nowhere-1'),
+    (('ec2_instance_type:=t9.huge',), 't9.huge'),
+    (('ami_image:=ami-0123456789abcdef0',), 'ami-0123456789abcdef0'),
+    (('ec2_instance_type:=t4g.medium', 'ami_image:=ami-0aaaaaaaaaaaaaaaa'), 'arm64'),
+])
+def test_what_does_not_exist_is_found_before_anything_is_made(
+        robot, box, name, arguments, word):
+    box.publish('ami-0aaaaaaaaaaaaaaaa', region='us-east-1')
+    said = complaint(robot.launch(*TALKER, f'name:={name}', *arguments))
+    assert word in said
+    assert not [call for call in box.calls() if call.action in (
+        'RunInstances', 'CreateSecurityGroup', 'ImportKeyPair')]
+
+
+def test_nobody_to_ask_and_nobody_to_ask_as(robot, box, name):
+    said = complaint(robot.launch(*TALKER, f'name:={name}', AWS_ACCESS_KEY_ID=''))
+    assert 'credentials' in said
+    assert box.calls() == []
+    said = complaint(robot.launch(
+        *TALKER, f'name:={name}', AWS_ENDPOINT_URL='http://198.51.100.1:9'))
+    assert 'reach' in said or 'answer' in said
+
+
+LAUNCH = '''\
+from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = AWSCloudInstance(name={name!r}, robot_timeout=8, **{options!r})
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, executable='talker', **words),
+        Node(executable='listener', **words),
+    ])
+'''
+
+#: The same, with little patience for the boot.
+BOOTING = '''\
+import sys
+from fogros2.deploy import Launch
+from fogros2.model import MachineSpec
+from fogros2.waiting import Timeouts
+Launch(timeouts=Timeouts(boot=6.0, ssh=4.0)).up(MachineSpec(sys.argv[1], 'aws'))
+'''
+
+UBUNTU = 'ID=ubuntu\nVERSION_ID="24.04"\nVERSION_CODENAME=noble\nUBUNTU_CODENAME=noble\n'
+SLEEPS = '#!/bin/sh\necho "$0 $*" >>/tmp/slow.$(id -u)\nexec sleep 600\n'
+
+
+def test_a_machine_ends_whose_robot_was_killed(robot, box, name, tmp_path):
+    """In the boot, while ROS is installed, while the workspace is on its way, and at work."""
+    installing, syncing = 'ami-0bbbbbbbbbbbbbbbb', 'ami-0cccccccccccccccc'
+    box.publish(installing, region='us-east-1', files={
+        '/etc/os-release': UBUNTU, '/usr/local/bin/apt-get': SLEEPS})
+    box.publish(syncing, region='us-east-1', files={'/usr/local/bin/rsync': SLEEPS})
+    package = f'fogt_{uuid.uuid4().hex[:6]}'
+    variables = colcon_workspace(tmp_path / 'workspace', package, programs={'nothing': 'pass'})
+    box.set_boot_delay(2.0)
+    phases = {
+        'install': {'ami_image': installing, 'bootstrap': 'apt'},
+        'sync': {'ami_image': syncing, 'ros_workspace': str(tmp_path / 'workspace')},
+        'run': {}}
+    runs = {phase: robot.launch(
+        robot.write(f'{phase}.launch.py', LAUNCH.format(name=f'{name}-{phase}', options=options)),
+        **(variables if phase == 'sync' else {})) for phase, options in phases.items()}
+    booting = subprocess.Popen(
+        box.on_robot([sys.executable, '-c', BOOTING, f'{name}-boot']),
+        env=robot.environment(), start_new_session=True)
+    try:
+        def instance(phase):
+            return next((found for found in box.instances()
+                         if found.tags.get('fogros2-name') == f'{name}-{phase}'), None)
+
+        wait_until(lambda: instance('boot'), timeout=30, what='a machine that boots')
+    finally:
+        os.killpg(booting.pid, signal.SIGKILL)
+        booting.wait(10)
+
+    def slow(phase, word):
+        assert runs[phase].child.poll() is None, runs[phase].text
+        return word in box.run(instance(phase).id, 'cat /tmp/slow.*', check=False)
+
+    runs['run'].wait_for('I heard: ')
+    for phase, word in (('install', 'apt-get'), ('sync', 'rsync')):
+        wait_until(lambda p=phase, w=word: slow(p, w), timeout=30, what=f'the {phase} to begin')
+    for run in runs.values():
+        run.kill()
+    wait_until(lambda: not box.alive(), timeout=45, what='the machines to end by themselves')
+    for phase in (*phases, 'boot'):
+        assert instance(phase).reason == 'Client.InstanceInitiatedShutdown'
+    # what a machine can't take along goes when the robot forgets it; of the one that was killed
+    # before it knew its machine, gc finds group and key by their tags, a quarter of an hour later
+    deleted = robot.ros2('fog', 'delete', '--yes', 'all')
+    assert deleted.returncode == 0, deleted.stdout + deleted.stderr
+    assert {kind: len(names) for kind, names in robot.things().items()} in (
+        {}, {'groups': 1, 'keys': 1})
+    robot.clear()

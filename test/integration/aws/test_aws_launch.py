@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches on EC2 instances, from nothing to messages to nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.timeout(120)
+
+#: What AWS may be asked for one launch at the most, from its beginning to its end.
+CALLS = 25
+
+
+def clean(run):
+    """Return whether it said nothing that would worry anybody; Ctrl-C is a warning to launch."""
+    others = run.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
+    return run.errors == [] and 'WARNING' not in others and 'Traceback' not in others
+
+
+def test_the_talker_from_nothing_to_nothing(robot, box, name):
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}')
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    assert (instance.type, instance.region, instance.state) == ('t3.medium', 'us-east-1',
+                                                                'running')
+    assert instance.tags['fogros2-name'] == name
+    # SSH goes through the VPN by now, and its port is closed to everybody
+    (group,) = [group for group in robot.api().describe_security_groups()['SecurityGroups']
+                if group['GroupName'] != 'default']
+    assert [rule['IpProtocol'] for rule in group['IpPermissions']] == ['udp']
+    described = robot.api().describe_instances(InstanceIds=[instance.id])['Reservations'][0][
+        'Instances'][0]
+    assert described['MetadataOptions']['HttpTokens'] == 'required'
+    (disk,) = robot.api().describe_volumes()['Volumes']
+    assert (disk['VolumeType'], disk['Encrypted'], disk['Size']) == ('gp3', True, 30)
+    for thing in (described, group, disk, *robot.api().describe_key_pairs()['KeyPairs']):
+        assert {tag['Key']: tag['Value'] for tag in thing['Tags']}['fogros2-name'] == name
+    # the host key that went through user data is nobody's any more
+    data = robot.api().describe_instance_attribute(
+        InstanceId=instance.id, Attribute='userData')['UserData']['Value']
+    now = box.run(instance.id, 'cat /etc/ssh/ssh_host_ed25519_key.pub').split()[1]
+    assert now in instance.tags['fogros2-host-key']
+    assert data
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    asked = [call for call in box.calls() if call.region == 'us-east-1']
+    # what this test has asked itself comes on top
+    assert len(asked) - 5 <= CALLS, asked
+
+
+THEIRS = '''\
+from launch_ros.actions import Node
+
+import fogros2
+
+
+def ami_image():
+    import lsb_release
+
+    return {'22.04': 'ami-034160df82745c454'}[lsb_release.get_os_release()['RELEASE']]
+
+
+def generate_launch_description():
+    ld = fogros2.FogROSLaunchDescription()
+    machine1 = fogros2.AWSCloudInstance(
+        region='us-west-1', ec2_instance_type='c5.4xlarge', ami_image=ami_image()
+    )
+    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
+    talker_node = fogros2.CloudNode(
+        package='fogros2_examples', executable='talker', output='screen', machine=machine1,
+    )
+    ld.add_action(talker_node)
+    ld.add_action(listener_node)
+    return ld
+'''
+
+THEIRS_AUTO = '''\
+from launch_ros.actions import Node
+import fogros2
+from utils import region_ami_selection, ec2_instance_type_selection
+
+
+def generic_ubuntu_ami():
+    return {
+        'us-west-1': {'ami_image': 'ami-02ea247e531eb3ce6'},
+        'us-east-1': {'ami_image': 'ami-08c40ec9ead489470'},
+    }
+
+
+def generate_launch_description():
+    ld = fogros2.FogROSLaunchDescription()
+    region, ami = region_ami_selection.find_nearest_region_and_ami(generic_ubuntu_ami())
+    ec2_instance_type = ec2_instance_type_selection.find_cheapest_ec2_instance_type(region)
+    print(region, ami, ec2_instance_type)
+    machine1 = fogros2.AWSCloudInstance(
+        region=region, ec2_instance_type=ec2_instance_type, ami_image=ami
+    )
+    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
+    talker_node = fogros2.CloudNode(
+        package='fogros2_examples', executable='talker', output='screen', machine=machine1,
+    )
+    ld.add_action(talker_node)
+    ld.add_action(listener_node)
+    return ld
+'''
+
+
+def theirs(file, twin):
+    """
+    Return a launch file of FogROS2's.
+
+    Where ``FOGROS2_ORIGINAL`` names a checkout of it, its own; else one of ours that asks for the
+    same in the same words.
+    """
+    checkout = os.environ.get('FOGROS2_ORIGINAL')
+    if not checkout:
+        return twin
+    return Path(checkout, 'fogros2_examples', 'launch', file).read_text()
+
+
+def test_fogros2s_own_launch_file_runs_unchanged(robot, box):
+    box.publish('ami-034160df82745c454', region='us-west-1')
+    modules = robot.home / 'modules'
+    modules.mkdir()
+    (modules / 'lsb_release.py').write_text(
+        "def get_os_release():\n    return {'RELEASE': '22.04'}\n")
+    path = robot.write('theirs.launch.py', theirs('talker.aws.launch.py', THEIRS))
+    before = os.environ.get('PYTHONPATH')
+    run = robot.launch(path, PYTHONPATH=':'.join(filter(None, (str(modules), before))))
+    run.wait_for('I heard: [Hello World from ')
+    (instance,) = box.alive()
+    assert (instance.region, instance.type, instance.image) == (
+        'us-west-1', 'c5.4xlarge', 'ami-034160df82745c454')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+
+
+def test_fogros2s_own_choice_of_region_and_type(robot, box):
+    for region, image in (('us-west-1', 'ami-02ea247e531eb3ce6'),
+                          ('us-east-1', 'ami-08c40ec9ead489470')):
+        box.publish(image, region=region)
+    text = theirs('talker.auto_aws.launch.py', THEIRS_AUTO)
+    assert 'from utils import' in text
+    path = robot.write('auto.launch.py', text.replace('from utils import', 'from fogros2 import'))
+    run = robot.launch(path)
+    run.wait_for('I heard: [Hello World from ')
+    (instance,) = box.alive()
+    assert instance.image in ('ami-02ea247e531eb3ce6', 'ami-08c40ec9ead489470')
+    assert instance.region in ('us-west-1', 'us-east-1')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+
+
+def test_the_nearest_region_and_the_cheapest_type(robot, box, name):
+    shown = robot.ros2('launch', 'fogros2_examples', 'talker.auto_aws.launch.py', '-s')
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert box.calls() == []
+    run = robot.launch('fogros2_examples', 'talker.auto_aws.launch.py', f'name:={name}',
+                       'count:=1')
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    (instance,) = [found for found in box.instances()
+                   if found.tags.get('fogros2-name') == name]
+    # what answers, and the cheapest there with 2 vCPUs and 4 GiB of this computer's kind
+    assert instance.region in ('us-east-1', 'eu-central-1', 'us-west-1')
+    assert instance.type in ('t3a.medium', 't4g.medium')
+
+
+TWO = '''\
+from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    one = AWSCloudInstance(name='{name}-one', region='us-east-1')
+    two = AWSCloudInstance(name='{name}-two', region='eu-central-1', ec2_instance_type='c5.large')
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        CloudNode(machine=one, executable='talker', **words),
+        CloudNode(machine=two, executable='listener', **words),
+        Node(executable='listener', name='here', **words),
+    ])
+'''
+
+
+def test_two_regions_hear_each_other(robot, box, name):
+    run = robot.launch(robot.write('two.launch.py', TWO.format(name=name)))
+    run.wait_for(f'[listener]: I heard: [Hello World from {name}-one ')
+    run.wait_for(f'[here]: I heard: [Hello World from {name}-one ')
+    assert {found.region for found in box.alive()} == {'us-east-1', 'eu-central-1'}
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+
+
+def test_an_image_is_baked_found_and_deleted(robot, box, name):
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
+                       'on_exit:=keep', 'count:=1')
+    assert run.ended() == 0, run.text
+    (kept,) = box.alive()
+
+    def baked():
+        shown = robot.ros2('fog', 'image', 'list', '--json')
+        assert shown.returncode == 0, shown.stdout + shown.stderr
+        return json.loads(shown.stdout)
+
+    dry = robot.ros2('fog', 'image', name, '--dry-run')
+    assert dry.returncode == 0, dry.stdout + dry.stderr
+    assert baked() == []
+    made = robot.ros2('fog', 'image', name)
+    assert made.returncode == 0, made.stdout + made.stderr
+    (image,) = robot.api().describe_images(Owners=['self'])['Images']
+    assert image['State'] == 'available'
+    # a computer that knows nothing of this robot's machines finds this one, and ends it
+    elsewhere = {'FOGROS2_STATE_HOME': str(robot.home / 'elsewhere')}
+    listed = robot.ros2('fog', 'list', **elsewhere)
+    assert listed.returncode == 0 and name in listed.stdout, listed.stdout + listed.stderr
+    gone = robot.ros2('fog', 'delete', '--yes', name, **elsewhere)
+    assert gone.returncode == 0, gone.stdout + gone.stderr
+    assert box.wait_for(kept.id, 'terminated').id == kept.id
+    # the robot that made it finds nothing to delete but its own memory
+    forgotten = robot.ros2('fog', 'delete', '--yes', name)
+    assert forgotten.returncode == 0, forgotten.stdout + forgotten.stderr
+    again = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}-b', 'count:=1')
+    assert again.ended() == 0, again.text
+    assert clean(again), again.text
+    assert box.instances()[-1].image == image['ImageId']
+    (shown,) = baked()
+    deleted = robot.ros2('fog', 'image', 'delete', shown['id'], '--yes')
+    assert deleted.returncode == 0, deleted.stdout + deleted.stderr
+    assert baked() == []
+    assert robot.things() == {}
+
+
+def test_a_spot_instance_is_taken_away_and_the_robot_goes_on(robot, box, name):
+    run = robot.launch(robot.write('spot.launch.py', SPOT.format(name=name, how='robot')))
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    assert instance.spot
+    box.interrupt(instance.id, notice=60.0)
+    run.wait_for('on our own')
+    wait_until(lambda: f'I heard: [Hello World from {os.uname().nodename} ' in run.text,
+               timeout=30, what='the talker on the robot')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
+SPOT = '''\
+from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription, MachineInterrupted
+from launch import EventHandler
+from launch.actions import LogInfo, RegisterEventHandler
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = AWSCloudInstance(name='{name}', spot=True, on_interrupt='{how}')
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        RegisterEventHandler(EventHandler(
+            matcher=lambda event: isinstance(event, MachineInterrupted),
+            entities=[LogInfo(msg='on our own')])),
+        CloudNode(machine=machine, executable='talker', **words),
+        Node(executable='listener', **words),
+    ])
+'''
+
+
+def test_a_spot_instance_is_lost_and_the_launch_ends(robot, box, name):
+    run = robot.launch(robot.write('spot.launch.py', SPOT.format(name=name, how='shutdown')))
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    box.interrupt(instance.id, notice=0.0)
+    assert run.ended() != 0, run.text
+    assert name in '\n'.join(run.errors), run.text
