@@ -136,6 +136,8 @@ class Api:
         self, environ: dict[str, Any], service: str, region: str, action: str,
         params: Mapping[str, Any],
     ) -> Answer:
+        if region not in market.ENABLED:
+            raise Refusal('AuthFailure')
         if service == 'pricing':
             return self._pricing(action, params)
         if service == 'ssm' and action in ('GetParameter', 'GetParameters'):

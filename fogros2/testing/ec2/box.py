@@ -193,8 +193,11 @@ class Ec2Box:
         inside = ['ip', 'netns', 'exec', self.robot]
         if os.geteuid() == 0:
             return [*inside, *words]
+        # sudo has a path of its own, and its loader drops the libraries'
+        kept = [f'{name}={os.environ[name]}' for name in ('PATH', 'LD_LIBRARY_PATH')
+                if name in os.environ]
         return ['sudo', '-n', '--preserve-env', *inside, 'setpriv', f'--reuid={os.getuid()}',
-                f'--regid={os.getgid()}', '--init-groups', '--', *words]
+                f'--regid={os.getgid()}', '--init-groups', '--', 'env', *kept, *words]
 
     def move_robot(self, *, back: bool = False) -> str:
         """Give the robot another address, and return it."""

@@ -15,7 +15,7 @@ from typing import Any
 from moto.ec2 import models
 
 from fogros2.testing.ec2.cloud import Cloud, MOTO
-from fogros2.testing.ec2.market import PublicImage
+from fogros2.testing.ec2.market import ENABLED, PublicImage
 
 #: Moto's account.
 ACCOUNT = '123456789012'
@@ -39,6 +39,9 @@ def install(cloud: Cloud) -> None:
     parts.elastic_ip_addresses.random_ip = public_address
     instances.random_private_ip = private_address
     parts.subnets.Subnet.get_available_subnet_ip = private_address
+
+    known = parts.availability_zones_and_regions.RegionsAndZonesBackend
+    known.regions = [region for region in known.regions if region.name in ENABLED]
 
     MOTO.update(
         start=instances.Instance.start, stop=instances.Instance.stop,

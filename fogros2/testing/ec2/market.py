@@ -17,6 +17,11 @@ import json
 import re
 from typing import Any, Optional
 
+#: Regions that every account has; the others have to be enabled first, which nobody has done.
+ENABLED = (
+    'ap-northeast-1', 'ap-northeast-2', 'ap-northeast-3', 'ap-south-1', 'ap-southeast-1',
+    'ap-southeast-2', 'ca-central-1', 'eu-central-1', 'eu-north-1', 'eu-west-1', 'eu-west-2',
+    'eu-west-3', 'sa-east-1', 'us-east-1', 'us-east-2', 'us-west-1', 'us-west-2')
 #: US dollars an hour in us-east-1.
 PRICES: Mapping[str, str] = {
     't3.micro': '0.0104', 't3.small': '0.0208', 't3.medium': '0.0416', 't3.large': '0.0832',

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How long a launch on a rented machine takes from ``ros2 launch`` to the first message.
+
+Against EC2 in a box (``fogros2.testing.ec2``), whose instances boot as slowly as they are told.
+*Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
+without the installation of ROS 2 on an image that has none.
+
+    python benchmarks/startup.py [--provider aws] [--runs 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Mapping
+import contextlib
+import os
+from pathlib import Path
+import re
+import statistics
+import tempfile
+import time
+
+from figures import Row, write
+
+from fogros2.testing.ec2 import Ec2Box
+from fogros2.testing.launched import launching, ros2
+
+REGION = 'us-east-1'
+DELAYS = (0.0, 20.0)
+MANY = 8
+
+LAUNCH = """\
+from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    machines = [AWSCloudInstance(name=f'bench-{{n}}') for n in range({number})]
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen') for machine in machines])
+"""
+
+
+class Robot:
+    """A robot beside a box, with a home of its own."""
+
+    def __init__(self, box: Ec2Box, home: Path) -> None:
+        self.box = box
+        self.home = home
+        self.environment: Mapping[str, str] = {
+            **os.environ, **box.environment(REGION), 'FOGROS2_AWS_CHECKIP': box.checkip,
+            'HOME': str(home), 'FOGROS2_STATE_HOME': str(home / 'state'),
+            'ROS_LOG_DIR': str(home / 'log'), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+    def fog(self, *words: str) -> float:
+        """Run ``ros2 fog`` and return how long it took (s)."""
+        begin = time.perf_counter()
+        done = ros2('fog', *words, environment=self.environment, timeout=120.0,
+                    prefix=self.box.on_robot([]))
+        if done.returncode != 0:
+            raise SystemExit(f'ros2 fog {" ".join(words)} failed:\n{done.stdout}{done.stderr}')
+        return time.perf_counter() - begin
+
+    def talker(self, *words: str) -> tuple[float, float, float, int]:
+        """
+        Launch the talker until the first message is heard.
+
+        :returns: seconds in all, of the boot, of the installation; requests to AWS, the end too.
+        """
+        self.box.forget_calls()
+        with launching() as launch:
+            begin = time.perf_counter()
+            run = launch('fogros2_examples', 'talker.aws.launch.py', 'count:=1', *words,
+                         environment=self.environment, prefix=self.box.on_robot([]))
+            run.wait_for('I heard: ', timeout=300.0)
+            total = time.perf_counter() - begin
+            if run.ended(120.0) != 0:
+                raise SystemExit(f'the launch failed:\n{run.text}')
+        newest = self.box.instances()[-1]
+        found = re.search(r'ROS 2 +([0-9.]+) s \((.*)\)', run.text)
+        installed = float(found[1]) if found and 'installed' in found[2] else 0.0
+        return total, newest.ready - newest.asked, installed, len(self.box.calls())
+
+    def machines(self, number: int) -> float:
+        """Return the seconds until the nodes of ``number`` machines run."""
+        path = self.home / 'many.launch.py'
+        path.write_text(LAUNCH.format(number=number))
+        with launching() as launch:
+            begin = time.perf_counter()
+            run = launch(str(path), environment=self.environment, prefix=self.box.on_robot([]))
+            run.wait_for('process started with pid', times=number, timeout=300.0)
+            total = time.perf_counter() - begin
+            run.interrupt()
+            if run.ended(120.0) != 0:
+                raise SystemExit(f'the launch failed:\n{run.text}')
+        return total
+
+
+@contextlib.contextmanager
+def robot(*, bare: bool) -> Iterator[Robot]:
+    """
+    Yield a robot beside a new box.
+
+    :param bare: the box's Ubuntu has no ROS 2; else it has the robot's, as a made image would.
+    """
+    with tempfile.TemporaryDirectory() as home, Ec2Box(mounts=() if bare else None) as box:
+        yield Robot(box, Path(home))
+
+
+def start(runs: int) -> Iterator[Row]:
+    """Yield what it takes to start on a fresh image, and on one that was baked of the first."""
+    calls = []
+    with robot(bare=True) as here:
+        for image in ('default', 'custom'):
+            for delay in DELAYS:
+                here.box.set_boot_delay(delay)
+                taken = [here.talker() for _ in range(runs)]
+                calls += [asked for *_, asked in taken]
+                total = statistics.median(t for t, *_ in taken)
+                installed = statistics.median(i for _, _, i, _ in taken)
+                share = statistics.median(t - b - i for t, b, i, _ in taken)
+                what = f'{image} image, boot delay {delay:g} s'
+                yield Row(f'{what}: to the first message', total, 's', runs=runs,
+                          published='275 s' if image == 'default' else '85 s')
+                if installed:
+                    yield Row(f'{what}: of it ROS 2 installed', installed, 's', runs=runs)
+                yield Row(f'{what}: our share', share, 's', 6.0 if image == 'default' else 4.0,
+                          runs=runs)
+            if image == 'default':
+                here.box.set_boot_delay(0.0)
+                here.talker('name:=baked', 'on_exit:=keep')
+                here.fog('image', 'baked')
+                here.fog('delete', '--yes', 'baked')
+        yield Row('requests to AWS in a launch, at most', max(calls), 'requests', 25.0,
+                  runs=len(calls))
+        yield from listing(here, runs)
+
+
+def listing(here: Robot, runs: int) -> Iterator[Row]:
+    """Yield what it takes to look for machines in all regions."""
+    here.fog('list')
+    taken = []
+    for _ in range(runs):
+        here.box.forget_calls()
+        taken.append(here.fog('list'))
+    regions = Counter(call.region for call in here.box.calls())
+    yield Row(f'ros2 fog list, {len(regions)} regions', statistics.median(taken), 's', 2.0,
+              runs=runs)
+    yield Row('ros2 fog list, a region', max(regions.values()), 'requests', 2.0, runs=runs)
+
+
+def several(runs: int) -> Iterator[Row]:
+    """Yield how much longer many machines take than one."""
+    with robot(bare=False) as here:
+        here.machines(1)
+        for delay in DELAYS:
+            here.box.set_boot_delay(delay)
+            one = statistics.median(here.machines(1) for _ in range(runs))
+            many = statistics.median(here.machines(MANY) for _ in range(runs))
+            what = f'{MANY} instances, boot delay {delay:g} s'
+            yield Row(f'1 instance, boot delay {delay:g} s', one, 's', runs=runs)
+            yield Row(what, many, 's', runs=runs)
+            yield Row(what, many / one, 'times one', 1.5, runs=runs,
+                      published='one after another')
+
+
+def main() -> None:
+    """Take the figures of a provider."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--provider', choices=['aws'], default='aws')
+    parser.add_argument('--runs', type=int, default=3)
+    arguments = parser.parse_args()
+    write(f'startup_{arguments.provider}', 'From ros2 launch to the first message, EC2 in a box',
+          [*start(arguments.runs), *several(arguments.runs)])
+
+
+if __name__ == '__main__':
+    main()
