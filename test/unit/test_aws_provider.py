@@ -54,6 +54,7 @@ def test_options_of_fogros2_are_taken_in_every_form_a_launch_file_has():
         'disk_size': '40', 'spot': 'True', 'arch': 'amd64', 'min_cpu': '8', 'gpu': True,
         'max_price': '1.25', 'ssh_from': '198.51.100.0/24', 'tags': {'team': 'slam'}})
     assert options.disk_size == 40
+    assert Options.parse({'disk_size': 30.0}).disk_size == 30
     assert options.spot is True
     assert options.arch == 'x86_64'
     assert options.min_cpu == 8.0
@@ -76,6 +77,7 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'ami_image': 'ubuntu'}, 'it takes ami-'),
     ({'arch': 'riscv'}, 'x86_64 or arm64'),
     ({'disk_size': 'lots'}, 'a whole number'),
+    ({'disk_size': 30.5}, 'a whole number'),
     ({'disk_size': 0}, 'a disk can not have 0 GB'),
     ({'spot': 'perhaps'}, 'True or False'),
     ({'max_price': 'cheap'}, "can't be 'cheap'"),

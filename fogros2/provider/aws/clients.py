@@ -139,7 +139,7 @@ class Account:
                     retries={'mode': 'adaptive', 'total_max_attempts': 2 if hasty else ATTEMPTS},
                     connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
                     read_timeout=5.0 if hasty else READ_TIMEOUT,
-                    user_agent_extra='fogros2', max_pool_connections=20)
+                    user_agent_extra='fogros2', max_pool_connections=50)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
                 own = found.meta.service_model.service_id.hyphenize()

@@ -51,7 +51,8 @@ class Creation:
         self.options = options
         self.attempt = instances.attempt_of(request.token)
         self._robot_address = robot_address
-        self._price = price
+        self._ask_price = price
+        self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
         self._images: dict[tuple[str, str, bool], Mapping[str, Any]] = {}
 
     def run(self, regions: list[str], types: list[str]) -> MachineId:
@@ -108,6 +109,11 @@ class Creation:
                 f"there is a machine '{self.spec.name}'{whose} in {region} already",
                 f'give the machine another name=, or: ros2 fog delete {self.spec.name}')
         return None
+
+    def _price(self, region: str, kind: str) -> Optional[Decimal]:
+        if (region, kind) not in self._prices:
+            self._prices[region, kind] = self._ask_price(region, kind)
+        return self._prices[region, kind]
 
     def _sources(self) -> list[str]:
         return list(self.options.ssh_from) or [self._robot_address()]

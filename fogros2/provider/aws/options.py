@@ -119,6 +119,10 @@ def _value(name: str, value: Any, default: Any) -> Any:
         value = (value,)
     if name == 'gpu' and isinstance(value, bool):
         return '1' if value else ''
+    if name == 'disk_size':
+        value = _number(value)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
     if isinstance(default, float):
         value = _number(value)
         if value == 0:
