@@ -285,12 +285,13 @@ def pair(case: Case) -> tuple[list[str], list[str]]:
     return words('encoder', '/camera'), words('decoder', '/decoded')
 
 
-def cpu(program: str) -> float:
-    """Return the seconds of CPU that processes with a text in their command line have taken."""
+def cpu(*programs: str) -> float:
+    """Return the seconds of CPU of processes that have one of the texts in their command line."""
     ticks = 0
     for path in Path('/proc').glob('[0-9]*'):
         try:
-            if program in (path / 'cmdline').read_bytes().decode(errors='replace'):
+            words = (path / 'cmdline').read_bytes().decode(errors='replace')
+            if any(program in words for program in programs):
                 ticks += sum(map(int, (path / 'stat').read_text().rpartition(')')[2].split()[
                     11:13]))
         except OSError:
@@ -316,30 +317,32 @@ def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: st
         for what, words in (('decoder', there), ('cloud', [
             sys.executable, f'{FOLDER}/streaming.py', '--cloud', '--topic', '/decoded',
             '--result', result, *size]))])
-    encoder = subprocess.Popen(here, env=environment)
+    encoder = source = None
     try:
+        encoder = subprocess.Popen(here, env=environment)
         source = subprocess.Popen(
             [sys.executable, __file__, '--camera', '--count', str(count), *size],
             env=environment, stdout=subprocess.PIPE, text=True)
         assert source.stdout is not None
         source.stdout.readline()
-        roles = [('encoder', 'theora.py encode'), ('decoder', 'theora.py\0decode')]
-        names = [roles[i][0] if case.codec != 'theora' else roles[i][1].replace(' ', '\0')
-                 for i in (0, 1)]
-        names = [f'image_transport_h264.{n} ' if case.codec != 'theora' else n for n in names]
-        begin = time.monotonic(), link.sent(), cpu(names[0]), cpu(names[1])
+        names = [('image_transport_h264.encoder ',), ('image_transport_h264.decoder ',)]
+        if case.codec == 'theora':
+            # FFmpeg's own program encodes
+            names = [('theora.py\0encode', 'libtheora'), ('theora.py\0decode',)]
+        begin = time.monotonic(), link.sent(), cpu(*names[0]), cpu(*names[1])
         told = json.loads(source.communicate(timeout=count / RATE + 120)[0].splitlines()[-1])
         seconds = time.monotonic() - begin[0]
-        load = [100 * (cpu(names[i]) - begin[2 + i]) / seconds for i in (0, 1)]
+        load = [100 * (cpu(*names[i]) - begin[2 + i]) / seconds for i in (0, 1)]
         sent = link.sent() - begin[1]
     finally:
-        encoder.send_signal(signal.SIGINT)
-        encoder.wait(15)
+        end(source)
+        end(encoder)
+        # what still runs there would be in the way of the next case
+        machine.stop([f'decoder-{mark}', f'cloud-{mark}'])
     counters = link.change(rate=0.0, delay=0.0, loss=0.0)
     # no packet is larger than the VPN's 1420 bytes
     if (counters['passed'] + counters['lost']) * 1420 < sent:
         raise RuntimeError(f'packets go past the relay: {counters}, {sent} bytes sent')
-    machine.stop([f'decoder-{mark}', f'cloud-{mark}'])
     quality = json.loads(machine_file(machine, result))
     times = sorted(1e3 * t for t in told['times']) or [math.nan]
 
@@ -350,6 +353,33 @@ def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: st
         case, quality['fps'], at(0.5), at(0.95), at(0.99), told['sent'] - quality['received'],
         sent / (told['sent'] + WARM_UP), quality['psnr'], quality['ssim'], quality['worst'],
         load[0], load[1])
+
+
+def tried(case: Case, launch: Any, machine: Any, link: Link, count: int,
+          video: str) -> Optional[Outcome]:
+    """Run a case, once more if it fails; None if it fails again, so that the others have a run."""
+    from fogros2.errors import FogError
+
+    for _ in range(2):
+        try:
+            return run(case, launch, machine, link, count, video)
+        except (FogError, OSError, RuntimeError, ValueError, IndexError,
+                subprocess.SubprocessError) as error:
+            print(f'{case.name}: {type(error).__name__}: {error}', file=sys.stderr, flush=True)
+            link.change(rate=0.0, delay=0.0, loss=0.0)
+    return None
+
+
+def end(process: Optional[subprocess.Popen[Any]]) -> None:
+    """End a process, in order if it lets itself be."""
+    if process is None:
+        return
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(15)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(15)
 
 
 def machine_file(machine: Any, path: str) -> str:
@@ -497,6 +527,8 @@ def main() -> None:
         print('no ffmpeg here: no row for Theora')
     outcomes: list[Outcome] = []
     limits: dict[str, float] = {}
+    failed: list[str] = []
+    begin = time.monotonic()
     launch = Launch()
     link: Optional[Link] = None
     try:
@@ -504,7 +536,10 @@ def main() -> None:
         prepare(machine)
         link = Link(launch, machine)
         for case in cases:
-            outcome = run(case, launch, machine, link, count, arguments.video)
+            outcome = tried(case, launch, machine, link, count, arguments.video)
+            if outcome is None:
+                failed.append(case.name)
+                continue
             outcomes.append(outcome)
             print(outcome, flush=True)
             if case.codec == 'h264' and not case.loss:
@@ -519,10 +554,17 @@ def main() -> None:
                'the scene of `fogros2_examples/scene.py`') + '.')
     text = table(outcomes, limits, note)
     print(text)
-    if arguments.only or arguments.short:
-        return
-    write('streaming', 'Streaming images over 10 Mbit/s', list(rows(outcomes, limits)))
-    (RESULTS / 'streaming-table.md').write_text(text)
+    print(f'took {(time.monotonic() - begin) / 60:.1f} min')
+    if not (arguments.only or arguments.short):
+        write('streaming', 'Streaming images over 10 Mbit/s', list(rows(outcomes, limits)))
+        (RESULTS / 'streaming-table.md').write_text(text)
+        (RESULTS / 'streaming-table.json').write_text(json.dumps({
+            'note': note, 'limits': limits,
+            'rows': [{key: None if isinstance(value, float) and math.isnan(value) else value
+                      for key, value in dataclasses.asdict(o).items()} for o in outcomes]},
+            indent=1) + '\n')
+    if failed:
+        raise SystemExit(f"without a result: {', '.join(failed)}")
 
 
 if __name__ == '__main__':
