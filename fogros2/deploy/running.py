@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from fogros2.deploy.launch import Launch
 
 
+#: Events that this side alone emits; those of the agent have a ``seq``.
+_OURS = ('lost', 'connection', 'gap')
+
+
 class RunningMachine:
     """
     A machine of the launch that is up, and the nodes on it.
@@ -86,9 +90,10 @@ class RunningMachine:
         ``{'event': 'gap', 'count': n}``  so many events came too late for the agent's log.
         """
         def tell(event: dict[str, Any]) -> None:
+            if self._lost or event['event'] in _OURS and 'seq' in event:
+                return  # the machine's agent has no say in these
             # an agent that leaves at the end as it was told is no news
-            if not self._lost and (
-                    event['event'] != 'connection' or not self._launch.ending):
+            if event['event'] != 'connection' or not self._launch.ending:
                 callback(event)
 
         with self._lock:

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
 
 from fogros2.actions.session import Session
+from fogros2.deploy import RunningMachine
 from fogros2.model import MachineSpec
 from fogros2.shell import ssh
 
@@ -40,6 +41,31 @@ def test_a_line_without_an_end_fills_no_memory(monkeypatch):
     assert channel.closed
 
 
+class Told:
+    """An agent that says what a test tells it to."""
+
+    silent_for = 0.0
+
+    def subscribe(self, callback, since):
+        self.callback, self.since = callback, since
+
+
+def test_that_it_is_gone_is_its_provider_s_to_say():
+    job = SimpleNamespace(spec=None, provider=SimpleNamespace(owned=False))
+    agent, heard = Told(), []
+    machine = RunningMachine(
+        SimpleNamespace(ending=False), job, None, None, agent, None,
+        SimpleNamespace(address='198.18.7.2'), 7)
+    machine.subscribe(heard.append)
+    assert agent.since == 7
+    for event in ('lost', 'connection', 'gap'):
+        agent.callback({'event': event, 'seq': 8, 'state': 'absent', 'reason': 'x', 'count': 1})
+    assert heard == []
+    agent.callback({'event': 'connection', 'state': 'lost'})
+    agent.callback({'event': 'notice', 'seq': 9, 'reason': 'soon'})
+    assert [event['event'] for event in heard] == ['connection', 'notice']
+
+
 @pytest.mark.parametrize('event', [
     {'event': ['started']}, {'event': 'started', 'node': ['n']}, {'event': 'started', 'node': 'n'},
     {'event': 'started', 'node': 'n', 'pid': 1, 'cmd': [1]},
@@ -52,7 +78,7 @@ def test_an_event_that_makes_no_sense_is_left_aside(event):
     loop = asyncio.new_event_loop()
     try:
         session = Session(MachineSpec('planner', 'ssh'), loop, in_thread=None, fail=heard.append,
-                          changed=lambda: None)
+                          changed=lambda: None, taken_away=lambda session, reason: None)
         session._runs['n'] = SimpleNamespace(on_event=heard.append)
         session._on_event(event)
     finally:
