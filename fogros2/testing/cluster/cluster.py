@@ -24,6 +24,8 @@ USERS = ('robot', 'limited')
 #: Networks for the cable between computer and node. Of TEST-NET-2, the last ones: the tests'
 #: container networks take the first.
 CABLES = [f'198.51.100.{last}/30' for last in (252, 248, 244, 240)]
+#: What ``running_cluster`` has to know, in the cluster's folder.
+_OWN = 'cluster.json'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +126,7 @@ def cluster(
         'admin.conf': access('admin'), 'cluster.conf': access('cluster'),
         'node.conf': access(f'system:node:{services.NODE}'),
         **{f'{name}.conf': access(name) for name in USERS},
+        _OWN: json.dumps({'layout': dataclasses.asdict(layout), 'images': str(store)}),
     }
     started = run_node(runs, {
         'commands': services.commands(layout), 'binaries': str(binaries / 'bin'),
@@ -139,6 +142,12 @@ def cluster(
         yield Cluster(started.folder, layout, store)
     finally:
         started.stop()
+
+
+def running_cluster(folder: Path) -> Cluster:
+    """Return the cluster that another process runs, see ``python -m fogros2.testing.cluster``."""
+    own = json.loads((folder / _OWN).read_text())
+    return Cluster(folder, services.Layout(**own['layout']), Path(own['images']))
 
 
 def free_network() -> ipaddress.IPv4Network:

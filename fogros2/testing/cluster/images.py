@@ -21,6 +21,7 @@ import platform
 import tarfile
 import tempfile
 import threading
+import time
 from typing import Any, Optional
 
 from fogros2 import bootstrap, plan, process, wheels
@@ -312,7 +313,10 @@ def _remove(folder: Path) -> None:
 
 
 def _forget_old(cache: Path, prefix: str, *, keep: Path, number: int = 2) -> None:
-    """Remove all but the last used."""
+    """Remove all but the last used, and what was left half made."""
+    for path in cache.glob('new-*'):
+        if time.time() - path.stat().st_mtime > 3600:
+            _remove(path)
     others = [path for path in cache.glob(f'{prefix}*') if path != keep]
     for path in sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
         _remove(path)

@@ -154,10 +154,9 @@ def network(layout: Layout) -> dict[str, Any]:
     """Return the pods' network: a bridge; what leaves it has the node's address."""
     return {
         'cniVersion': '0.4.0', 'name': 'pods', 'plugins': [
-            {'type': 'bridge', 'bridge': 'pods', 'isGateway': True, 'ipMasq': True,
-             'hairpinMode': True,
-             'ipam': {'type': 'host-local', 'ranges': [[{'subnet': layout.pods}]],
-                      'routes': [{'dst': '0.0.0.0/0'}]}},
+            {'type': 'bridge', 'bridge': 'pods', 'isDefaultGateway': True,
+             'ipMasq': True, 'hairpinMode': True,
+             'ipam': {'type': 'host-local', 'ranges': [[{'subnet': layout.pods}]]}},
             {'type': 'portmap', 'capabilities': {'portMappings': True}},
         ]}
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import contextlib
 import dataclasses
 import os
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, Optional
 
 import pytest
 
-from fogros2.testing.cluster import Client, Cluster, cluster
+from fogros2.testing.cluster import Client, Cluster, cluster, running_cluster
 from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,7 +43,10 @@ def binaries(root: None) -> Path:
 
 @pytest.fixture(scope='session')
 def kubernetes(binaries: Path) -> Iterator[Cluster]:
-    """Return a cluster of this run's own."""
+    """Return a cluster of this run's own, or the one that FOGROS2_CLUSTER names."""
+    if folder := os.environ.get('FOGROS2_CLUSTER'):
+        yield running_cluster(Path(folder))
+        return
     pytest.importorskip('kubernetes', reason="needs the client: pip install 'fogros2[kubernetes]'")
     with cluster(binaries.parent, binaries) as running:
         yield running
@@ -99,11 +103,9 @@ def role(text: str, namespace: str) -> dict[str, Any]:
     return dict(found)
 
 
-@pytest.fixture
-def namespaces(
-    kubernetes: Cluster, client: Client,
-) -> Iterator[Callable[..., Namespace]]:
-    """Return what makes a namespace in which a user has the sample role, if a changed one."""
+@contextlib.contextmanager
+def making_namespaces(kubernetes: Cluster, client: Client) -> Iterator[Callable[..., Namespace]]:
+    """Yield what makes a namespace in which a user has the sample role, or a changed one."""
     made: list[str] = []
 
     def make(
@@ -128,9 +130,27 @@ def namespaces(
             timeout=30.0, what="the namespace's service account")
         return Namespace(name, client, kubernetes.kubeconfig_of(user, name))
 
-    yield make
-    for name in made:
-        client.ask('DELETE', f'/api/v1/namespaces/{name}')
+    try:
+        yield make
+    finally:
+        for name in made:
+            client.ask('DELETE', f'/api/v1/namespaces/{name}')
+
+
+@pytest.fixture
+def namespaces(kubernetes: Cluster, client: Client) -> Iterator[Callable[..., Namespace]]:
+    """Return what makes a namespace, gone after the test."""
+    with making_namespaces(kubernetes, client) as make:
+        yield make
+
+
+@pytest.fixture(scope='module')
+def namespaces_of_module(
+    kubernetes: Cluster, client: Client,
+) -> Iterator[Callable[..., Namespace]]:
+    """Return what makes a namespace, gone after the module."""
+    with making_namespaces(kubernetes, client) as make:
+        yield make
 
 
 @pytest.fixture

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every provider and every shell has to do, by pods of a real cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import threading
+
+import pytest
+
+from fogros2 import kubernetes_api
+from fogros2.errors import PrerequisiteError, ProviderError, ShellError
+from fogros2.model import Command, MachineSpec
+from fogros2.provider.kubernetes import KubernetesProvider
+from fogros2.shell.kubernetes import KubernetesShell
+from fogros2.testing import ProviderContract, request_for, ShellContract
+from fogros2.testing.cluster import BARE
+from fogros2.testing.shell_contract import raised
+from fogros2.waiting import wait_until
+
+
+@pytest.fixture(scope='module')
+def place(namespaces_of_module):
+    """Yield a namespace in which the robot has the sample role."""
+    found = namespaces_of_module()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('KUBECONFIG', str(found.kubeconfig))
+        yield found
+
+
+def run(name, **options):
+    """Bring a machine up and return its provider, its id and itself."""
+    provider = KubernetesProvider()
+    spec = MachineSpec(name, provider.name, {'container_image': BARE, **options})
+    provider.check(spec)
+    machine_id = provider.create(spec, request_for(spec))
+    try:
+        return provider, machine_id, provider.reachable(
+            machine_id, name=name, timeout=60.0, cancel=threading.Event())
+    except BaseException:
+        provider.destroy(machine_id)
+        raise
+
+
+def left(place, name):
+    """Return what there is of a machine."""
+    return [line for line in place.left() if f'fogros2-{name}' in line]
+
+
+class TestProvider(ProviderContract):
+
+    @pytest.fixture(autouse=True)
+    def in_a_namespace(self, place):
+        pass
+
+    def make(self):
+        return KubernetesProvider(), {'container_image': BARE}
+
+
+@pytest.fixture(scope='module')
+def pod(place):
+    """Yield a machine that runs."""
+    provider, machine_id, machine = run('shells')
+    yield machine
+    provider.destroy(machine_id)
+
+
+class TestShell(ShellContract):
+
+    @pytest.fixture(autouse=True)
+    def in_a_pod(self, pod):
+        self.pod = pod
+
+    def make(self, folder):
+        shell = KubernetesShell(self.pod.shell, name='shells')
+        there = f'/tmp/{secrets.token_hex(4)}'
+        shell.run(Command(('mkdir', there)), timeout=30.0)
+        return shell, there
+
+
+def test_nodes_do_not_run_as_root(pod):
+    with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
+        assert shell.run(Command(('id', '-un')), timeout=30.0).stdout == 'fog\n'
+
+
+def test_a_pod_has_no_token_of_the_cluster_s(pod):
+    with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
+        found = shell.run(Command(('ls', '/var/run/secrets/kubernetes.io'), sudo=True),
+                          timeout=30.0, check=False)
+        assert found.returncode != 0
+
+
+def test_a_launch_asks_the_cluster_seldom(place):
+    """Everything a provider and a shell ask for a machine: the figure that is promised."""
+    api = kubernetes_api.connect()
+    before = api.calls
+    provider, machine_id, machine = run('counted')
+    try:
+        shell = KubernetesShell(machine.shell, name='counted')
+        with contextlib.closing(shell):
+            for _ in range(30):
+                shell.run(Command(('true',)), timeout=30.0)
+    finally:
+        provider.destroy(machine_id)
+    assert api.calls - before <= 15
+
+
+def test_a_pod_that_nobody_guards_ends_itself(place, monkeypatch):
+    monkeypatch.setattr('fogros2.provider.kubernetes.manifests.BOOT', 2.0)
+    provider = KubernetesProvider()
+    spec = MachineSpec('unguarded', provider.name, {'container_image': BARE}, robot_timeout=2.0)
+    machine_id = provider.create(spec, request_for(spec))
+    try:
+        wait_until(lambda: provider.describe(machine_id).state.value == 'stopping',
+                   timeout=30.0, what='the pod to end')
+    finally:
+        provider.destroy(machine_id)
+
+
+def test_an_agent_s_word_ends_the_pod(place):
+    provider, machine_id, machine = run('ended')
+    try:
+        with contextlib.closing(KubernetesShell(machine.shell, name='ended')) as shell:
+            # the connection goes with the pod
+            raised(ShellError, lambda: shell.run(
+                Command((*machine.end_command[:2], f'{machine.end_command[2]}; exec sleep 30'),
+                        sudo=True), timeout=30.0))
+        wait_until(lambda: provider.describe(machine_id).state.value == 'stopping',
+                   timeout=30.0, what='the pod to end')
+    finally:
+        provider.destroy(machine_id)
+
+
+@pytest.mark.parametrize('options, told, hint', [
+    ({'gpus': 1}, 'FailedScheduling: 0/1 nodes are available: 1 Insufficient nvidia.com/gpu',
+     'device plugin'),
+    ({'container_image': 'fogros2.test/nothing:here'}, 'ErrImagePull', ''),
+    ({'container_image': 'Fogros2.test/A B'}, "can't be", 'such as')])
+def test_what_can_not_run_is_told_with_the_event_s_text(place, monkeypatch, options, told, hint):
+    monkeypatch.setattr('fogros2.provider.kubernetes.start.PATIENCE', 3.0)
+    error = raised(RuntimeError, lambda: run('hopeless', **options))
+    assert told in str(error)
+    assert hint in error.hint
+    assert left(place, 'hopeless') == []
+
+
+def test_a_quota_that_is_used_up_is_told(place, client):
+    base = f'/api/v1/namespaces/{place.name}/resourcequotas'
+    client.create(base, 'v1 ResourceQuota', 'none', spec={'hard': {'pods': '0'}})
+    try:
+        wait_until(lambda: 'status' in client.ask('GET', f'{base}/none') and client.ask(
+            'GET', f'{base}/none')['status'].get('hard'), timeout=20.0, what='the quota')
+        error = raised(ProviderError, lambda: run('poor'))
+    finally:
+        client.ask('DELETE', f'{base}/none')
+    assert 'exceeded quota: none' in str(error)
+    assert 'quota' in error.hint
+    assert left(place, 'poor') == []
+
+
+@pytest.mark.parametrize('resource, verb', [
+    ('jobs', 'create'), ('jobs', 'delete'), ('pods/exec', 'create'), ('pods', 'watch')])
+def test_a_right_that_lacks_is_named_before_anything_is_made(
+        namespaces, monkeypatch, resource, verb):
+    def change(role):
+        rule, = (rule for rule in role['rules'] if rule['resources'] == [resource])
+        rule['verbs'] = [each for each in rule['verbs'] if each != verb]
+
+    place = namespaces(change)
+    monkeypatch.setenv('KUBECONFIG', str(place.kubeconfig))
+    error = raised(PrerequisiteError, lambda: run('forbidden'))
+    assert f'may not {verb} {resource}' in str(error)
+    assert 'role.yaml' in error.hint
+    assert place.left() == []

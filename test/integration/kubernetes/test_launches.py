@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 launch`` with pods of a real cluster as machines, until nothing of them is left."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import shutil
+import time
+import uuid
+
+import pytest
+
+from fogros2.testing.cluster import READY
+from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
+
+
+def no_embedded() -> bool:
+    return not list(importlib.metadata.distributions(name='ros2-embedded'))
+
+
+pytestmark = [
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+    pytest.mark.skipif(no_embedded(), reason='this robot runs ROS 2, and its pods would need an '
+                       'image with ROS 2: none can be made from what this computer has'),
+]
+
+#: Seconds after its end for which a Job stays, by its ttlSecondsAfterFinished.
+TTL = 60
+
+HEADER = """
+from fogros2 import CloudNode, FogROSLaunchDescription, KubeInstance
+from launch_ros.actions import Node
+
+
+def pod(name, **more):
+    return KubeInstance(name=name, container_image='{image}', **more)
+
+
+def talker(machine, **more):
+    return CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                     output='screen', **more)
+
+
+def listener(**more):
+    return Node(package='fogros2_examples', executable='listener', output='screen', **more)
+
+
+def generate_launch_description():
+    return FogROSLaunchDescription([
+"""
+
+
+@pytest.fixture(autouse=True)
+def logs(tmp_path, monkeypatch):
+    """Keep what launch logs out of the user's home."""
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+
+
+@pytest.fixture
+def launch(tmp_path):
+    """Return what starts a launch of some entities, written as in a launch file."""
+    with launching() as start:
+        def run(*entities: str, **launched):
+            path = tmp_path / f'{uuid.uuid4().hex[:6]}.launch.py'
+            lines = ''.join(f'        {entity},\n' for entity in entities)
+            path.write_text(f"{HEADER.replace('{image}', READY)}{lines}    ])\n")
+            return start(str(path), **launched)
+
+        yield run
+
+
+def clean(run):
+    """Return whether it said nothing that would worry anybody, but for a Ctrl-C."""
+    warnings = [line for line in run.said if 'WARNING' in line and 'ctrl-c' not in line]
+    return run.errors == warnings == [] and 'Traceback' not in run.text
+
+
+@pytest.fixture(scope='module')
+def killed(kubernetes, namespaces_of_module, tmp_path_factory):
+    """Return the namespace of a robot that was killed while its pod was talking, and when."""
+    space = namespaces_of_module()
+    folder = tmp_path_factory.mktemp('killed')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('KUBECONFIG', str(space.kubeconfig))
+        patch.setenv('FOGROS2_STATE_HOME', str(folder / 'state'))
+        patch.setenv('ROS_LOG_DIR', str(folder / 'log'))
+        path = folder / 'killed.launch.py'
+        path.write_text(
+            HEADER.replace('{image}', READY)
+            + "        talker(pod('killed', robot_timeout=3)), listener()])\n")
+        with launching() as start:
+            run = start(str(path))
+            run.wait_for('I heard')
+            run.kill()
+        when = time.monotonic()
+        yield space, when
+        # what the robot itself keeps is the next launch's, or this, to take away
+        assert ros2('fog', 'gc').returncode == 0
+
+
+def test_a_killed_robot_s_pod_ends_itself(killed):
+    space, _ = killed
+    assert space.all('services')
+
+    def ended():
+        return [pod['status']['phase'] for pod in space.all('pods')] in ([], ['Succeeded'])
+
+    wait_until(ended, timeout=30.0, what='the pod to end')
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_the_example(namespace):
+    with launching() as start:
+        run = start('fogros2_examples', 'talker.kube.launch.py', 'name:=planner',
+                    f'image:={READY}', 'count:=2')
+        assert run.ended() == 0, run.text
+    assert run.text.count('I heard: [Hello World from planner ') >= 2
+    assert clean(run), run.text
+    assert 'node_port' in run.text, f'it says which way UDP took: {run.text}'
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
+    run = launch(
+        "talker(pod('dialler', expose='pod_dials_robot', "
+        f"robot_host='{kubernetes.layout.host}'))", 'listener()')
+    run.wait_for('I heard: [Hello World from dialler ', times=2)
+    assert namespace.all('services') == []
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_two_pods_talk_to_each_other(launch, namespace):
+    run = launch(
+        "talker(pod('speaker'))",
+        "CloudNode(machine=pod('hearer'), package='fogros2_examples', executable='listener', "
+        "output='screen')", "listener(name='robot_listener')")
+    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2)
+    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
+    run = launch("talker(pod('victim'))", 'listener()')
+    run.wait_for('I heard')
+    (pod,) = namespace.all('pods')
+    namespace.client.ask(
+        'DELETE', f"/api/v1/namespaces/{namespace.name}/pods/{pod['metadata']['name']}",
+        gracePeriodSeconds='0')
+    assert run.ended() != 0, run.text
+    assert any("'victim'" in line for line in run.errors), run.text
+    namespace.gone()
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_nodes_of_an_evicted_pod_go_on_on_the_robot(launch, namespace):
+    run = launch("talker(pod('evicted', on_interrupt='robot'))", 'listener()')
+    run.wait_for('I heard: [Hello World from evicted ')
+    (pod,) = namespace.all('pods')
+    name = pod['metadata']['name']
+    namespace.client.create(
+        f'/api/v1/namespaces/{namespace.name}/pods/{name}/eviction', 'policy/v1beta1 Eviction',
+        name)
+    wait_until(
+        lambda: any('I heard' in line and 'from evicted ' not in line for line in run.said),
+        timeout=60.0, what=f'the robot to talk itself: {run.text}')
+    # its time is up sooner here than it would be there
+    namespace.client.ask(
+        'DELETE', f'/api/v1/namespaces/{namespace.name}/pods/{name}', gracePeriodSeconds='0')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    namespace.gone()
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_an_api_server_that_restarts_is_waited_for(launch, namespace, kubernetes):
+    run = launch("talker(pod('patient'))", 'listener()')
+    wait_until(lambda: namespace.all('jobs') or None, timeout=60.0, what='the Job')
+    kubernetes.stop('kube-apiserver')
+    kubernetes.start('kube-apiserver')
+    run.wait_for('I heard: [Hello World from patient ')
+    kubernetes.stop('kube-apiserver')
+    before = run.text.count('I heard')
+    run.wait_for('I heard', times=before + 5, timeout=20.0)
+    kubernetes.start('kube-apiserver')
+    # the agent's events come again
+    before = run.text.count('[talker-')
+    run.wait_for('[talker-', times=before + 5)
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_a_kept_pod_is_a_warm_start(launch, namespace):
+    entities = ("talker(pod('warm', on_exit='keep'))", 'listener()')
+    pods = []
+    for _ in range(2):
+        run = launch(*entities)
+        run.wait_for('I heard')
+        run.interrupt()
+        assert run.ended() == 0, run.text
+        assert clean(run), run.text
+        pods += [pod['metadata']['uid'] for pod in namespace.all('pods')]
+    assert len(pods) == 2 and len({*pods}) == 1, "the second launch took the first one's pod"
+    listed = ros2('fog', 'list')
+    assert 'warm' in listed.stdout and namespace.name in listed.stdout, listed
+    deleted = ros2('fog', 'delete', 'warm', '--yes')
+    assert deleted.returncode == 0, deleted
+    assert namespace.left() == []
+
+
+@pytest.mark.soak
+@pytest.mark.usefixtures('nothing_left')
+def test_twenty_pods_of_one_launch(launch, namespace):
+    run = launch(*(f"talker(pod('many-{n}'), namespace='n{n}')" for n in range(20)),
+                 *(f"listener(namespace='n{n}')" for n in (0, 19)))
+    for number in (0, 19):
+        run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=240.0)
+    run.wait_for('[talker-', times=20)
+    assert len(namespace.all('pods')) == 20
+    run.interrupt()
+    assert run.ended(120.0) == 0, run.text
+    assert namespace.left() == []
+
+
+def test_a_killed_robot_s_pod_and_services_are_gone_by_their_deadline(killed):
+    space, when = killed
+    space.gone(timeout=max(5.0, when + 30.0 + TTL + 15.0 - time.monotonic()))
