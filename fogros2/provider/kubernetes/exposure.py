@@ -60,8 +60,7 @@ class Exposure:
 
     def words(self) -> str:
         """Return which way was taken and why, for people."""
-        kind = self.kind.replace('_', ' ')
-        return f'UDP by {kind}: {self.why}' if self.why else f'UDP by {kind}'
+        return f'UDP by {self.kind}: {self.why}' if self.why else f'UDP by {self.kind}'
 
     @classmethod
     def parse(cls, text: str) -> Optional[Exposure]:
