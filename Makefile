@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video test lint bench soak clean
+.PHONY: help setup demo demo-video test test-kubernetes lint bench soak clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -18,6 +18,12 @@ demo-video:
 test:
 	@tools/setup.sh test
 	@tools/test.sh $(ARGS)
+
+## test-kubernetes   the tests with a real Kubernetes cluster, built first if it isn't there
+test-kubernetes:
+	@tools/setup.sh test
+	@tools/kubernetes.sh >/dev/null
+	@tools/test.sh test/integration/kubernetes $(ARGS)
 
 ## lint   ruff and mypy
 lint:

@@ -55,12 +55,27 @@ why_not() {
         echo "a cluster takes root, or sudo without a question"
     elif ! have apt-get || ! have dpkg; then
         echo "this computer has no apt, and Kubernetes is built from Debian's source package"
-    elif [ -z "${HOME:-}${XDG_CACHE_HOME:-}" ]; then
+    elif [ -z "${XDG_CACHE_HOME:-}${HOME:-}" ]; then
         echo "there is no cache folder: neither HOME nor XDG_CACHE_HOME is set"
-    elif ! [ -d "$(folder)" ] && ! known_source; then
+    elif ! as_root unshare --fork --pid --mount --net --ipc --uts true 2>/dev/null; then
+        echo "root may make no namespaces here, as in a container without privileges"
+    elif ! as_root sh -c 'for tree in /sys/fs/cgroup /sys/fs/cgroup/memory; do
+            mkdir "$tree/fogros2-probe" 2>/dev/null && rmdir "$tree/fogros2-probe" && exit 0
+            done; exit 1'; then
+        echo "root may make no control groups here, as in a container without privileges"
+    elif [ -d "$(folder)" ]; then
+        :
+    elif [ "$(free_gb)" -lt 8 ]; then
+        echo "building it takes 8 GB of disk, and $(free_gb) are free in $cache" \
+             "(XDG_CACHE_HOME names another place)"
+    elif ! known_source; then
         echo "$(. /etc/os-release; echo "${PRETTY_NAME:-this system}") has no source package" \
-             "'kubernetes' (Debian 12 has one)"
+             "'kubernetes', or can't be asked for it (Debian 12 has one)"
     fi
+}
+free_gb() {
+    mkdir -p "$cache"
+    df -P -k "$cache" | awk 'NR == 2 { print int($4 / 1048576) }'
 }
 
 # --- apt, with source packages, in a configuration of our own -----------------------------------
@@ -160,9 +175,6 @@ if ! [ -d "$target" ]; then
     trap 'chmod -R u+w "$work" 2>/dev/null; rm -rf "$work"' EXIT
     trap 'exit 130' INT
     trap 'exit 143' TERM HUP
-    free=$(df -P -k "$cache" | awk 'NR == 2 { print int($4 / 1048576) }')
-    [ "$free" -ge 8 ] || fail "Kubernetes: 8 GB of disk are needed to build it, $free are free" \
-        "in $cache; XDG_CACHE_HOME names another place."
     apt_sources "$work/apt"
     quiet 'read the list of source packages' apt_with_sources "$work/apt" update
     mkdir "$work/source"

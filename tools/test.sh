@@ -12,6 +12,18 @@ status=0
 unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE \
     ROS_STATIC_PEERS ROS_LOCALHOST_ONLY FOGROS2_STATE_HOME
 
+# The cluster of the Kubernetes tests: minutes the first time. Those who name their tests don't wait
+# for it, and where it can't be built those tests are skipped.
+if [ $# = 0 ]; then
+    FOGROS2_NO_KUBERNETES=$(tools/kubernetes.sh --why-not)
+    if [ -n "$FOGROS2_NO_KUBERNETES" ]; then
+        say "No Kubernetes for the tests: $FOGROS2_NO_KUBERNETES"
+        export FOGROS2_NO_KUBERNETES
+    elif ! tools/kubernetes.sh >/dev/null; then
+        status=1
+    fi
+fi
+
 suite() {
     name=$1; shift
     say "Tests on $name"
