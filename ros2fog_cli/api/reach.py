@@ -195,9 +195,11 @@ def follow(
     Hand the agent's events to ``show`` from the first on, until the last or for ever.
 
     Returns False if the agent vanished meanwhile; a Ctrl-C is the way out of for ever.
+
+    :raises BrokenPipeError: nobody reads what is shown any more.
     """
     last = int(client.request('status')['next']) - 1
-    over, absent = threading.Event(), threading.Event()
+    over, absent, unheard = threading.Event(), threading.Event(), threading.Event()
 
     def take(event: dict[str, Any]) -> None:
         if event.get('event') == 'connection':
@@ -205,7 +207,11 @@ def follow(
                 absent.set()
                 over.set()
             return
-        show(event)
+        try:
+            show(event)
+        except BrokenPipeError:
+            unheard.set()  # as behind `| head`
+            over.set()
         if not forever and int(event.get('seq', 0)) >= last:
             over.set()
 
@@ -215,7 +221,17 @@ def follow(
     while not over.wait(0.5 if forever else 30.0):
         if not forever:
             return False
+    if unheard.is_set():
+        raise BrokenPipeError
     return not absent.is_set()
+
+
+def hush() -> None:
+    """Let what is still to be printed go nowhere: the interpreter's end would complain again."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for target in (1, 2):
+        os.dup2(nowhere, target)
+    os.close(nowhere)
 
 
 def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:

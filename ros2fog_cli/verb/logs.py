@@ -31,6 +31,9 @@ class LogsVerb(VerbExtension):
                     client, lambda event: show(event, args.node), forever=args.follow)
             except KeyboardInterrupt:
                 return 0
+            except BrokenPipeError:
+                reach.hush()
+                return 0
             finally:
                 client.close()
         if not there:

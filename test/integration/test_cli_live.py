@@ -118,6 +118,11 @@ def test_logs_follow_until_interrupted(
     assert follower.poll() is None
     follower.send_signal(signal.SIGINT)
     assert follower.wait(20) in (0, signal.SIGINT, -signal.SIGINT)
+    # a reader that has seen enough ends it as well, without a traceback
+    fog_words = ' '.join(f"'{word}'" for word in [*ROS2, 'fog', 'logs', name, '-f'])
+    enough = subprocess.run(['sh', '-c', f'{fog_words} 2>&1 | head -n 2'], capture_output=True,
+                            text=True, timeout=60)
+    assert len(enough.stdout.splitlines()) == 2 and enough.stderr == ''
 
 
 def test_another_terminal_joins(
