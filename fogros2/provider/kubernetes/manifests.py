@@ -65,7 +65,7 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
     """Return what the pod runs, with no right beyond NET_ADMIN and no token of the cluster's."""
     port = 0 if options.expose in ('pod_dials_robot', 'pod_ip') else request.vpn_port
     container: dict[str, Any] = {
-        'name': names.CONTAINER, 'image': options.container_image,
+        'name': names.CONTAINER, 'image': image_for(options, request.dependencies),
         'imagePullPolicy': 'IfNotPresent',
         'command': boot.arguments(
             options.user, max(BOOT, spec.robot_timeout), port, word(request.token), LISTEN),
@@ -96,6 +96,11 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
     if options.zone:
         found['affinity'] = _preferring(options.zone)
     return found
+
+
+def image_for(options: Options, dependencies: str) -> str:
+    """Return the pod's image; ``{dependencies}`` in its name stands for what a launch needs."""
+    return options.container_image.replace('{dependencies}', dependencies or 'latest')
 
 
 def _resources(options: Options) -> dict[str, str]:

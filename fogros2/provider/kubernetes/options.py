@@ -24,7 +24,8 @@ class Options:
     """
     What a launch file may ask of a pod.
 
-    :param container_image: has Python 3.10 and ``sh`` at least.
+    :param container_image: has Python 3.10 and ``sh`` at least; ``{dependencies}`` in it stands
+        for the hash of what the launch needs, the tag that ``image.recipe`` gives.
     :param namespace: '' for the context's own.
     :param context: of the kubeconfig; '' for the current one.
     :param zone: the pod runs there if it can.

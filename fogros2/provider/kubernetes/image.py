@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Images for pods: a pod's disk can't be kept, so the image that saves installing is built here.
+
+``recipe`` decides, by value; ``write`` and ``build`` act. The tag is the hash of what is in it, so
+a launch file that names ``container_image='REGISTRY/fogros2:{dependencies}'`` takes the one that
+fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import dataclasses
+import os
+from pathlib import Path
+import re
+import threading
+from typing import Optional
+from xml.sax.saxutils import escape
+
+from fogros2 import process
+from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, ProviderError
+from fogros2.model import Command
+from fogros2.provider.kubernetes.boot import UID
+from fogros2.provider.kubernetes.options import IMAGE
+
+#: Programs that build and push images, in the order in which they are looked for.
+ENGINES = ('podman', 'docker', 'buildah')
+NAME = 'fogros2'
+CONTAINERFILE = 'Containerfile'
+MANIFEST = 'package.xml'
+
+_REGISTRY = re.compile(r'[a-z0-9][a-z0-9.-]*(:[0-9]+)?(/[a-z0-9._-]+)*')
+_WORD = re.compile(r'[A-Za-z0-9][A-Za-z0-9.+:_-]*')
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """
+    How an image is built.
+
+    :param reference: its name, registry and tag included.
+    :param files: texts by name, the Containerfile among them: all that goes into the build.
+    """
+
+    reference: str
+    files: tuple[tuple[str, str], ...]
+
+
+def recipe(
+    registry: str, *, dependencies: str, packages: Sequence[str], keys: Sequence[str] = (),
+    base: str = IMAGE, user: str = 'fog', distro: str = 'jazzy',
+) -> Recipe:
+    """
+    Return how to build the image for a robot's machines.
+
+    :param registry: where it goes, such as 'registry.example/robots'.
+    :param dependencies: hash of what is in it, its tag.
+    :param packages: for apt.
+    :param keys: for rosdep: what the workspace's packages depend on.
+    :param base: image to begin with.
+    :param user: the login user; see the option of this name.
+    :raises ConfigurationError: a value can't be what it should.
+    """
+    if not _REGISTRY.fullmatch(registry):
+        raise ConfigurationError(f"'{registry}' can't be a registry",
+                                 "such as 'registry.example/robots' or 'localhost:5000'")
+    for word in (*packages, *keys, dependencies, user, distro):
+        if not _WORD.fullmatch(word):
+            raise ConfigurationError(f"'{word}' can't be part of an image's recipe")
+    if not base or base.startswith('-') or any(c.isspace() for c in base):
+        raise ConfigurationError(f"'{base}' can't be the image to begin with")
+    files = [(CONTAINERFILE, _containerfile(dependencies, packages, keys, base, user, distro))]
+    if keys:
+        files.append((MANIFEST, _manifest(keys)))
+    return Recipe(f'{registry}/{NAME}:{dependencies}', tuple(files))
+
+
+def _containerfile(
+    dependencies: str, packages: Sequence[str], keys: Sequence[str], base: str, user: str,
+    distro: str,
+) -> str:
+    lines = ['# what a robot installs on a machine otherwise, at each launch', f'FROM {base}',
+             'USER root', f'LABEL fogros2-dependencies={dependencies}']
+    if packages:
+        listed = ' \\\n        '.join(sorted(set(packages)))
+        lines.append(
+            'RUN apt-get update \\\n'
+            '    && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends \\\n'
+            f'        {listed} \\\n'
+            '    && rm -rf /var/lib/apt/lists/*')
+    if keys:
+        lines += [
+            f'COPY {MANIFEST} /tmp/fogros2/{MANIFEST}',
+            'RUN apt-get update \\\n'
+            '    && { [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || rosdep init; } \\\n'
+            f'    && rosdep update --rosdistro {distro} \\\n'
+            f'    && DEBIAN_FRONTEND=noninteractive rosdep install --rosdistro {distro} \\\n'
+            '        --from-paths /tmp/fogros2 --ignore-src -y \\\n'
+            '    && rm -rf /tmp/fogros2 /var/lib/apt/lists/*']
+    if user != 'root':
+        # here already, so that the first launch needn't make it
+        lines.append(f'RUN grep -q "^{user}:" /etc/passwd || useradd -m -u {UID} {user}')
+    return '\n'.join(lines) + '\n'
+
+
+def _manifest(keys: Sequence[str]) -> str:
+    """Return a package that depends on what the workspace does, for rosdep to read."""
+    depends = '\n'.join(f'  <depend>{escape(key)}</depend>' for key in sorted(set(keys)))
+    return ('<?xml version="1.0"?>\n<package format="3">\n  <name>fogros2_machine</name>\n'
+            "  <version>0.0.0</version>\n  <description>A workspace's needs</description>\n"
+            '  <maintainer email="robot@localhost">robot</maintainer>\n'
+            f'  <license>Apache-2.0</license>\n{depends}\n</package>\n')
+
+
+def write(what: Recipe, folder: Path) -> Path:
+    """
+    Write a recipe's files, and return the Containerfile's path.
+
+    :raises PrerequisiteError: they can't be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in what.files:
+            (folder / name).write_text(text)
+    except OSError as error:
+        raise PrerequisiteError(f'{folder} can not be written: {error.strerror}') from error
+    return folder / CONTAINERFILE
+
+
+def engine(wanted: str = 'auto') -> str:
+    """
+    Return the program that builds images here.
+
+    :param wanted: one of ``ENGINES``, or 'auto' for the first that is there.
+    :raises ConfigurationError: there is none of this name.
+    :raises PrerequisiteError: it isn't installed.
+    """
+    if wanted not in ('auto', *ENGINES):
+        raise ConfigurationError(f"'{wanted}' builds no images",
+                                 f"there are: {', '.join(ENGINES)}")
+    for name in ENGINES if wanted == 'auto' else (wanted,):
+        if process.which(name):
+            return name
+    names = ', '.join(ENGINES) if wanted == 'auto' else wanted
+    raise PrerequisiteError(f'{names} not found on this computer',
+                            f'sudo apt-get install {ENGINES[0] if wanted == "auto" else wanted}')
+
+
+def commands(what: Recipe, folder: Path, program: str, *, push: bool = True) -> list[Command]:
+    """Return what builds an image and, with ``push``, sends it to its registry."""
+    file = str(folder / CONTAINERFILE)
+    # podman and docker share their words, buildah has the same but for a 'from' of its own
+    build = Command((program, 'build', '-t', what.reference, '-f', file, str(folder)),
+                    what=f'building {what.reference}')
+    if not push:
+        return [build]
+    return [build, Command((program, 'push', what.reference), what=f'pushing {what.reference}')]
+
+
+def build(
+    what: Recipe, folder: Path, *, program: str, push: bool = True, timeout: float = 3600.0,
+    cancel: Optional[threading.Event] = None,
+    on_output: Optional[Callable[[str], None]] = None,
+) -> str:
+    """
+    Write, build and push an image; return its reference, for ``container_image=``.
+
+    :param folder: for the Containerfile, which stays there to be read and changed.
+    :param program: what ``engine`` returned.
+    :param timeout: seconds each of the steps may take.
+    :param on_output: gets the lines that the program prints.
+    :raises ProviderError: it can't be built, or the registry doesn't take it.
+    """
+    write(what, folder)
+    for command in commands(what, folder, program, push=push):
+        try:
+            process.run(dataclasses.replace(command, environment=_login()), timeout=timeout,
+                        cancel=cancel, on_output=on_output)
+        except CommandError as error:
+            raise ProviderError(str(error.args[0]), _hint(error.result.stderr, what, program)) \
+                from error
+    return what.reference
+
+
+def _login() -> dict[str, str]:
+    """Return where the user's own logins to registries are; nothing is asked or kept here."""
+    return {name: os.environ[name] for name in ('REGISTRY_AUTH_FILE', 'DOCKER_CONFIG')
+            if os.environ.get(name)}
+
+
+def _hint(said: str, what: Recipe, program: str) -> str:
+    registry = what.reference.partition('/')[0]
+    text = said.lower()
+    if re.search(r'unauthorized|denied|authentication required|forbidden', text):
+        return f'{program} login {registry}'
+    if re.search(r'connection refused|no such host|timeout|network is unreachable|lookup ', text):
+        return f'is {registry} right, and reachable from here?'
+    if 'server gave http response' in text:
+        return f'{registry} speaks no TLS: let {program} know that it is an insecure registry'
+    if 'permission denied' in text:
+        return f'let this user use {program}, or run this as root'
+    return ''
