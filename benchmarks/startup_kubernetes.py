@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How long a launch with pods takes from ``ros2 launch`` to the first message, on a real cluster.
+
+The cluster is one node on this computer (``fogros2.testing.cluster``), whose image is there
+already and has the embedded default. Requests are counted from the API server's audit log, for a
+user who has the sample role and no other right.
+
+    python benchmarks/startup.py --provider kubernetes [--runs 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator
+import contextlib
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import tempfile
+import time
+import uuid
+
+from figures import Row, write
+
+from fogros2.testing.cluster import Client, Cluster, cluster, READY, running_cluster
+from fogros2.testing.cluster.namespaces import making_namespaces, Namespace
+from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
+
+ROOT = Path(__file__).resolve().parents[1]
+MANY = 20
+
+LAUNCH = """\
+from fogros2 import CloudNode, FogROSLaunchDescription, KubeInstance
+
+
+def generate_launch_description():
+    machines = [KubeInstance(name=f'bench-{{n}}', container_image='{image}')
+                for n in range({number})]
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen') for machine in machines])
+"""
+
+
+class Robot:
+    """A robot that may use one namespace of a cluster."""
+
+    def __init__(self, there: Cluster, space: Namespace, home: Path) -> None:
+        self._cluster = there
+        self._space = space
+        self._home = home
+        self.environment = {
+            **os.environ, 'KUBECONFIG': str(space.kubeconfig),
+            'FOGROS2_STATE_HOME': str(home / 'state'), 'ROS_LOG_DIR': str(home / 'log'),
+            'ROS_DOMAIN_ID': '87', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+    def talker(self, *words: str) -> tuple[float, Counter[str]]:
+        """
+        Launch the talker until the first message is heard.
+
+        :returns: seconds, and the requests to the API server, those of the end too.
+        """
+        before = len(self._cluster.requests('robot'))
+        with launching() as launch:
+            begin = time.perf_counter()
+            run = launch('fogros2_examples', 'talker.kube.launch.py', f'image:={READY}',
+                         'count:=1', *words, environment=self.environment)
+            run.wait_for('I heard: ', timeout=120.0)
+            total = time.perf_counter() - begin
+            if run.ended(120.0) != 0:
+                raise SystemExit(f'the launch failed:\n{run.text}')
+        asked = self._cluster.requests('robot')[before:]
+        return total, Counter(
+            f"{event['verb']} {event['objectRef']['resource']}" for event in asked
+            if 'objectRef' in event)
+
+    def machines(self, number: int) -> float:
+        """Return the seconds until the nodes of ``number`` machines run."""
+        path = self._home / f'many-{uuid.uuid4().hex}.launch.py'
+        path.write_text(LAUNCH.format(number=number, image=READY))
+        with launching() as launch:
+            begin = time.perf_counter()
+            run = launch(str(path), environment=self.environment)
+            run.wait_for('process started with pid', times=number, timeout=300.0)
+            total = time.perf_counter() - begin
+            run.interrupt()
+            if run.ended(120.0) != 0:
+                raise SystemExit(f'the launch failed:\n{run.text}')
+        self.settled()
+        return total
+
+    def delete(self, name: str) -> None:
+        """Delete a machine that was kept."""
+        done = ros2('fog', 'delete', '--yes', name, environment=self.environment)
+        if done.returncode != 0:
+            raise SystemExit(f'ros2 fog delete failed:\n{done.stdout}{done.stderr}')
+        self.settled()
+
+    def settled(self) -> None:
+        """Wait until nothing of the launches before is left to do for the cluster."""
+        wait_until(lambda: not self._space.left() or None, timeout=120.0,
+                   what='the namespace to be empty')
+
+
+def rows(here: Robot, runs: int) -> Iterator[Row]:
+    """Yield the figures."""
+    here.talker()  # the first one of a cluster reads files that nobody has read
+    fresh = [here.talker() for _ in range(runs)]
+    yield Row('a new pod: to the first message', statistics.median(t for t, _ in fresh), 's', 5.0,
+              runs=runs, published='27 s (GCP: 29 s)')
+    here.talker('name:=kept', 'on_exit:=keep')
+    kept = [here.talker('name:=kept', 'on_exit:=keep') for _ in range(runs)]
+    here.delete('kept')
+    yield Row('a kept pod: to the first message', statistics.median(t for t, _ in kept), 's', 2.0,
+              runs=runs)
+    calls = max((asked for _, asked in fresh), key=lambda asked: sum(asked.values()))
+    print('requests of a launch:', ', '.join(f'{n} {what}' for what, n in sorted(calls.items())))
+    yield Row('requests to the API server in a launch, at most', sum(calls.values()), 'requests',
+              15.0, runs=runs)
+    one = statistics.median(here.machines(1) for _ in range(runs))
+    many = statistics.median(here.machines(MANY) for _ in range(runs))
+    yield Row('1 pod: until its node runs', one, 's', runs=runs)
+    yield Row(f'{MANY} pods: until all nodes run', many, 's', runs=runs)
+    yield Row(f'{MANY} pods', many / one, 'times one', 4.0, runs=runs)
+
+
+@contextlib.contextmanager
+def robot() -> Iterator[Robot]:
+    """Yield a robot with a cluster: the one that FOGROS2_CLUSTER names, or one for this time."""
+    with contextlib.ExitStack() as stack:
+        if folder := os.environ.get('FOGROS2_CLUSTER'):
+            there = running_cluster(Path(folder))
+        else:
+            script = ROOT / 'tools' / 'kubernetes.sh'
+            reason = subprocess.check_output([script, '--why-not'], text=True).strip()
+            if reason:
+                raise SystemExit(f'no Kubernetes to measure: {reason}')
+            binaries = Path(subprocess.check_output([script], text=True).strip())
+            there = stack.enter_context(cluster(binaries.parent, binaries))
+        make = stack.enter_context(making_namespaces(
+            there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
+        home = stack.enter_context(tempfile.TemporaryDirectory())
+        yield Robot(there, make(), Path(home))
+
+
+def measure(runs: int) -> None:
+    """Take the figures and write them down."""
+    with robot() as here:
+        write('startup_kubernetes', 'From ros2 launch to the first message, a local cluster',
+              [*rows(here, runs)])
+
+
+def main() -> None:
+    """Take the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--runs', type=int, default=3)
+    measure(parser.parse_args().runs)
+
+
+if __name__ == '__main__':
+    main()
