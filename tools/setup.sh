@@ -226,6 +226,8 @@ prepare() {
         fi
         pip_in "$folder" install 'setuptools>=70.1' wheel
         [ "$now" = none ] && with= || with="[$now]"
+        # Debian 12's pip tries versions back to those without wheels, and gives up there
+        [ "$now" = none ] || pip_in "$folder" install 'pip>=24'
         pip_in "$folder" install --no-build-isolation "$@$with"
     else
         say "Sources changed: installing them into ${folder#"$PWD"/} again"
