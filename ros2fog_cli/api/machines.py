@@ -89,7 +89,9 @@ class Entry:
 
     @property
     def expires(self) -> Optional[float]:
-        """When its lifetime is over, in seconds since the epoch."""
+        """When its lifetime is over, in seconds since the epoch; a stopped one's begins anew."""
+        if self.machine is not None and self.machine.state is MachineState.STOPPED:
+            return None
         tag = self.machine.tags.get(TAG_EXPIRES, '') if self.machine is not None else ''
         known = [float(tag)] if tag.isdigit() else []
         record = self.record
@@ -289,5 +291,5 @@ def one(entries: Sequence[Entry], name: str) -> Entry:
     if len(own) > 1:
         places = ', '.join(f'{entry.provider} {entry.machine_id}' for entry in own)
         raise ConfigurationError(f"there are several machines '{name}': {places}",
-                                 'ros2 fog delete takes all of that name')
+                                 'ros2 fog list shows whose they are')
     return own[0]

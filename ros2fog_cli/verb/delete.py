@@ -24,7 +24,7 @@ class DeleteVerb(VerbExtension):
             '--force', action='store_true',
             help='also under a launch that runs, or when a computer or provider is out of reach')
         parser.add_argument('--any-robot', action='store_true',
-                            help="with 'all': other robots' machines too")
+                            help="also other robots' machines of that name, or with 'all'")
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete, and return 1 if something is still there."""
@@ -33,8 +33,9 @@ class DeleteVerb(VerbExtension):
         store = Store()
         name = None if args.name == 'all' else args.name
         entries = machines.survey(warn, name=name, regions=args.region, store=store)
-        if name is None and not args.any_robot:
-            others = [entry for entry in entries if not entry.own]
+        others = [entry for entry in entries if not entry.own]
+        # by its name, a machine can be ended from any computer, but one's own is meant first
+        if not args.any_robot and (name is None or len(others) < len(entries)):
             entries = [entry for entry in entries if entry.own]
             if others:
                 warn(f'{len(others)} of other robots left out (--any-robot takes them)')

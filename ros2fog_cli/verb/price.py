@@ -66,7 +66,7 @@ class PriceVerb(VerbExtension):
               _gpus(one.type.gpus, one.type.gpu, one.type.gpu_memory_gb), one.type.arch,
               one.type.cpu or table.NONE, table.cost(one.price), table.cost(one.spot_price))
              for one in shown], width=table.terminal_width(),
-            optional=('GPU', 'CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()))))
+            optional=('CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()), 'GPU')))
         left = len(choice.offers) - len(shown)
         if left:
             print(f"{left} more {'cost' if left > 1 else 'costs'} as much or more (--limit 0)")

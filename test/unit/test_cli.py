@@ -163,7 +163,7 @@ def test_list_shows_what_providers_and_the_store_know(
     assert ' running   ' in states['alive'] and '$0.0416  $0.01' in states['alive']
     assert 'eu-west-1  t3.medium' in states['alive']
     # what is stopped costs its disk alone; 10 minutes of the others
-    assert '$' not in states['idle']
+    assert '$' not in states['idle'] and 'min' not in states['idle'].split('198.51.100.7')[1]
     assert lines[-1] == '$1.2416 an hour, $0.21 so far, disks and traffic aside'
     assert '10 min' in states['alive'] and '60 min' in states['alive']
     assert 'unknown (record damaged)' in states['broken']
@@ -274,6 +274,18 @@ def test_delete_all_leaves_other_robots_alone(capsys: pytest.CaptureFixture[str]
     assert list(Memory.machines) == ['id-c']
     assert run('delete', 'all', '--yes', '--any-robot') == 0
     assert not Memory.machines
+
+
+def test_delete_by_name_takes_one_s_own_first(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a', 'ours')
+    machine('a', 'theirs', robot='somebody-7')
+    assert run('delete', 'a', '--yes') == 0
+    assert list(Memory.machines) == ['theirs']
+    assert '1 of other robots left out' in capsys.readouterr().err
+    # from any computer, where none of that name is its own
+    assert run('delete', 'a', '--yes') == 0
+    assert not Memory.machines
+    assert 'of the robot somebody-7' in capsys.readouterr().out
 
 
 def test_one_failure_stops_nothing_and_keeps_the_record(
