@@ -14,28 +14,24 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import difflib
-import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Event, EventHandler, LaunchContext
 from launch.actions import (
-    ExecuteLocal,
     OpaqueFunction,
     PopEnvironment,
     PushEnvironment,
     ResetEnvironment,
 )
 from launch.event_handlers import OnShutdown
-from launch.events.process import ShutdownProcess
 import launch.logging
 
-from fogros2.actions import cost, private, signals, streaming
-from fogros2.actions.carriers import Carrier
+from fogros2.actions import census, cost, interruption, private, signals, streaming
 from fogros2.actions.console import Console
 from fogros2.actions.interruption import MachineInterrupted
 from fogros2.actions.session import Session
-from fogros2.errors import Cancelled, ConfigurationError, FogError, ProviderError
+from fogros2.errors import Cancelled, ConfigurationError, FogError
 
 if TYPE_CHECKING:
     from fogros2.actions.machines import CloudInstance
@@ -67,17 +63,6 @@ class Failed(Event):
     def __init__(self, error: BaseException) -> None:
         super().__init__()
         self.error = error
-
-
-class _Census(ShutdownProcess):
-    """Asks every process action for itself; shuts none of them down."""
-
-    def __init__(self, found: list[ExecuteLocal]) -> None:
-        def note(action: ExecuteLocal) -> bool:
-            found.append(action)
-            return False  # not meant for this one
-
-        super().__init__(process_matcher=note)
 
 
 class Coordinator:
@@ -257,7 +242,7 @@ class Coordinator:
             kept.update(environment)
         # what the launch sets for the robot isn't the launch file's change, and doesn't travel
         self.base_environment.update(environment)
-        for action in self._processes():
+        for action in census.processes(self._context):
             details, ended = action.process_details, private.completed(action)
             if details is None or ended is None or ended.done():
                 continue
@@ -326,22 +311,10 @@ class Coordinator:
                 MachineInterrupted(session.spec.name, reason, session.lost))
 
     def _on_interrupted(self, context: LaunchContext) -> None:
-        event: MachineInterrupted = context.locals.event
-        session = self._sessions.get(event.machine)
-        if session is None or context.is_shutdown:
-            return
-        what = (f"the machine '{event.machine}' "
-                f'{"is gone" if event.lost else "is being taken away"}: {event.reason}')
-        if session.spec.on_interrupt == 'robot':
-            self._logger.warning(f'{what}; its nodes go on on the robot')
-            for carrier in self._streams.remove(event.machine):
-                context.emit_event_sync(ShutdownProcess(
-                    process_matcher=functools.partial(_carries, carrier)))
-            session.move_all()
-            return
-        if session.lost:
-            session.end_all()
-        raise ProviderError(what, "on_interrupt='robot' would have its nodes go on on the robot")
+        session = self._sessions.get(context.locals.event.machine)
+        if session is not None and not context.is_shutdown:
+            interruption.react(
+                context.locals.event, session, self._streams, context, self._logger)
 
     # -- going down -----------------------------------------------------------------------------
 
@@ -370,7 +343,7 @@ class Coordinator:
     async def _take_down(self) -> None:
         # the VPN's interface must not go from under a node that runs
         sessions = self._sessions.values()
-        futures = [private.completed(action) for action in self._processes()]
+        futures = [private.completed(action) for action in census.processes(self._context)]
         await _all_done({*futures, *(session.deployment for session in sessions)})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
@@ -385,27 +358,6 @@ class Coordinator:
         self._pool.shutdown(wait=False)
         self._restore_signals()
 
-    def _processes(self) -> list[ExecuteLocal]:
-        """
-        Return every process action that was executed, the robot's own too.
-
-        launch keeps no list of them, but each has a handler that asks an event's matcher about
-        the action; this one notes it and says no. Handled here and not by the event queue, so
-        that the answer is there at once.
-        """
-        found: list[ExecuteLocal] = []
-        census = _Census(found)
-        context = self._context
-        for handler in tuple(context._event_handlers):
-            if handler.matches(census):
-                context._push_locals()
-                entities = handler.handle(census, context)
-                for entity in entities if isinstance(entities, Iterable) else (entities,):
-                    if entity is not None:
-                        entity.visit(context)
-                context._pop_locals()
-        return found
-
     def _in_thread(self, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
         future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(
             self._pool, function, *args)
@@ -416,10 +368,6 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
     waits = {future for future in futures if future is not None}
     if waits:
         await asyncio.wait(waits)
-
-
-def _carries(node: str, action: ExecuteLocal) -> bool:
-    return isinstance(action, Carrier) and action.node == node
 
 
 def _nothing() -> None:

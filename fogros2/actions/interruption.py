@@ -1,9 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What launch files can learn of a machine that its provider takes away."""
+"""A machine that its provider takes away: what launch files learn of it, and what is done."""
 
 from __future__ import annotations
 
-from launch import Event
+import functools
+import logging
+from typing import TYPE_CHECKING
+
+from launch import Event, LaunchContext
+from launch.actions import ExecuteLocal
+from launch.events.process import ShutdownProcess
+
+from fogros2.actions.carriers import Carrier
+from fogros2.errors import ProviderError
+
+if TYPE_CHECKING:
+    from fogros2.actions.session import Session
+    from fogros2.actions.streaming import Streams
 
 
 class MachineInterrupted(Event):
@@ -28,3 +41,31 @@ class MachineInterrupted(Event):
         self.machine = machine
         self.reason = reason
         self.lost = lost
+
+
+def react(
+    event: MachineInterrupted, session: Session, streams: Streams, context: LaunchContext,
+    logger: logging.Logger,
+) -> None:
+    """
+    Do what the machine's ``on_interrupt`` says.
+
+    :param streams: of the launch; those of this machine end.
+    :raises ProviderError: to end the launch.
+    """
+    what = (f"the machine '{event.machine}' "
+            f'{"is gone" if event.lost else "is being taken away"}: {event.reason}')
+    if session.spec.on_interrupt == 'robot':
+        logger.warning(f'{what}; its nodes go on on the robot')
+        for node in streams.remove(event.machine):
+            context.emit_event_sync(
+                ShutdownProcess(process_matcher=functools.partial(_carries, node)))
+        session.move_all()
+        return
+    if event.lost:
+        session.end_all()
+    raise ProviderError(what, "on_interrupt='robot' would have its nodes go on on the robot")
+
+
+def _carries(node: str, action: ExecuteLocal) -> bool:
+    return isinstance(action, Carrier) and action.node == node

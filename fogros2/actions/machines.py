@@ -56,7 +56,9 @@ class CloudInstance:
     :param bootstrap: how ROS 2 gets there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine.
     :param on_interrupt: when the provider takes the machine away while its nodes run: 'shutdown'
-        ends the launch, with an exit status other than zero; 'robot' runs them on the robot.
+        ends the launch, with an exit status other than zero; 'robot' starts them anew on the
+        robot, which has to have their programs: with the same names and parameters, without
+        what they had in memory, a lifecycle state, or components that were loaded.
     :param options: the provider's own settings, for subclasses to give.
     :raises ConfigurationError: an unknown keyword (with the nearest one), or a wrong value.
     """
