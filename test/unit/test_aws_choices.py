@@ -17,7 +17,7 @@ from botocore.stub import ANY, Stubber
 import pytest
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError
-from fogros2.provider.aws import choices, prices
+from fogros2.provider.aws import choices, iam, prices
 from fogros2.provider.aws.choices import Wants
 from fogros2.provider.aws.prices import InstanceType, Market
 from fogros2.testing.fakes import FakeClock
@@ -333,6 +333,17 @@ def test_a_refusal_is_a_fog_error(recorded: Recorded, market: Market) -> None:
     recorded.error = 'UnauthorizedOperation'
     with pytest.raises(FogError, match='policy .* does not allow ec2:DescribeInstanceTypes'):
         market.types(REGION)
+
+
+def test_the_policy_allows_what_is_asked(recorded: Recorded, market: Market) -> None:
+    choices.choose([REGION], choices.wants(arch='x86_64'), market, spot_too=True)
+    asked = {f"{'pricing' if what == 'get_products' else 'ec2'}:{xform_back(what)}"
+             for _, what in recorded.asked}
+    assert len(asked) == 4 and asked <= set(iam.ACTIONS)
+
+
+def xform_back(operation: str) -> str:
+    return ''.join(word.capitalize() for word in operation.split('_'))
 
 
 def test_a_list_of_prices_that_can_not_be_read() -> None:

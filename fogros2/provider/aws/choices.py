@@ -191,11 +191,13 @@ def offers(
     :param spot_too: look for the spot prices even where they don't count.
     :raises FogError: AWS refused, or can't be reached.
     """
-    zones = market.zones(region)
-    kinds = [kind for kind in market.types(region) if fits(kind, asked) and kind.name in zones]
+    with ThreadPoolExecutor(3, f'fog-{region}') as pool:  # some ten pages each, one by one
+        asking = (pool.submit(market.zones, region), pool.submit(market.types, region),
+                  pool.submit(market.prices, region))
+        zones, types, prices = (asking[0].result(), asking[1].result(), asking[2].result())
+    kinds = [kind for kind in types if fits(kind, asked) and kind.name in zones]
     if not kinds:
         return []
-    prices = market.prices(region)
     spot = market.spot(region, [kind.name for kind in kinds]) if asked.spot or spot_too else {}
     found = [Offer(region, kind, prices.get(kind.name),
                    cheapest_zone(spot.get(kind.name, {}), zones[kind.name]),
