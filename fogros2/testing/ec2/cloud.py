@@ -8,8 +8,7 @@ this process, which serves one box and nothing else.
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import dataclasses
 import sys
 import threading
@@ -17,7 +16,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError
-from fogros2.testing.ec2 import cloud_config, computer, guest, metadata, network
+from fogros2.testing.ec2 import computer, guest, metadata, network, told
 from fogros2.testing.ec2.computer import Boot, Computer
 from fogros2.waiting import wait_until
 
@@ -191,10 +190,11 @@ class Cloud:
         self.net.attach(machine.space, machine.host)
         self.protect()
         service = metadata.MetadataService(
-            machine.space, lambda: self._metadata(machine),
+            machine.space,
+            lambda: told.values(instance, spot=machine.spot, notice=machine.notice),
             lambda: bool(instance.metadata_options.http_tokens == 'required'))
         try:
-            plan = self._plan(machine)
+            plan = told.plan(instance)
             machine.computer.start(Boot(
                 f'{network.PREFIX}{self.mark}{link}',
                 plan['hostname'] or f"ip-{private.replace('.', '-')}", machine.space, plan))
@@ -256,49 +256,6 @@ class Cloud:
         if machine.reason != BY_USER:
             instance._reason = text
 
-    # -- what it is told ------------------------------------------------------------------
-
-    def _plan(self, machine: Machine) -> Mapping[str, Any]:
-        instance = machine.instance
-        plan = dataclasses.asdict(cloud_config.parse(_user_data(instance)))
-        return {**plan, 'instance': instance.id, 'user': computer.USER,
-                'keys': self._public_keys(instance)}
-
-    def _public_keys(self, instance: Any) -> list[str]:
-        pair = instance.ec2_backend.key_pairs.get(instance.key_name)
-        if pair is None:
-            return []
-        material = pair.material_public
-        return [material.decode() if isinstance(material, bytes) else str(material)]
-
-    def _metadata(self, machine: Machine) -> dict[str, bytes]:
-        instance = machine.instance
-        values = {
-            'meta-data/instance-id': instance.id, 'meta-data/ami-id': instance.image_id,
-            'meta-data/instance-type': instance.instance_type,
-            'meta-data/hostname': instance.private_dns_name,
-            'meta-data/local-ipv4': instance.private_ip_address,
-            'meta-data/placement/availability-zone': str(instance.availability_zone),
-            'meta-data/placement/region': instance.region_name,
-            'meta-data/instance-life-cycle': 'spot' if machine.spot else 'on-demand',
-        }
-        if instance.public_ip:
-            values['meta-data/public-ipv4'] = instance.public_ip
-        for key in self._public_keys(instance):
-            values['meta-data/public-keys/0/openssh-key'] = key
-        if machine.notice:
-            values['meta-data/spot/instance-action'] = \
-                f'{{"action": "terminate", "time": "{machine.notice}"}}'
-            values['meta-data/spot/termination-time'] = machine.notice
-        if instance.metadata_options.instance_metadata_tags == 'enabled':
-            for tag in instance.get_tags():
-                values[f"meta-data/tags/instance/{tag['key']}"] = tag['value']
-        values['dynamic/instance-identity/document'] = metadata.document(values)
-        found = {name: value.encode() for name, value in values.items()}
-        if instance.user_data:
-            found['user-data'] = _user_data(instance)
-        return found
-
     # -- images ---------------------------------------------------------------------------
 
     def image(self, image: Any, instance: Any, *, reboot: bool) -> None:
@@ -327,33 +284,16 @@ class Cloud:
     def protect(self) -> None:
         """Bring the router's rules in line with the security groups."""
         with self._lock:
-            hosts = []
-            for machine in self.machines.values():
-                if machine.host is not None:
-                    hosts.append(dataclasses.replace(
-                        machine.host, allowed=self._allowed(machine.instance)))
+            # another thread may take a host away meanwhile: looked at once
+            there = [(host, machine.instance) for machine in self.machines.values()
+                     if (host := machine.host) is not None]
+            members: dict[str, list[str]] = {}
+            for host, instance in there:
+                for group in instance.nics[0].group_set:
+                    members.setdefault(group.id, []).extend((host.public, host.private))
+            hosts = [dataclasses.replace(host, allowed=told.allowed(instance, members))
+                     for host, instance in there]
             self.net.protect(hosts)
-
-    def _allowed(self, instance: Any) -> tuple[network.Allowed, ...]:
-        found = []
-        for group in instance.nics[0].group_set:
-            for rule in group.ingress_rules:
-                sources = [rule.ip_range['CidrIp']] if rule.ip_range.get('CidrIp') else []
-                if rule.source_group:
-                    sources += self._members(rule.source_group.get('GroupId', ''))
-                ports = None if rule.from_port in (None, -1) else (
-                    int(rule.from_port), int(rule.to_port))
-                if sources:
-                    found.append(network.Allowed(rule.ip_protocol, ports, tuple(sources)))
-        return tuple(found)
-
-    def _members(self, group_id: str) -> list[str]:
-        found = []
-        for machine in self.machines.values():
-            groups = {group.id for group in machine.instance.nics[0].group_set}
-            if machine.host is not None and group_id in groups:
-                found += [machine.host.public, machine.host.private]
-        return found
 
     def close(self) -> None:
         """End every computer at once."""
@@ -384,7 +324,3 @@ def _state(instance: Any) -> str:
 
 def _set_state(instance: Any, name: str) -> None:
     instance._state.name, instance._state.code = name, _STATES[name]
-
-
-def _user_data(instance: Any) -> bytes:
-    return base64.b64decode(instance.user_data.as_bytes()) if instance.user_data else b''

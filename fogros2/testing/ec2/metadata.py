@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 import http.server
-import json
 import secrets
 import socket
 import socketserver
@@ -111,15 +110,3 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Say nothing."""
-
-
-def document(values: Mapping[str, str]) -> str:
-    """Return the instance identity document."""
-    return json.dumps({
-        'instanceId': values['meta-data/instance-id'],
-        'imageId': values['meta-data/ami-id'],
-        'instanceType': values['meta-data/instance-type'],
-        'region': values['meta-data/placement/region'],
-        'availabilityZone': values['meta-data/placement/availability-zone'],
-        'privateIp': values['meta-data/local-ipv4'],
-    })

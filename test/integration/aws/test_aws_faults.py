@@ -45,34 +45,37 @@ def test_a_launch_gets_round_what_passes(robot, box, name):
     assert len(made) == 1
 
 
-@pytest.mark.parametrize('code, action, words', [
-    ('InsufficientInstanceCapacity', 'RunInstances', ('us-east-1', 't3.medium')),
-    ('VcpuLimitExceeded', 'RunInstances', ('us-east-1',)),
-    ('UnauthorizedOperation', 'RunInstances', ('ec2:RunInstances',)),
-    ('UnauthorizedOperation', 'CreateSecurityGroup', ('ec2:CreateSecurityGroup',)),
-    ('RequestExpired', 'DescribeInstances', ('clock',)),
-    ('AuthFailure', 'DescribeInstances', ('credentials',)),
-])
-def test_what_stays_is_said_in_one_line(robot, box, name, code, action, words):
-    box.fail(code, action=action, times=0)
-    said = complaint(robot.launch(*TALKER, f'name:={name}'))
+def test_what_stays_is_said_in_one_line(robot, box, name):
+    """Each launch in a region of its own, which refuses it in its own way."""
+    refusals = {
+        'us-west-1': ('InsufficientInstanceCapacity', 'RunInstances', 't3.medium'),
+        'us-west-2': ('VcpuLimitExceeded', 'RunInstances', 'quota'),
+        'us-east-2': ('UnauthorizedOperation', 'RunInstances', 'ec2:RunInstances'),
+        'eu-west-1': ('UnauthorizedOperation', 'CreateSecurityGroup', 'ec2:CreateSecurityGroup'),
+        'eu-west-2': ('RequestExpired', 'DescribeInstances', 'clock'),
+        'eu-west-3': ('AuthFailure', 'DescribeInstances', 'credentials')}
+    for region, (code, action, _) in refusals.items():
+        box.fail(code, action=action, region=region, times=0)
+    runs = {region: robot.launch(*TALKER, f'name:={name}-{region}', f'region:={region}')
+            for region in refusals}
+    for region, (code, _, word) in refusals.items():
+        said = complaint(runs[region])
+        assert word in said and (code in said or region in said), said
     box.heal()
-    for word in words:
-        assert word in said
     assert all(found.state == 'terminated' for found in box.instances())
 
 
-@pytest.mark.parametrize('arguments, word', [
-    (('region:=xx-nowhere-1',), 'xx-nowhere-1'),
-    (('ec2_instance_type:=t9.huge',), 't9.huge'),
-    (('ami_image:=ami-0123456789abcdef0',), 'ami-0123456789abcdef0'),
-    (('ec2_instance_type:=t4g.medium', 'ami_image:=ami-0aaaaaaaaaaaaaaaa'), 'arm64'),
-])
-def test_what_does_not_exist_is_found_before_anything_is_made(
-        robot, box, name, arguments, word):
+def test_what_does_not_exist_is_found_before_anything_is_made(robot, box, name):
     box.publish('ami-0aaaaaaaaaaaaaaaa', region='us-east-1')
-    said = complaint(robot.launch(*TALKER, f'name:={name}', *arguments))
-    assert word in said
+    wrong = [
+        ('xx-nowhere-1', 'region:=xx-nowhere-1'),
+        ('t9.huge', 'ec2_instance_type:=t9.huge'),
+        ('ami-0123456789abcdef0', 'ami_image:=ami-0123456789abcdef0'),
+        ('arm64', 'ec2_instance_type:=t4g.medium', 'ami_image:=ami-0aaaaaaaaaaaaaaaa')]
+    runs = [(word, robot.launch(*TALKER, f'name:={name}-{number}', *arguments))
+            for number, (word, *arguments) in enumerate(wrong)]
+    for word, run in runs:
+        assert word in complaint(run)
     assert not [call for call in box.calls() if call.action in (
         'RunInstances', 'CreateSecurityGroup', 'ImportKeyPair')]
 
