@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 _DRAIN = 2.0
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 16
-#: Seconds to reach the machine for a stream: whoever waits tries again, and looks for a cancel.
-_OPEN = 15.0
+#: Seconds that one attempt to connect, or to open a session, may take: a cancel isn't seen sooner.
+_ATTEMPT = 10.0
 #: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
 MAX_LINE = 32 << 20
 
@@ -60,7 +60,9 @@ class SSHShell:
 
     # -- connection -----------------------------------------------------------------------------
 
-    def channel(self, timeout: Optional[float] = None) -> paramiko.Channel:
+    def channel(
+        self, timeout: Optional[float] = None, cancel: Optional[threading.Event] = None,
+    ) -> paramiko.Channel:
         """
         Return a new channel of the connection, which is opened as needed.
 
@@ -70,7 +72,8 @@ class SSHShell:
         """
         patience = min(self._timeout, timeout or self._timeout)
         return wait_until(
-            lambda: self._try_channel(patience), timeout=patience, longest=0.1,
+            lambda: self._try_channel(min(patience, _ATTEMPT)), timeout=patience, longest=0.1,
+            cancel=cancel,
             what=f"a session on '{self.name}'", hint='raise MaxSessions of its SSH server')
 
     def _try_channel(self, patience: float) -> Optional[paramiko.Channel]:
@@ -138,7 +141,7 @@ class SSHShell:
         begin = time.monotonic()
         if cancel is not None and cancel.is_set():
             raise Cancelled(_what(command))
-        channel = self.start(line, timeout)
+        channel = self.start(line, timeout, cancel)
         output = _Output(on_output)
         try:
             feeder = _feed(channel, command.input)
@@ -158,7 +161,10 @@ class SSHShell:
                 command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
         return result
 
-    def start(self, line: str, timeout: Optional[float] = None) -> paramiko.Channel:
+    def start(
+        self, line: str, timeout: Optional[float] = None,
+        cancel: Optional[threading.Event] = None,
+    ) -> paramiko.Channel:
         """
         Start a command line there and return its channel.
 
@@ -168,7 +174,7 @@ class SSHShell:
         import paramiko
 
         for attempt in (1, 2):
-            channel = self.channel(timeout)
+            channel = self.channel(timeout, cancel)
             try:
                 channel.exec_command(line)
                 return channel
@@ -258,7 +264,7 @@ class SSHShell:
 
     def open(self, command: Command) -> Stream:
         """Start a program there and return its streams; it ends with the stream."""
-        channel = self.start(command_line.remote_line(command, user=self.user), _OPEN)
+        channel = self.start(command_line.remote_line(command, user=self.user), _ATTEMPT)
         _feed(channel, command.input, end=False)
         return SSHStream(channel, self.name)
 
