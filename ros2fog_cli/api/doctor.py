@@ -329,7 +329,7 @@ def state() -> Check:
 
 
 def lan_peers(seconds: float) -> Check:
-    """Look for ROS 2 on other computers: a launch's nodes would not talk to them."""
+    """Look for ROS 2 on other computers, and whether a launch's nodes would talk to them."""
     name = 'ROS 2 on the LAN'
     if seconds <= 0:
         return Check(name, 'ok', 'not looked for')
@@ -341,10 +341,12 @@ def lan_peers(seconds: float) -> Check:
     if not found:
         return Check(name, 'ok', f'no other computer answers in domain {domain}')
     hosts = ', '.join(f'{host} ({count})' for host, count in sorted(found.items()))
-    return Check(
-        name, 'warning', f'participants at {hosts}: nodes of a launch with cloud machines prefer '
-        'the VPN and do not exchange messages with them',
-        'run what they need on a machine of the launch, or in a launch without CloudNode')
+    if os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF'):
+        return Check(
+            name, 'warning', f"participants at {hosts}: a launch's nodes don't talk to them, as "
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE is {os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
+            'unset ROS_AUTOMATIC_DISCOVERY_RANGE if they should')
+    return Check(name, 'ok', f"participants at {hosts}; a launch's nodes here talk to them")
 
 
 def _succeeds(*words: str) -> bool:

@@ -231,9 +231,9 @@ def _ask(
     records: Iterable[Record], warn: Warn,
 ) -> Optional[list[Machine]]:
     """Return a provider's machines, None if it can't be asked."""
-    if not any(record.provider == name for record in records) and not wanted(name, regions):
-        return []
     try:
+        if not any(record.provider == name for record in records) and not wanted(name, regions):
+            return []
         provider = load(name, regions)
         try:
             return list(provider.find(tags))

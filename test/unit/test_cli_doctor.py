@@ -132,6 +132,10 @@ def test_answers_of_others_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(lan, '_announce', announce)
         assert lan.participants(0, 0.3) == {'127.0.0.2': 2}
     monkeypatch.setattr(lan, 'participants', lambda domain, seconds: {'10.1.2.3': 2})
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
+    check = doctor.lan_peers(1)
+    assert check.verdict == 'ok' and '10.1.2.3 (2)' in check.detail
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     check = doctor.lan_peers(1)
     assert check.verdict == 'warning' and '10.1.2.3 (2)' in check.detail
 
