@@ -308,7 +308,8 @@ class Node:
         for name in self.plan['commands']:
             self.start(name)
             self.await_answer(name)
-        self.await_service(self.node_ready, 'kubelet')
+        if 'kubelet' in self.running:
+            self.await_service(self.node_ready, 'kubelet')
 
     def node_ready(self) -> bool:
         """Whether the node says so, and a namespace has its service account."""

@@ -9,12 +9,15 @@ import signal
 import socket
 import subprocess
 import sys
+import uuid
 
 import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
-from fogros2.testing.cluster import BARE, node
+from fogros2.testing.cluster import BARE, node, services
+from fogros2.testing.cluster.cluster import free_network
+from fogros2.testing.cluster.node_process import run_node
 from fogros2.waiting import wait_until
 
 RUN = """
@@ -149,14 +152,23 @@ def test_nothing_is_left_of_the_cluster_of_a_test_that_was_killed(started):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='kills a process of root')
-def test_a_node_that_was_killed_as_well_is_tidied_up_by_the_next(started, kubernetes):
-    child, folder = started
+def test_a_node_that_was_killed_as_well_is_tidied_up_by_the_next(kubernetes, binaries):
+    network_of = free_network()
+    host, there = network_of.hosts()
+    name = uuid.uuid4().hex[:6]
+    started = run_node(kubernetes.folder.parent, {
+        'commands': {'containerd': services.commands(services.NOWHERE)['containerd']},
+        'binaries': str(binaries), 'cable': {
+            'name': f'fogt{name}', 'host': f'{host}/30', 'node': f'{there}/30'},
+    }, {'containerd.toml': services.containerd('')}, name=name)
+    folder = started.folder
+    assert started.await_line(30.0) == {'ready': True}
     space = process_namespace(folder)
     for process in Path('/proc').glob('[0-9]*'):
         words = (process / 'cmdline').read_text().split('\0')
         if str(folder) in words and '--inside' not in words:
             os.kill(int(process.name), signal.SIGKILL)
-    child.kill()
+    started.stop()
     wait_until(lambda: not processes(space) or None, timeout=10.0, what='its processes to end')
     assert folder.exists() and groups(node.MARK + folder.name)
     assert network(folder) == [], "the cable is the namespace's"

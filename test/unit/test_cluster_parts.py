@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests' cluster is made of, by value: configuration, images, certificates."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import socket
+import ssl
+import tarfile
+import threading
+
+import pytest
+
+from fogros2.testing.cluster import images, node, services
+from fogros2.testing.cluster.certificates import Authority, rsa_key
+from fogros2.testing.cluster.images import Image
+from fogros2.testing.cluster.pod_security import verdict
+
+LAYOUT = services.Layout('198.51.100.254', '198.51.100.253', 30)
+
+
+def test_all_files_that_commands_name_are_written():
+    files = services.files(LAYOUT, 'sandbox:1', 'fogros2-x')
+    # the rest is made for each cluster: keys, certificates, tokens, kubeconfigs
+    made = {'api.crt', 'api.key', 'ca.crt', 'accounts.key', 'tokens.csv', 'cluster.conf',
+            'node.conf', 'log/audit.json', 'plugins', 'kubelet-certificates'}
+    for words in services.commands(LAYOUT).values():
+        for word in words[1:]:
+            _, _, value = word.partition('=')
+            path = value or word
+            if path.startswith(services.HERE):
+                assert path.removeprefix(f'{services.HERE}/') in {*files, *made}, word
+
+
+def test_services_start_after_what_they_need():
+    order = list(services.commands(LAYOUT))
+    assert order.index('etcd') < order.index('kube-apiserver') < order.index('kubelet')
+    assert order.index('containerd') < order.index('kubelet')
+
+
+def test_nothing_asks_for_what_a_container_may_not():
+    files = services.files(LAYOUT, 'sandbox:1', 'fogros2-x')
+    kubelet = json.loads(files['kubelet.json'])
+    # lowering an oom score takes CAP_SYS_RESOURCE
+    assert kubelet['oomScoreAdj'] == 0
+    assert 'restrict_oom_score_adj = true' in files['containerd.toml']
+    assert kubelet['cgroupRoot'] == '/fogros2-x'
+    assert '--oom-score-adj=0' in services.commands(LAYOUT)['kube-proxy']
+
+
+def test_only_who_has_a_token_gets_in():
+    assert '--anonymous-auth=false' in services.commands(LAYOUT)['kube-apiserver']
+    assert not json.loads(services.files(LAYOUT, 's', 'g')['kubelet.json'])[
+        'authentication']['anonymous']['enabled']
+    text = services.tokens({'admin': ('secret', ('system:masters', 'b')), 'robot': ('word', ())})
+    assert list(csv.reader(text.splitlines())) == [
+        ['secret', 'admin', '0', 'system:masters,b'], ['word', 'robot', '1']]
+
+
+def test_an_archive_is_an_image_layout(tmp_path):
+    low, high = tmp_path / 'low.tar', tmp_path / 'high.tar'
+    low.write_bytes(b'low')
+    high.write_bytes(b'high')
+    target = tmp_path / 'images.tar'
+    images.write_archive(target, [
+        Image('a.test/one:1', (low,), {'Cmd': ['sh']}),
+        Image('a.test/two:1', (low, high), {})], leave_out=[high])
+    with tarfile.open(target) as archive:
+        files = {member.name: archive.extractfile(member).read() for member in archive}
+    for name, data in files.items():
+        if name.startswith('blobs/'):
+            assert name == f'blobs/sha256/{hashlib.sha256(data).hexdigest()}'
+    index = json.loads(files['index.json'])
+    assert [m['annotations']['io.containerd.image.name'] for m in index['manifests']] == [
+        'a.test/one:1', 'a.test/two:1']
+    two = json.loads(files['blobs/' + index['manifests'][1]['digest'].replace(':', '/')])
+    config = json.loads(files['blobs/' + two['config']['digest'].replace(':', '/')])
+    assert config['rootfs']['diff_ids'] == [layer['digest'] for layer in two['layers']]
+    there = ['blobs/' + layer['digest'].replace(':', '/') in files for layer in two['layers']]
+    assert there == [True, False], 'the upper layer was to be left out'
+
+
+def test_a_certificate_proves_its_host(tmp_path):
+    authority = Authority('test')
+    pair = authority.issue('server', ['127.0.0.1'])
+    path = tmp_path / 'pair.pem'
+    path.write_bytes(pair.certificate + pair.key)
+    ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    ours.load_cert_chain(path)
+    theirs = ssl.create_default_context(cadata=authority.certificate.decode())
+    stranger = ssl.create_default_context(cadata=Authority('other').certificate.decode())
+
+    said = []
+
+    def serve(raw: socket.socket) -> None:
+        try:
+            with raw, ours.wrap_socket(raw, server_side=True):
+                said.append('served')
+        except OSError:
+            said.append('refused')
+
+    for context in (theirs, stranger):
+        here, there = socket.socketpair()
+        thread = threading.Thread(target=serve, args=(there,))
+        thread.start()
+        try:
+            with here, context.wrap_socket(here, server_hostname='127.0.0.1'):
+                said.append('trusted')
+        except ssl.SSLCertVerificationError:
+            said.append('not trusted')
+        thread.join(10.0)
+    assert sorted(said[:2]) == ['served', 'trusted']
+    assert sorted(said[2:]) == ['not trusted', 'refused']
+    assert rsa_key().startswith(b'-----BEGIN RSA PRIVATE KEY-----')
+
+
+def test_baseline_refuses_what_a_vpn_takes():
+    def pod(*added: str) -> dict[str, object]:
+        return {'spec': {'containers': [
+            {'name': 'machine', 'securityContext': {'capabilities': {'add': list(added)}}}]}}
+
+    assert verdict({'spec': {'containers': [{'name': 'plain'}]}}) == ''
+    assert verdict(pod('CHOWN')) == ''
+    assert '"machine" must not include "NET_ADMIN"' in verdict(pod('NET_ADMIN'))
+
+
+def test_a_folder_is_one_node_s(tmp_path):
+    with node.claimed(tmp_path) as mine, node.claimed(tmp_path) as again:
+        assert (mine, again) == (True, False)
+    with node.claimed(tmp_path) as mine:
+        assert mine
