@@ -12,6 +12,7 @@ import uuid
 
 import pytest
 
+from fogros2 import process
 from fogros2.testing.launched import launching
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
@@ -19,7 +20,7 @@ pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytestmark = [
     pytest.mark.usefixtures('nothing_left', 'engine'),
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
-    pytest.mark.skipif(shutil.which('sshd') is None, reason='needs sshd (openssh-server)'),
+    pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)'),
 ]
 
 #: Other runs of this test may be under way on the same computer.
