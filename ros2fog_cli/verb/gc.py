@@ -74,7 +74,7 @@ class GcVerb(VerbExtension):
             if not args.dry_run:
                 store.sweep()
                 for what in endings.tidy(warn, regions=args.region):
-                    note('what was left at the provider:', what, 'its machine ended by itself')
+                    note('leftover', what, 'its machine ended by itself')
         if args.json:
             print(json.dumps(done, indent=2))
         elif not done:

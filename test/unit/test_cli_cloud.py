@@ -277,8 +277,8 @@ def test_gc_has_providers_clear_up_as_well(
     assert ('tidy',) not in Cloud.calls
     capsys.readouterr()
     assert run('gc') == 0
-    assert capsys.readouterr().out == "cleared what was left at the provider: security group " \
-        "of 'old' (cloud): its machine ended by itself\n"
+    assert capsys.readouterr().out == \
+        "cleared leftover security group of 'old' (cloud): its machine ended by itself\n"
     Cloud.up = False
     Cloud.calls.clear()
     assert run('gc') == 0
