@@ -16,6 +16,7 @@ import os
 from pathlib import Path
 import queue
 import threading
+import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode
 
@@ -35,6 +36,8 @@ CONNECT = 5.0
 ANSWER = 30.0
 #: Seconds for which an API server that restarts is waited for.
 PATIENCE = 30.0
+#: Seconds after a restart in which an API server may not know yet what it allows whom.
+DOUBT = 15.0
 #: Seconds of silence after which a watch is begun anew: its connection may be gone.
 SILENCE = 240.0
 #: Token, certificate and namespace of a pod that may use the API itself.
@@ -76,6 +79,7 @@ class Api:
         self.context, self.namespace, self._client = _load(context)
         #: Requests made so far, for the figures.
         self.calls = 0
+        self._lost = -DOUBT
 
     @property
     def server(self) -> str:
@@ -94,16 +98,19 @@ class Api:
 
     def request(
         self, method: str, path: str, body: Optional[Mapping[str, Any]] = None,
-        *, patience: float = PATIENCE, cancel: Optional[threading.Event] = None, **query: Any,
+        *, patience: float = PATIENCE, doubt: float = 0.0,
+        cancel: Optional[threading.Event] = None, **query: Any,
     ) -> dict[str, Any]:
         """
         Make a request and return the answer.
 
         :param patience: seconds for which an API server that doesn't answer is asked again.
+        :param doubt: seconds for which one that says that we may not is.
         :raises ApiError: it refused.
         :raises Unreachable: it doesn't answer.
         """
         last: list[ProviderError] = []
+        sure = time.monotonic() + doubt
 
         def attempt() -> Optional[dict[str, Any]]:
             try:
@@ -111,7 +118,8 @@ class Api:
             except Unreachable as error:
                 last[:] = [error]
             except ApiError as error:
-                if error.status not in (429, 500, 502, 503, 504):
+                if not self.passing(error) and not (
+                        error.status == 403 and time.monotonic() < sure):
                     raise
                 last[:] = [error]
             return None
@@ -121,6 +129,15 @@ class Api:
                               what=f'the API server {self.server}')
         except DeadlineExceeded as error:
             raise last[0] from error
+
+    def passing(self, error: ApiError) -> bool:
+        """Return whether a refusal may be one of an API server that has just begun again."""
+        return error.status in (429, 500, 502, 503, 504) or (
+            error.status == 403 and time.monotonic() - self._lost < DOUBT)
+
+    def lost(self) -> None:
+        """Note that a connection to the API server was lost, or none can be had."""
+        self._lost = time.monotonic()
 
     def _once(
         self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
@@ -162,6 +179,7 @@ class Api:
         return f'{self.server}{path}?{text}' if text else f'{self.server}{path}'
 
     def _unreachable(self, error: BaseException) -> Unreachable:
+        self.lost()
         return Unreachable(
             f'the API server {self.server} does not answer: {_words(error)}',
             'is the cluster up, and reachable from this robot? `kubectl cluster-info` asks the '
@@ -249,7 +267,8 @@ class _Watch:
     def __init__(self, api: Api, path: str, query: Query) -> None:
         self._events: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
         self._response = self._open(api, path, query)
-        self._thread = threading.Thread(target=self._read, name='fog-watch', daemon=True)
+        self._thread = threading.Thread(
+            target=self._read, args=(api,), name='fog-watch', daemon=True)
         if self._response is not None:
             self._thread.start()
 
@@ -264,13 +283,15 @@ class _Watch:
         if response.status >= 400:
             data = response.read(decode_content=True)
             response.release_conn()
-            if response.status not in (410, 429, 500, 502, 503, 504):
-                raise _refusal(response.status, _parsed(data), data)
+            refusal = _refusal(response.status, _parsed(data), data)
+            if refusal.status != 410 and not api.passing(refusal):
+                raise refusal
             self._events.put(('CLOSED', {}))
+            threading.Event().wait(0.1)
             return None
         return response
 
-    def _read(self) -> None:
+    def _read(self, api: Api) -> None:
         rest = b''
         with contextlib.suppress(OSError, ValueError, AttributeError, *_http_errors()):
             for data in self._response.stream(1 << 16):
@@ -279,6 +300,8 @@ class _Watch:
                     event = _parsed(line)
                     if 'type' in event:
                         self._events.put((event['type'], event.get('object') or {}))
+        if self._response is not None:
+            api.lost()  # or the API server has had enough of us, which does no harm
         self._events.put(('CLOSED', {}))
 
     def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:

@@ -295,14 +295,14 @@ class Link:
         source = _source()
         words = ['python3', '-ISc', _LOADER.format(size=len(source)), self._session,
                  'resume' if resume else 'new']
+        api = kubernetes_api.connect(self._context)
         try:
-            api = kubernetes_api.connect(self._context)
             link = api.websocket(
                 kubernetes_api.path('pods', self._namespace, self._pod, 'exec'),
                 {'container': 'machine', 'command': words, 'stdin': 'true', 'stdout': 'true',
                  'stderr': 'true', 'tty': 'false'}, timeout=timeout)
         except ApiError as error:
-            raise self._refused(error) from error
+            raise self._refused(error, passing=api.passing(error)) from error
         except Unreachable as error:
             raise ConnectError(f"'{self._name}' can't be reached: {error.args[0]}", error.hint) \
                 from error
@@ -359,8 +359,10 @@ class Link:
             text = json.loads(text).get('message', text)
         return ConnectError(f"'{self._name}' can not begin a command: {' '.join(text.split())}")
 
-    def _refused(self, error: ApiError) -> FogError:
+    def _refused(self, error: ApiError, *, passing: bool) -> FogError:
         message = str(error.args[0])
+        if passing and 'not found' not in message:
+            return ConnectError(f"'{self._name}' can't be reached: {message}", error.hint)
         if error.status == 404:
             return ShellError(f"the pod of '{self._name}' is gone: {message}")
         if error.status == 403:
@@ -384,6 +386,8 @@ class Link:
                 pass  # whatever it was, the next connection shows whether it can be mended
             with self._lock:
                 self._drop()
+            if not self._closed:
+                kubernetes_api.connect(self._context).lost()
             if self._closed or not self._resume():
                 return
 

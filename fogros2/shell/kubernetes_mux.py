@@ -275,6 +275,8 @@ class Daemon:
             self.send(EXIT, number, struct.pack('>i', 127 if missing else 126))
             return
         self.processes[number] = process
+        if process.terminal:
+            self.send(ERR, number)  # has one stream for both
         self.listen(process)
 
     def listen(self, process: Process) -> None:

@@ -26,7 +26,8 @@ def attach(link: Link, command: Optional[Command]) -> int:
     terminal = None
     if os.isatty(0) and os.isatty(1):
         columns, rows = os.get_terminal_size(0)
-        terminal = (rows, columns, os.environ.get('TERM', 'dumb'))
+        # one that tells no size, as of a program that only plays one, gets the usual
+        terminal = (rows or 24, columns or 80, os.environ.get('TERM', 'dumb'))
     channel = link.open(command or Command(()), terminal=terminal, login=command is None)
     with contextlib.ExitStack() as undo:
         undo.callback(channel.close)

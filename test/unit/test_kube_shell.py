@@ -75,10 +75,11 @@ class Pipe:
         self.child.wait()
 
 
-class FakeApi:
+class FakeApi(kubernetes_api.Api):
     """An API server that runs what it is told here, or refuses."""
 
     def __init__(self) -> None:
+        self._lost = -kubernetes_api.DOUBT
         self.links: list[Pipe] = []
         self.sessions: set[str] = set()
         self.refusals: list[Exception] = []
@@ -174,6 +175,13 @@ def test_a_pod_that_is_gone_is_told_at_once(api, shell):
     assert 'is gone' in str(error)
 
 
+def test_an_api_server_that_has_just_begun_again_is_not_believed(api, shell):
+    """Its list of who may what is empty at first."""
+    api.lost()
+    api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)] * 2
+    assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
+
+
 def test_rights_that_lack_are_named(api, shell):
     api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)]
     error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
@@ -243,6 +251,7 @@ def test_a_terminal_has_the_user_s_size_and_follows_it(api, shell):
     assert b'43 132' in answer(b'stty size; echo a""gain\n', b'again')
     assert b'xterm' in answer(b'echo $TERM; echo la""st\n', b'last')
     answer(b'exit 7\n', b'exit 7')
+    assert wait_until(lambda: channel.read(1.0)[2], timeout=10.0, what='its end')
     assert channel.recv_exit_status() == 7
     channel.close()
 

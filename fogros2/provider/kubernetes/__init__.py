@@ -238,7 +238,8 @@ class KubernetesProvider(Provider):
             try:
                 answer = api.request('DELETE', target, {
                     'kind': 'DeleteOptions', 'apiVersion': 'v1',
-                    'propagationPolicy': 'Foreground', 'preconditions': {'uid': where.uid}})
+                    'propagationPolicy': 'Foreground', 'preconditions': {'uid': where.uid}},
+                    doubt=kubernetes_api.DOUBT)
             except ApiError as error:
                 # gone, or gone and another of the name in its place
                 if error.status in (404, 409):
@@ -278,11 +279,25 @@ class KubernetesProvider(Provider):
             return None if left else True
 
         if left:
+            for pod in found:
+                self._tell(api, pod)
             api.follow(target, look, again=again, timeout=_GONE, labelSelector=labels,
                        what=f"the pod of '{where.job}' to end")
         if found:
             # nothing runs in it any more; the node would take seconds to tidy up first
             delete(0)
+
+    def _tell(self, api: Api, pod: Mapping[str, Any]) -> None:
+        """Have a pod end itself: it may be in the time it was given to move its nodes."""
+        meta = pod['metadata']
+        # where it doesn't hear us, the node ends it
+        with contextlib.suppress(ProviderError, OSError, ValueError):
+            link = api.websocket(
+                path('pods', str(meta['namespace']), str(meta['name']), 'exec'), {
+                    'container': names.CONTAINER, 'command': boot.END_COMMAND,
+                    'stdout': 'true', 'stderr': 'true'}, timeout=2.0)
+            with contextlib.closing(link):
+                link.recv()  # its status, or the end
 
     # -- what all of them need ------------------------------------------------------------------
 

@@ -57,17 +57,13 @@ guarded() {
     done 2>/dev/null
 }
 taken() {
-    trap '' TERM
     guarded
     [ "$state" = guarded ] || ended 'ended by the cluster' 0
-    echo "the cluster takes the pod away in at most $grace s" >"$notice"
+    [ "$last" = never ] || return
     last=$(($(date +%s) + grace))
-    while [ "$(date +%s)" -lt "$last" ] && [ "$state" = guarded ]; do
-        sleep 1 & wait $!
-        guarded
-    done
-    ended 'ended by the cluster' 0
+    echo "the cluster takes the pod away in at most $grace s" >"$notice"
 }
+last=never
 trap taken TERM
 trap 'ended "ended as told" 0' USR1 INT
 umask 022
@@ -104,7 +100,10 @@ while :; do
     if [ "$since" != never ] && [ $((now - since)) -ge "$patience" ]; then
         ended "no agent guards this pod for $patience s" 3
     fi
-    sleep 2 & wait $!
+    if [ "$last" != never ] && { [ "$now" -ge "$last" ] || [ "$state" != guarded ]; }; then
+        ended 'ended by the cluster' 0
+    fi
+    sleep 1 & wait $!
 done
 """.replace('@UID@', str(UID)).replace('@GRACE@', str(GRACE - 5)).lstrip()
 
