@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import time
 import uuid
 
 import pytest
@@ -12,6 +13,8 @@ import pytest
 from fogros2.model import Command
 from fogros2.process import argv
 from fogros2.testing.launched import launching
+from fogros2.testing.plugins import install
+from fogros2.waiting import wait_until
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -29,8 +32,12 @@ from launch.actions import LogInfo, OpaqueFunction, RegisterEventHandler
 from launch_ros.actions import Node
 
 
+class Warned(ContainerInstance):
+    provider = {provider!r}
+
+
 def generate_launch_description():
-    machine = ContainerInstance(
+    machine = Warned(
         name={name!r}, network={network!r}, on_interrupt={on_interrupt!r})
 
     def say(context):
@@ -49,6 +56,17 @@ def generate_launch_description():
 """
 
 
+#: Its machines say beforehand that they will be taken away, as spot instances do.
+PROVIDER = """
+from fogros2.provider.container import ContainerProvider
+
+
+class WarningProvider(ContainerProvider):
+    name = 'warning'
+    notice = ('cat', '/run/notice')
+"""
+
+
 def remove(engine: str, name: str, *how: str) -> None:
     """End a machine as somebody would who knows nothing of the launch."""
     words = argv(Command((engine, *how, f'fogros2-{name}'), sudo=True))
@@ -59,10 +77,10 @@ def remove(engine: str, name: str, *how: str) -> None:
 def launched(cloud_network, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     with launching() as launch:
-        def start(name, on_interrupt):
+        def start(name, on_interrupt, provider='container'):
             path = tmp_path / 'interrupted.launch.py'
             path.write_text(LAUNCH.format(
-                name=name, network=cloud_network, on_interrupt=on_interrupt))
+                name=name, network=cloud_network, on_interrupt=on_interrupt, provider=provider))
             return launch(str(path))
         yield start
 
@@ -82,6 +100,31 @@ def test_nodes_go_on_on_the_robot(launched, engine, how):
     run.wait_for(f'I heard: [Hello World from {here} ', times=3)
     assert f'[{name}.talker' in run.text and '[arm.speaker]' in run.text
     # the same process to launch: it never exited
+    assert 'process has' not in run.text and run.errors == [], run.text
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
+def test_a_notice_moves_the_nodes_before_the_machine_goes(
+    launched, engine, tmp_path, monkeypatch,
+):
+    monkeypatch.setenv('PYTHONPATH', install(
+        tmp_path / 'plugin', 'fogros2.provider', 'warning', PROVIDER, 'WarningProvider'))
+    name = f'warned-{RUN}'
+    run = launched(name, 'robot', 'warning')
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    words = argv(Command((engine, 'exec', f'fogros2-{name}', 'sh', '-c',
+                          'echo "terminate at 12:00" >/run/notice'), sudo=True))
+    subprocess.run(words, check=True, capture_output=True, timeout=60)
+    run.wait_for(f'noticed: {name} lost False', timeout=30)
+    run.wait_for(f"the machine '{name}' is being taken away: terminate at 12:00; its nodes go on")
+    here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
+    run.wait_for(f'I heard: [Hello World from {here} ')
+    # the one there has ended: nobody says anything twice
+    begin = time.monotonic()
+    wait_until(lambda: len(run.since(begin, f'I heard: [Hello World from {here} ')) >= 5,
+               timeout=20.0, what='messages of the robot')
+    assert run.since(begin, f'Hello World from {name} ') == []
     assert 'process has' not in run.text and run.errors == [], run.text
     run.interrupt()
     assert run.ended() == 0, run.text

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
 import re
 import shutil
@@ -23,6 +22,7 @@ import uuid
 import pytest
 
 from fogros2.testing.launched import Launched, launching
+from fogros2.testing.plugins import install
 from fogros2.waiting import wait_until
 
 pytestmark = [
@@ -128,18 +128,11 @@ class Relay:
 @pytest.fixture
 def weather(tmp_path, monkeypatch) -> Iterator[Path]:
     """Install the provider for the launches of a test; return the folder it talks through."""
-    plugin = tmp_path / 'plugin'
-    about = plugin / 'fogt_relayed-0.dist-info'
-    about.mkdir(parents=True)
-    (about / 'METADATA').write_text('Metadata-Version: 2.1\nName: fogt-relayed\nVersion: 0\n')
-    (about / 'entry_points.txt').write_text(
-        '[fogros2.provider]\nrelayed = fogt_relayed:RelayedProvider\n')
-    (plugin / 'fogt_relayed.py').write_text(PROVIDER)
+    monkeypatch.setenv('PYTHONPATH', install(
+        tmp_path / 'plugin', 'fogros2.provider', 'relayed', PROVIDER, 'RelayedProvider'))
     folder = tmp_path / 'talk'
     folder.mkdir()
     monkeypatch.setenv('FOGT_RELAY', str(folder))
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(plugin), *os.environ.get('PYTHONPATH', '').split(os.pathsep)]).strip(os.pathsep))
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     yield folder
 
