@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from fogros2.waiting import wait_until
+
 pytestmark = pytest.mark.timeout(120)
 
 #: What AWS may be asked for one launch at the most, from its beginning to its end.
@@ -45,6 +47,13 @@ def test_the_talker_from_nothing_to_nothing(robot, box, name):
     now = box.run(instance.id, 'cat /etc/ssh/ssh_host_ed25519_key.pub').split()[1]
     assert now in instance.tags['fogros2-host-key']
     assert data
+    # the robot goes on from another address, as from a train
+    heard = run.text.count('I heard: ')
+    box.move_robot()
+    try:
+        run.wait_for('I heard: ', times=heard + 3)
+    finally:
+        box.move_robot(back=True)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert clean(run), run.text
@@ -199,6 +208,35 @@ def test_two_regions_hear_each_other(robot, box, name):
     run.interrupt()
     assert run.ended() == 0, run.text
     assert clean(run), run.text
+
+
+def test_a_stopped_instance_is_started_again(robot, box, name):
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
+                       'on_exit:=stop', 'count:=1')
+    assert run.ended() == 0, run.text
+    (stopped,) = box.alive()
+    box.wait_for(stopped.id, 'stopped')
+    listed = robot.ros2('fog', 'list')
+    assert listed.returncode == 0 and 'stopped' in listed.stdout, listed.stdout + listed.stderr
+    again = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
+                         'on_exit:=delete', 'count:=1')
+    assert again.ended() == 0, again.text
+    assert clean(again), again.text
+    assert box.instances()[-1].id == stopped.id
+    assert box.wait_for(stopped.id, 'terminated').reason == 'Client.UserInitiatedShutdown'
+
+
+@pytest.mark.soak  # the robot looks for its own address every ten seconds alone
+def test_a_robot_that_moves_during_the_boot_is_let_in(robot, box, name):
+    box.set_boot_delay(5.0)
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}', 'count:=1')
+    wait_until(box.alive, timeout=30, what='an instance')
+    box.move_robot()
+    try:
+        assert run.ended(90) == 0, run.text
+        assert clean(run), run.text
+    finally:
+        box.move_robot(back=True)
 
 
 def test_an_image_is_baked_found_and_deleted(robot, box, name):
