@@ -64,7 +64,7 @@ class Deployment:
             job.failed = False
             running = RunningMachine(
                 self.launch, job, machine, shell, agent, heartbeat, interface,
-                self.guard.first_event)
+                self.guard.first_event, self.joining.redial)
             running.undo = job.undo.pop_all()
             return running
 

@@ -4,17 +4,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import contextlib
 import dataclasses
+from typing import Optional
 
 from fogros2 import plan
 from fogros2.agent_client import AgentClient
 from fogros2.deploy.guarding import Guard
 from fogros2.deploy.job import Job
 from fogros2.deploy.robot_vpn import VpnMember
-from fogros2.errors import CommandError, VpnError
-from fogros2.model import Machine, Peer, VpnInterface
+from fogros2.errors import CommandError, FogError, VpnError
+from fogros2.model import Command, Machine, Peer, VpnInterface
+from fogros2.report import step
 from fogros2.shell import Shell
 from fogros2.vpn import addresses
+
+#: What sends a packet to an address and port, so that the other side hears of this one.
+_KNOCK = """\
+import socket, sys
+socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', (sys.argv[1], int(sys.argv[2])))
+"""
 
 
 class Joining:
@@ -23,6 +32,7 @@ class Joining:
     def __init__(self, job: Job, guard: Guard) -> None:
         self._job = job
         self._guard = guard
+        self._member: Optional[VpnMember] = None
 
     def interface(self) -> VpnInterface:
         """Return the machine's interface, decided and written down before it is made."""
@@ -97,10 +107,34 @@ class Joining:
                         'launch again: each launch takes another network') from error
                 raise
             robot.spread(member)
+            self._member = member
             detail.append(interface.address)
             if place.robot_endpoint is not None:
                 detail.append(f'dials {place.robot_endpoint}')
             return member
+
+    def redial(self, machine: Machine) -> None:
+        """
+        Have a machine that dials the robot do so where the robot is by now.
+
+        :param machine: what its provider tells of it.
+        """
+        member, job = self._member, self._job
+        if member is None or member.place.robot_endpoint is None or not machine.robot_host:
+            return
+        robot = job.launch.robot_vpn()
+        endpoint = plan.endpoint(machine.robot_host, robot.interface.port)
+        if endpoint != member.place.robot_endpoint:
+            with contextlib.suppress(FogError), step(
+                    job.launch.report, job.name, 'VPN, from where the robot is now',
+                    fatal=False) as detail:
+                member.redial(robot, endpoint)
+                detail.append(f'dials {endpoint}')
+                if job.shell is not None:
+                    # by its next packet the robot learns the way back; a keepalive would take 25 s
+                    job.on(job.shell, [Command(
+                        ('python3', '-IS', '-c', _KNOCK, robot.interface.address,
+                         str(plan.HEARTBEAT_PORT)), what='greet the robot')])
 
     def _leave(self, shell: Shell, agent: AgentClient, interface: VpnInterface) -> None:
         job = self._job

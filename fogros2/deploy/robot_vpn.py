@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+import dataclasses
 from pathlib import Path
 import threading
 import time
@@ -199,3 +200,13 @@ class VpnMember:
             if peers != self._kept:
                 self._keep(peers)
                 self._kept = peers
+
+    def redial(self, robot: RobotVpn, endpoint: str) -> None:
+        """Have the machine dial the robot at another ``host:port`` from now on."""
+        before = self.place
+        self.place = dataclasses.replace(before, robot_endpoint=endpoint)
+        try:
+            self.update(robot)
+        except FogError:
+            self.place = before  # so that the next look tries again
+            raise

@@ -28,11 +28,13 @@ class RunningMachine:
     A machine of the launch that is up, and the nodes on it.
 
     :param first_event: number of the agent's first event that is this launch's.
+    :param found: takes what the provider tells of the machine when its heartbeat stays away.
     """
 
     def __init__(
         self, launch: Launch, job: Job, machine: Machine, shell: Shell, agent: AgentClient,
         heartbeat: Heartbeat, interface: VpnInterface, first_event: int,
+        found: Callable[[Machine], None],
     ) -> None:
         self.spec = job.spec
         self.machine = machine
@@ -52,7 +54,7 @@ class RunningMachine:
         self._lost = ''
         self._watch: Optional[Watch] = None
         if job.provider.owned:
-            self._watch = Watch(job, agent, heartbeat, self._gone)
+            self._watch = Watch(job, agent, heartbeat, gone=self._gone, found=found)
             job.undo.callback(self._watch.close)
 
     def warm(self) -> None:

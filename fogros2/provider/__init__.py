@@ -109,7 +109,10 @@ class Provider(abc.ABC):
         """
         Return what is known of a machine now.
 
-        ``shell`` is set, with the host key to pin, as soon as a connection can be tried.
+        ``shell`` is set, with the host key to pin, as soon as a connection can be tried. By then
+        ``vpn_host`` says where the robot dials the machine's VPN port; where nobody outside can,
+        ``robot_host`` says where the machine dials the robot, and where the robot is by now each
+        time that this is asked.
 
         :raises MachineNotFound: it doesn't exist (any more).
         """

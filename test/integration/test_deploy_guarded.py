@@ -6,6 +6,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import ipaddress
+import json
 import shutil
 import socket
 import threading
@@ -198,19 +199,25 @@ def test_what_takes_a_machine_away_is_told(cloud, spec, monkeypatch):
     assert identity in told[1]['reason'] or 'stopped' in told[1]['reason']
 
 
-def test_machines_that_nobody_can_dial_dial_the_robot_and_each_other(
-        cloud, spec, monkeypatch):
-    robot = cloud.robot.partition('/')[0]
+def hide(cloud, monkeypatch, robots):
+    """Make machines those that nobody dials; they dial the robot at the last of ``robots``."""
     for name in ('firewall', 'one_time_host_key', 'notice'):
         monkeypatch.setattr(CloudLike, name, getattr(ContainerProvider, name))
     describe = cloud.describe
 
     def hidden(machine_id):
         machine = describe(machine_id)
-        return dataclasses.replace(machine, vpn_host='', robot_host=robot, inner_network='pods',
-                                   inner_host=machine.vpn_host)
+        return dataclasses.replace(
+            machine, vpn_host='', robot_host=robots[-1], inner_network='pods',
+            inner_host=machine.vpn_host)
 
     monkeypatch.setattr(cloud, 'describe', hidden)
+
+
+def test_machines_that_nobody_can_dial_dial_the_robot_and_each_other(
+        cloud, spec, monkeypatch):
+    robot = cloud.robot.partition('/')[0]
+    hide(cloud, monkeypatch, [robot])
     events = []
     launch = Launch(report=events.append)
     names = [spec(name).name for name in ('one', 'two')]
@@ -229,3 +236,50 @@ def test_machines_that_nobody_can_dial_dial_the_robot_and_each_other(
     # the robot takes a handshake that comes before it knows the machine for nobody's
     agents = [event for event in events if isinstance(event, StepDone) and event.step == 'agent']
     assert all(event.seconds < 3 for event in agents), agents
+
+
+#: What lies between a machine and where the robot was; SSH isn't what this is about.
+MOVED = """\
+table inet moved {
+  chain input {
+    type filter hook input priority -200; policy accept;
+    meta l4proto udp ip saddr %s drop
+  }
+  chain output {
+    type filter hook output priority -200; policy accept;
+    meta l4proto udp ip daddr %s drop
+  }
+}
+"""
+
+
+def test_a_machine_that_dials_a_robot_that_moves_dials_it_there(
+        cloud, spec, monkeypatch, cloud_network):
+    monkeypatch.setattr('fogros2.deploy.watching.SILENCE', 2.5)
+    robots = [cloud.robot.partition('/')[0]]
+    hide(cloud, monkeypatch, robots)
+    network = json.loads(run(Command(
+        ('podman', 'network', 'inspect', cloud_network), sudo=True), timeout=30).stdout)[0]
+    bridge = network['network_interface']
+    subnet = ipaddress.ip_network(network['subnets'][0]['subnet'])
+    later = str(list(subnet.hosts())[-2])
+    events = []
+    launch = Launch(report=events.append)
+    try:
+        machine = launch.up(spec('moving'))
+        run(Command(('ip', 'address', 'add', f'{later}/32', 'dev', bridge), sudo=True), timeout=10)
+        machine.shell.run(Command(
+            ('nft', '-f', '-'), input=(MOVED % (robots[0], robots[0])).encode(), sudo=True),
+            timeout=20)
+        robots.append(later)
+        wait_until(lambda: any(
+            isinstance(event, StepDone) and f'dials {later}:' in event.detail
+            and event.step.startswith('VPN, from') for event in events),
+            timeout=25, what='the machine to dial again')
+        begin = time.monotonic()
+        wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=10,
+                   what='the heartbeat')
+    finally:
+        assert launch.down() == []
+        run(Command(('ip', 'address', 'delete', f'{later}/32', 'dev', bridge), sudo=True),
+            timeout=10, check=False)
