@@ -551,6 +551,15 @@ def test_a_region_to_go_on_in_that_lacks_the_type_is_passed_over(aws):
     assert left(HOME) == left(AWAY) == NOTHING
 
 
+def test_of_several_types_those_that_a_region_lacks_are_passed_over(aws):
+    machine_id = aws.provider.create(*ask(
+        ec2_instance_type='t9.medium', instance_types=['t3.large', 't9.large']))
+    assert aws.provider.describe(machine_id).kind == 't3.large'
+    with pytest.raises(ConfigurationError, match=r't9.medium or t9.large in eu-central-1 failed'):
+        aws.provider.create(*ask('mapper', ec2_instance_type='t9.medium',
+                                 instance_types=['t9.large']))
+
+
 def test_an_answer_that_got_lost_may_have_been_a_yes(aws, monkeypatch):
     spec, request = ask()
     call = Account.call

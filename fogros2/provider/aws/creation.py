@@ -78,17 +78,17 @@ class Creation:
         raise first
 
     def _in_region(self, region: str, types: list[str]) -> MachineId:
-        with ThreadPoolExecutor(3, 'fog-aws') as pool:
+        with ThreadPoolExecutor(4, 'fog-aws') as pool:
             # all of it before anything is made; side by side, since each is a way there and back
             there = pool.submit(self._existing, region)
+            asked = pool.submit(images.kinds, self.account, region, types)
             sources = pool.submit(self._sources)
             vpc = pool.submit(network.vpc_of, self.account, region, self.options.subnet) \
                 if self.options.subnet else None
             found = there.result()
             if found is not None:
                 return found
-            kinds = images.kinds(self.account, region, types)
-            chosen = [(kind, self._image(region, kind, kinds)) for kind in kinds]
+            chosen = [(kind, self._image(region, kind)) for kind in asked.result()]
             return self._make(region, chosen, sources.result(), _done(vpc))
 
     def _existing(self, region: str) -> Optional[MachineId]:
@@ -118,7 +118,7 @@ class Creation:
     def _sources(self) -> list[str]:
         return list(self.options.ssh_from) or [self._robot_address()]
 
-    def _image(self, region: str, kind: Kind, kinds: list[Kind]) -> Mapping[str, Any]:
+    def _image(self, region: str, kind: Kind) -> Mapping[str, Any]:
         """Return a kind's image, asked once for all kinds that take the same."""
         key = (region, kind.arch, kind.nvidia)
         if key not in self._images:

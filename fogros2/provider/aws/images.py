@@ -47,21 +47,33 @@ def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
     """
     Return instance types as a region has them, in the order of ``names``.
 
-    :raises ConfigurationError: it has none of that name.
+    Of several those that it lacks are left out: there is no room for them there.
+
+    :raises ConfigurationError: it has none of them.
     """
-    what = f'looking for the instance type {" or ".join(names)}'
     try:
         found = {entry['InstanceType']: entry for entry in account.call(
-            'ec2', region, 'describe_instance_types', what, InstanceTypes=names)['InstanceTypes']}
+            'ec2', region, 'describe_instance_types',
+            f'looking for the instance type {" or ".join(names)}',
+            InstanceTypes=names)['InstanceTypes']}
     except AwsError as error:
         if error.code != 'InvalidInstanceType':
             raise
+        if len(names) > 1:
+            # one that it lacks is an error for all of them
+            alone = [_kinds_if_any(account, region, name) for name in names]
+            some = [kind for each in alone for kind in each]
+            if some:
+                return some
         raise ConfigurationError(str(error.args[0]), error.hint) from error
-    missing = [name for name in names if name not in found]
-    if missing:
-        raise ConfigurationError(f'{region} has no instance type {" or ".join(missing)}',
-                                 f'ros2 fog price --region {region} shows what it has')
-    return [_kind(found[name]) for name in names]
+    return [_kind(found[name]) for name in names if name in found]
+
+
+def _kinds_if_any(account: Account, region: str, name: str) -> list[Kind]:
+    try:
+        return kinds(account, region, [name])
+    except ConfigurationError:
+        return []
 
 
 def _kind(entry: Mapping[str, Any]) -> Kind:
