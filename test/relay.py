@@ -6,7 +6,8 @@ A UDP relay that stands for a bad network between two hosts: delay, jitter, loss
 As a program it listens at one address and passes packets to another; each client gets a socket
 of its own there, so that the far side sees what it would see behind a NAT. Settings change while
 it runs: one JSON object a line on standard input, such as ``{"loss": 0.05}`` or ``{"cut": true}``
-or ``{"rebind": true}``; each is answered with a line of counters. It ends with its standard input
+or ``{"rebind": true}`` or ``{"source": "198.51.100.9"}``, this computer's address that the far
+side sees from then on; each is answered with a line of counters. It ends with its standard input
 or with its lifetime.
 """
 
@@ -73,6 +74,8 @@ class Relay:
         self.target = target
         #: From the clients to the target, and back.
         self.up, self.down = Link(**settings), Link(**settings)
+        #: Address from which the target is dialled, '' for any.
+        self.source = ''
         self.passed = self.lost = self.bytes = 0
         self._chance = random.Random(seed)
         self._inside: Optional[socket.socket] = None
@@ -105,7 +108,9 @@ class Relay:
         """Apply settings to both directions, or to ``up_...`` or ``down_...``; return counters."""
         for key, value in settings.items():
             side, _, name = key.partition('_')
-            if key == 'rebind':
+            if key in ('rebind', 'source'):
+                if key == 'source':
+                    self.source = str(value)
                 self.rebind()
                 continue
             links = {'up': [self.up], 'down': [self.down]}.get(side, [self.up, self.down])
@@ -124,6 +129,8 @@ class Relay:
         outside = self._outside.get(client)
         if outside is None:
             outside = self._open(lambda back, _: self._from_target(back, client))
+            if self.source:
+                outside.bind((self.source, 0))
             self._outside[client] = outside
         self._put(outside, data, self.target)
 
