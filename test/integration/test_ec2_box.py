@@ -359,6 +359,39 @@ def test_two_regions_are_two_places(box, key):
     assert [i['InstanceId'] for r in found for i in r['Instances']] == [one.id]
 
 
+def test_groups_name_groups_and_a_reboot_is_no_new_boot(box, key):
+    one = Launched(box, key, config={'bootcmd': ['echo boot >>/boots'],
+                                     'runcmd': ['echo first >>/firsts']}).runs()
+    two = Launched(box, key).runs()
+    address = one.described()['PrivateIpAddress']
+
+    def reached():
+        said = box.run(two.id, f'timeout 1 bash -c "</dev/tcp/{address}/22" && echo yes',
+                       check=False)
+        return 'yes' in said
+
+    assert not reached()
+    one.ec2.authorize_security_group_ingress(GroupId=one.group, IpPermissions=[{
+        'IpProtocol': 'tcp', 'FromPort': 22, 'ToPort': 22,
+        'UserIdGroupPairs': [{'GroupId': two.group}]}])
+    assert reached()
+    refused('DependencyViolation', lambda: one.ec2.delete_security_group(GroupId=two.group))
+    public = one.described()['PublicIpAddress']
+    box.run(one.id, 'cloud-init status --wait')
+    one.ec2.reboot_instances(InstanceIds=[one.id])
+
+    def booted_twice():
+        return box.run(one.id, 'cat /boots /firsts', check=False).split() == [
+            'boot', 'boot', 'first']
+
+    wait_until(booted_twice, timeout=20, longest=0.2, what='the reboot')
+    assert one.runs().described()['PublicIpAddress'] == public
+    # and by its own word
+    box.run(one.id, 'reboot', check=False)
+    wait_until(lambda: box.run(one.id, 'wc -l </boots', check=False).strip() == '3', timeout=20,
+               longest=0.2, what='the second reboot')
+
+
 STARTER = """
 import sys, time, boto3
 from fogros2.testing.ec2 import Ec2Box

@@ -239,8 +239,10 @@ class Computer:
 
     def exit_status(self) -> int:
         """Return how its first process ended."""
-        found = self._engine.inspect([self._name])
-        return int(found[0]['State']['ExitCode']) if found else 0
+        # the engine learns of it a little after the kernel
+        told = self._engine.call('wait', '-i', '20ms', self._name, what='see an instance end',
+                                 check=False).stdout.split()
+        return int(told[0]) if told else 0
 
     def ask_to_end(self) -> None:
         """Press its power button: the first process goes down in order."""
