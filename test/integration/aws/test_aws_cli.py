@@ -12,8 +12,12 @@ boto3 = pytest.importorskip('boto3', reason='needs boto3')
 pytestmark = pytest.mark.timeout(240)
 
 
+#: Asking all regions is another test's.
+HERE = {'FOGROS2_AWS_REGIONS': 'us-east-1 eu-central-1'}
+
+
 def fog(robot, *words, **variables):
-    done = robot.ros2('fog', *words, **variables)
+    done = robot.ros2('fog', *words, **{**HERE, **variables})
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -43,7 +47,7 @@ def test_beside_a_launch_the_way_in_is_the_vpn(robot, box, name):
     status = json.loads(fog(robot, 'status', name, '--json'))
     assert status['problems'] == [] and status['agent']['nodes'][0]['state'] == 'running'
     assert doors(box) == []
-    refused = robot.ros2('fog', 'delete', name, '--yes')
+    refused = robot.ros2('fog', 'delete', name, '--yes', **HERE)
     assert refused.returncode != 0 and 'has the machine' in refused.stdout + refused.stderr
     run.interrupt()
     assert run.ended() == 0, run.text
