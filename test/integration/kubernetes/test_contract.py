@@ -173,3 +173,58 @@ def test_a_right_that_lacks_is_named_before_anything_is_made(
     assert f'may not {verb} {resource}' in str(error)
     assert 'role.yaml' in error.hint
     assert place.left() == []
+
+
+@pytest.mark.parametrize('expose', ['node_port', 'pod_dials_robot', 'pod_ip'])
+def test_the_way_is_the_one_that_was_asked_for(place, expose):
+    provider, machine_id, machine = run('asked', expose=expose)
+    provider.destroy(machine_id)
+    assert f'UDP by {expose}' in machine.note
+    assert (machine.vpn_host == '') is (expose == 'pod_dials_robot')
+    assert (machine.vpn_port > 0) is (expose == 'node_port')
+    assert machine.robot_host
+    if expose == 'pod_ip':
+        assert machine.vpn_host == machine.inner_host
+
+
+def test_a_load_balancer_is_waited_for(place, client):
+    """Nobody makes any here, so the test does what a cloud would, with the node's address."""
+    services = f'/api/v1/namespaces/{place.name}/services'
+
+    def provide():
+        def made():
+            return [one for one in place.all('services')
+                    if one['spec']['type'] == 'LoadBalancer'] or None
+
+        service, = wait_until(made, timeout=30.0, what='the Service')
+        node, = client.ask('GET', '/api/v1/nodes')['items']
+        address = next(each['address'] for each in node['status']['addresses']
+                       if each['type'] == 'InternalIP')
+        name = service['metadata']['name']
+        client.ask('PATCH', f'{services}/{name}/status', {
+            'status': {'loadBalancer': {'ingress': [{'ip': address}]}}})
+
+    cloud = threading.Thread(target=provide)
+    cloud.start()
+    try:
+        provider, machine_id, machine = run('balanced', expose='load_balancer')
+        provider.destroy(machine_id)
+    finally:
+        cloud.join()
+    assert 'UDP by load_balancer' in machine.note
+    # at the load balancer the port is the VPN's own
+    assert machine.vpn_port >= 49152 or machine.vpn_port == 51820
+
+
+def test_a_way_that_lets_nothing_through_is_told(place, monkeypatch):
+    """With a node's port that nobody answers at: what a firewall in between does."""
+    monkeypatch.setattr('fogros2.provider.kubernetes.exposure.NODE_PORT', 1.0)
+    monkeypatch.setattr('fogros2.provider.kubernetes.exposure.node_port', lambda service: 9)
+    error = raised(ProviderError, lambda: run('shut', expose='node_port'))
+    assert 'port 9 of the node' in str(error)
+    assert 'pod_dials_robot' in error.hint
+    provider, machine_id, machine = run('shut')
+    provider.destroy(machine_id)
+    # and where the choice is ours the next way is taken
+    assert machine.vpn_host == ''
+    assert 'pod_dials_robot: port 9 of the node' in machine.note
