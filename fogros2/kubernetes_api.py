@@ -387,7 +387,11 @@ def _load(context: str) -> tuple[str, str, Any]:
             raise PrerequisiteError(
                 f"the kubeconfig has no context '{name}'", f"there are: {', '.join(names)}")
         entry = next(each for each in contexts if each['name'] == name)
-        client = config.new_client_from_config(files, context=name)
+        settings = type.__call__(kubernetes.client.Configuration)
+        config.load_kube_config(files, context=name, client_configuration=settings)
+        # a connection for each of many machines that come up at once
+        settings.connection_pool_maxsize = 64
+        client = kubernetes.client.ApiClient(settings)
     except (config.ConfigException, OSError, ValueError, TypeError, KeyError) as error:
         raise PrerequisiteError(f"the kubeconfig {files} can't be used: {_words(error)}",
                                 '`kubectl config view` shows it') from error

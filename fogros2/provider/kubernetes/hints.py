@@ -15,7 +15,7 @@ RIGHTS: tuple[Right, ...] = (
     ('', 'pods', ('create', 'get', 'list', 'watch', 'deletecollection')),
     ('', 'pods/exec', ('create', 'get')),
     ('', 'events', ('list',)),
-    ('', 'services', ('create', 'get', 'list')),
+    ('', 'services', ('create', 'get', 'watch')),
 )
 
 _FORBIDDEN = re.compile(
