@@ -38,6 +38,7 @@ def wait_until(
     cancel: Optional[threading.Event] = None,
     interval: float = 0.02,
     longest: float = 1.0,
+    first: float = 0.0,
 ) -> T:
     """
     Call ``probe`` until it returns something other than None or False, and return that.
@@ -46,11 +47,13 @@ def wait_until(
     and a slow one isn't flooded.
 
     :param what: completes 'timed out after 30 s waiting for ...'.
+    :param first: seconds before the first call, for what never is there at once.
     :raises DeadlineExceeded: after ``timeout`` seconds.
     :raises Cancelled: as soon as ``cancel`` is set.
     """
     deadline = time.monotonic() + timeout
     cancel = cancel or threading.Event()
+    cancel.wait(first)
     while True:
         if cancel.is_set():
             raise Cancelled(f'waiting for {what}')

@@ -78,7 +78,7 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'arch': 'riscv'}, 'x86_64 or arm64'),
     ({'disk_size': 'lots'}, 'a whole number'),
     ({'disk_size': 30.5}, 'a whole number'),
-    ({'disk_size': 0}, 'a disk can not have 0 GB'),
+    ({'disk_size': 7}, 'a disk can not have 7 GB'),
     ({'spot': 'perhaps'}, 'True or False'),
     ({'max_price': 'cheap'}, "can't be 'cheap'"),
     ({'security_groups': ['default']}, 'takes sg-'),

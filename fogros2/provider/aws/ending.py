@@ -28,18 +28,28 @@ def destroy(account: Account, machine: MachineId) -> None:
 
     :raises FogError: something could not be deleted.
     """
-    if _there(account, machine):
-        try:
-            account.call('ec2', machine.region, 'terminate_instances',
-                         f'ending {machine.instance}', InstanceIds=[machine.instance])
-        except AwsError as error:
-            if code_of(error) not in GONE:
-                raise
-        wait_until(
-            lambda: not _there(account, machine), timeout=PATIENCE, interval=1.0, longest=5.0,
-            what=f'{machine.instance} in {machine.region} to be terminated',
-            hint='ros2 fog delete again later')
+    # what this process has made is ours without asking
+    if machine.instance in account.made or _there(account, machine):
+        if _terminate(account, machine):
+            # it takes EC2 half a minute and more
+            wait_until(
+                lambda: not _there(account, machine), timeout=PATIENCE, first=1.0, interval=4.0,
+                longest=15.0, what=f'{machine.instance} in {machine.region} to be terminated',
+                hint='ros2 fog delete again later')
     sweep(account, machine.region, machine.attempt)
+
+
+def _terminate(account: Account, machine: MachineId) -> bool:
+    """Have an instance end; returns whether there is something to wait for."""
+    try:
+        answer = account.call('ec2', machine.region, 'terminate_instances',
+                              f'ending {machine.instance}', InstanceIds=[machine.instance])
+    except AwsError as error:
+        if code_of(error) in GONE:
+            return False
+        raise
+    return any(entry['CurrentState']['Name'] != 'terminated'
+               for entry in answer['TerminatingInstances'])
 
 
 def _there(account: Account, machine: MachineId) -> bool:
@@ -54,15 +64,30 @@ def _there(account: Account, machine: MachineId) -> bool:
 def sweep(account: Account, region: str, attempt: str) -> None:
     """Delete what an attempt made besides its instance: key, group, addresses, disks."""
     drop_key(account, region, attempt)
-    drop_groups(account, region, attempt)
-    mine = [{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]}]
-    for address in account.call('ec2', region, 'describe_addresses', 'looking for addresses',
-                                Filters=mine)['Addresses']:
-        _gone_is_fine(account, region, 'release_address', 'releasing an address',
-                      AllocationId=address['AllocationId'])
+    left = [str(entry['ResourceId']) for entry in account.pages(
+        'ec2', region, 'describe_tags', 'Tags', 'looking for what is left',
+        Filters=[{'Name': 'key', 'Values': [TAG_ATTEMPT]},
+                 {'Name': 'value', 'Values': [attempt]}])]
+    groups = [each for each in left if each.startswith('sg-')]
+    if groups:
+        network.delete_groups(account, region, groups, timeout=PATIENCE)
+    else:
+        # tags are told a little late: its name tells for sure
+        drop_groups(account, region, attempt)
+    for address in left:
+        if address.startswith('eipalloc-'):
+            _gone_is_fine(account, region, 'release_address', 'releasing an address',
+                          AllocationId=address)
+    if any(each.startswith('vol-') for each in left):
+        _drop_volumes(account, region, attempt)
+
+
+def _drop_volumes(account: Account, region: str, attempt: str) -> None:
+    # the instance's own goes with it, and is told of for some time
     volumes: Iterable[Mapping[str, Any]] = account.call(
         'ec2', region, 'describe_volumes', 'looking for disks',
-        Filters=[*mine, {'Name': 'status', 'Values': ['available', 'error']}])['Volumes']
+        Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
+                 {'Name': 'status', 'Values': ['available', 'error']}])['Volumes']
     for volume in volumes:
         _gone_is_fine(account, region, 'delete_volume', 'deleting a disk',
                       VolumeId=volume['VolumeId'])

@@ -10,7 +10,6 @@ from fogros2.provider.aws.instances import TAG_ATTEMPT
 
 #: Asked of what anybody has.
 LOOK = (
-    'ec2:DescribeAddresses',
     'ec2:DescribeImages',
     'ec2:DescribeInstanceTypes',
     'ec2:DescribeInstances',
@@ -19,6 +18,7 @@ LOOK = (
     'ec2:DescribeSecurityGroups',
     'ec2:DescribeSnapshots',
     'ec2:DescribeSubnets',
+    'ec2:DescribeTags',
     'ec2:DescribeVolumes',
     'ssm:GetParameter',
 )

@@ -24,6 +24,8 @@ UBUNTU = {
     'x86_64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id',
     'arm64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id',
 }
+#: The name of its disk.
+ROOT_DEVICE = '/dev/sda1'
 #: The same with NVIDIA's driver in it.
 DEEP_LEARNING = {
     'x86_64': '/aws/service/deeplearning/ami/x86_64/'
@@ -105,6 +107,10 @@ def choose(
     parameter = (DEEP_LEARNING if kind.nvidia else UBUNTU)[kind.arch]
     identity = account.call('ssm', region, 'get_parameter', f'asking for the image {parameter}',
                             Name=parameter)['Parameter']['Value']
+    if not kind.nvidia:
+        # what else would be asked of it is known
+        return {'ImageId': str(identity), 'RootDeviceName': ROOT_DEVICE,
+                'Architecture': kind.arch}
     return _named(account, region, kind, str(identity))
 
 

@@ -150,9 +150,9 @@ def _check(options: Options) -> None:
     if options.arch not in _ARCHES:
         raise ConfigurationError(f"there are no machines of the architecture '{options.arch}'",
                                  'arch= takes x86_64 or arm64')
-    if not 1 <= options.disk_size <= 65536:
+    if not 8 <= options.disk_size <= 65536:
         raise ConfigurationError(f'a disk can not have {options.disk_size} GB',
-                                 'disk_size= takes 8 to 16384; the image has to fit')
+                                 'disk_size= takes 8 to 65536')
     for group in options.security_groups:
         if not re.fullmatch(r'sg-[0-9a-f]+', group):
             raise ConfigurationError(f"'{group}' is no id of a security group",

@@ -237,9 +237,10 @@ class AWSProvider(Provider):
             ready = found.state is MachineState.RUNNING and found.shell is not None
             return dataclasses.replace(found, id=machine_id) if ready else None
 
-        # the boot takes ten seconds and more: few questions, but a fast one is seen at once
-        return wait_until(look, timeout=timeout, cancel=cancel, interval=0.25, longest=4.0,
-                          what=f"'{name}' ({machine.instance}) to run")
+        # it takes EC2 some ten seconds: few questions, but a fast one is seen soon
+        return wait_until(
+            look, timeout=timeout, cancel=cancel, first=0.3, interval=1.0, longest=4.0,
+            what=f"'{name}' ({machine.instance}) to run")
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the instances that carry all of ``tags``, of all regions at once."""
