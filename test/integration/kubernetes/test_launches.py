@@ -193,8 +193,8 @@ def test_an_api_server_that_restarts_is_waited_for(launch, namespace, kubernetes
     run.wait_for('I heard', times=before + 5, timeout=20.0)
     kubernetes.start('kube-apiserver')
     # the agent's events come again
-    before = run.text.count('[talker-')
-    run.wait_for('[talker-', times=before + 5)
+    before = run.text.count('[patient.talker-1]')
+    run.wait_for('[patient.talker-1]', times=before + 5)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert namespace.left() == []
@@ -226,7 +226,7 @@ def test_twenty_pods_of_one_launch(launch, namespace):
                  *(f"listener(namespace='n{n}')" for n in (0, 19)))
     for number in (0, 19):
         run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=240.0)
-    run.wait_for('[talker-', times=20)
+    run.wait_for('.talker-1]', times=20)
     assert len(namespace.all('pods')) == 20
     run.interrupt()
     assert run.ended(120.0) == 0, run.text
