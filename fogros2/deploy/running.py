@@ -69,13 +69,16 @@ class RunningMachine:
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
-        # at its end a launch doesn't wait for a machine that is out of reach
-        timeout = self._job.patience(30.0) if self._launch.cancel.is_set() else 30.0
-        self.agent.request('stop', timeout=timeout, nodes=None if ids is None else list(ids))
+        self.agent.request('stop', timeout=self._patience(),
+                           nodes=None if ids is None else list(ids))
 
     def signal(self, node: str, name: str) -> None:
         """Send a node a signal, by its name (``SIGUSR1``)."""
-        self.agent.request('signal', node=node, signal=name)
+        self.agent.request('signal', timeout=self._patience(), node=node, signal=name)
+
+    def _patience(self) -> float:
+        """Return how long a request may take: at the end nobody out of reach is waited for."""
+        return self._job.patience(30.0) if self._launch.cancel.is_set() else 30.0
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """

@@ -71,24 +71,38 @@ class SSHShell:
         :raises DeadlineExceeded: it takes no more channels, or answers no more.
         """
         patience = min(self._timeout, timeout or self._timeout)
-        return wait_until(
-            lambda: self._try_channel(min(patience, _ATTEMPT)), timeout=patience, longest=0.1,
-            cancel=cancel,
-            what=f"a session on '{self.name}'", hint='raise MaxSessions of its SSH server')
+        refused = False
 
-    def _try_channel(self, patience: float) -> Optional[paramiko.Channel]:
+        def attempt() -> Optional[paramiko.Channel]:
+            nonlocal refused
+            channel, refused = self._try_channel(min(patience, _ATTEMPT))
+            return channel
+
+        try:
+            return wait_until(
+                attempt, timeout=patience, longest=0.1, cancel=cancel,
+                what=f"a session on '{self.name}'", hint='raise MaxSessions of its SSH server')
+        except DeadlineExceeded as error:
+            if refused:
+                raise
+            raise ConnectError(f"'{self.name}' has not answered for {patience:g} s",
+                               "check the robot's network") from error
+
+    def _try_channel(self, patience: float) -> tuple[Optional[paramiko.Channel], bool]:
+        """Return a new channel, or None and whether it was the server who gave none."""
         transport = self._connected(patience)
         import paramiko
         begin = time.monotonic()
         try:
-            return transport.open_session(window_size=1 << 22, timeout=patience)
+            return transport.open_session(window_size=1 << 22, timeout=patience), False
         except (paramiko.SSHException, EOFError, OSError):
             # Lost, as we find out only now, and nothing has been started yet; or as many
             # sessions as the server allows, and one of ours will end. What is raised doesn't
             # tell: paramiko keeps one exception for all threads. Nor does is_active().
-            if not transport.is_alive() or time.monotonic() - begin >= patience:
+            silent = time.monotonic() - begin >= patience
+            if silent or not transport.is_alive():
                 self._drop(transport)
-            return None
+            return None, not silent
 
     def _connected(self, patience: float) -> paramiko.Transport:
         until = time.monotonic() + patience

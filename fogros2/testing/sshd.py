@@ -18,6 +18,8 @@ from fogros2 import process
 from fogros2.model import Command, Endpoint
 from fogros2.waiting import wait_until
 
+# a login shell that is bash reads the user's ~/.bashrc for sshd at the first shell level alone:
+# what stands there, and what a cut connection leaves of it, is none of a test's business
 _CONFIG = """\
 ListenAddress 127.0.0.1
 Port {port}
@@ -32,6 +34,7 @@ KbdInteractiveAuthentication no
 PermitRootLogin prohibit-password
 PrintMotd no
 LogLevel ERROR
+SetEnv SHLVL=2
 """
 
 
