@@ -16,9 +16,11 @@ from fogros2 import bootstrap, model, plan, process
 from fogros2.deploy.job import Job
 from fogros2.errors import (
     ConfigurationError,
+    FogError,
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
+    ProviderError,
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineState
@@ -38,7 +40,7 @@ class Creation:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._asked = False
+        self._asked = self._refused = False
 
     def run(self) -> Machine:
         """
@@ -145,10 +147,14 @@ class Creation:
         }
         key = self._login_key() if job.provider.owned and job.provider.shell_kind == 'ssh' else ''
         self._asked = True
-        machine_id = job.provider.create(job.spec, CreateRequest(
-            token=token, authorized_key=key, tags=tags,
-            vpn_port=plan.machine_port(job.launch.id), agent_config=config,
-            dependencies=dependencies, cancel=job.cancel))
+        try:
+            machine_id = job.provider.create(job.spec, CreateRequest(
+                token=token, authorized_key=key, tags=tags,
+                vpn_port=plan.machine_port(job.launch.id), agent_config=config,
+                dependencies=dependencies, cancel=job.cancel))
+        except ProviderError:
+            self._refused = True
+            raise
         job.save(machine_id=machine_id)
 
     def _dependencies(self) -> str:
@@ -211,3 +217,7 @@ class Creation:
                 {TAG_NAME: job.name, TAG_LAUNCH: job.launch.id})]
         except Unsupported:
             return []
+        except FogError:
+            if not self._refused:
+                raise
+            return []  # by its own word nothing is left; this was a second look

@@ -99,6 +99,14 @@ def test_a_machine_is_ended_whose_creation_failed_half_way(launch, provider, mon
     assert list(provider.find({})) == []
 
 
+def test_of_a_refused_creation_nothing_is_told_but_the_refusal(launch, provider):
+    refused = ProviderError('your token has expired')
+    provider.failures.update(create=refused, find=refused)
+    with pytest.raises(ProviderError, match='has expired'):
+        launch.up(SPEC)
+    assert launch.down() == []
+
+
 def kept(store, provider, **changes):
     """Leave a machine behind, as a launch does that keeps it."""
     spec = MachineSpec('planner', 'fake', on_exit='keep', options={'size': 1})
