@@ -25,6 +25,8 @@ from fogros2.kubernetes_api import cancelled
 
 #: Seconds between two questions.
 INTERVAL = 0.1
+#: Questions to one place that may still be answered.
+ROUNDS = 10
 #: Seconds in which a load balancer has to be there, and to answer: clouds take minutes.
 LOAD_BALANCER = 180.0
 #: Seconds in which a port of a node that is going to answer does.
@@ -120,31 +122,48 @@ def first_to_answer(
     """
     question = word.encode() + b' ' + secrets.token_hex(8).encode()
     deadline = time.monotonic() + timeout
-    with contextlib.ExitStack() as undo:
-        links: dict[socket.socket, tuple[str, int]] = {}
-        for host, port in places:
-            with contextlib.suppress(OSError):
-                family, kind, protocol, _, address = socket.getaddrinfo(
-                    host, port, socket.AF_INET, socket.SOCK_DGRAM)[0]
-                link = undo.enter_context(socket.socket(family, kind, protocol))
-                link.setblocking(False)
-                # connected: another's datagram isn't taken for an answer
-                link.connect(address)
-                links[link] = (str(address[0]), port)
-        while links and time.monotonic() < deadline:
+    known = _resolved(places)
+    links: dict[socket.socket, tuple[str, int]] = {}
+    try:
+        while known and time.monotonic() < deadline:
             cancelled(cancel, 'looking for a way into the cluster')
-            for link in links:
+            # From a port of its own each time: the node remembers what became of the first
+            # datagram of a pair of ports, and that may have been before it knew the pod.
+            for place in known:
                 with contextlib.suppress(OSError):
+                    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                    links[link] = place
+                    link.setblocking(False)
+                    link.connect(place)  # another's datagram isn't taken for an answer
                     link.send(question)
-            ready, _, _ = select.select(list(links), [], [], INTERVAL)
-            for link in ready:
-                with contextlib.suppress(OSError):
-                    if link.recv(512) == question:
-                        return links[link]
-            if ready and not any(link.fileno() < 0 for link in links):
-                # refused, by a node that isn't ready: not a reason to ask in a tight loop
-                (cancel or threading.Event()).wait(INTERVAL / 2)
+            begin = time.monotonic()
+            while (left := begin + INTERVAL - time.monotonic()) > 0:
+                ready, _, _ = select.select(list(links), [], [], left)
+                for link in ready:
+                    place = links[link]
+                    with contextlib.suppress(OSError):
+                        if link.recv(512) == question:
+                            return place
+                    # refused, by a node that isn't ready
+                    del links[link]
+                    link.close()
+            for link in list(links)[:-ROUNDS * len(known)]:
+                del links[link]
+                link.close()
+    finally:
+        for link in links:
+            link.close()
     return None
+
+
+def _resolved(places: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Return places by address, without those whose name nobody knows (yet)."""
+    found = []
+    for host, port in places:
+        with contextlib.suppress(OSError):
+            address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+            found.append((str(address[0]), port))
+    return found
 
 
 def own_address(server: str) -> str:
