@@ -368,6 +368,7 @@ def _load(context: str) -> tuple[str, str, Any]:
         raise PrerequisiteError(
             f"Kubernetes' client for Python is missing: {error}",
             "python3 -m pip install 'fogros2[kubernetes]'") from error
+    import yaml
     config: Any = kubernetes.config
     if not kubeconfig_files():
         if not configured():
@@ -392,10 +393,34 @@ def _load(context: str) -> tuple[str, str, Any]:
         # a connection for each of many machines that come up at once
         settings.connection_pool_maxsize = 64
         client = kubernetes.client.ApiClient(settings)
-    except (config.ConfigException, OSError, ValueError, TypeError, KeyError) as error:
+        _check_plugin(str(entry['context'].get('user', '')), settings)
+    except (config.ConfigException, yaml.YAMLError, OSError, ValueError, TypeError, KeyError,
+            AttributeError) as error:
         raise PrerequisiteError(f"the kubeconfig {files} can't be used: {_words(error)}",
                                 '`kubectl config view` shows it') from error
     return name, str(entry['context'].get('namespace') or 'default'), client
+
+
+def _check_plugin(user: str, settings: Any) -> None:
+    """
+    Look whether the program that a kubeconfig names has given credentials.
+
+    The client goes on without, as nobody, and every request would be refused.
+
+    :raises PrerequisiteError: it hasn't.
+    """
+    if settings.auth_settings() or settings.cert_file:
+        return
+    import yaml
+    texts = (yaml.safe_load(path.read_text()) or {} for path in kubeconfig_files())
+    known = [each for text in texts for each in text.get('users') or ()]
+    for each in known:
+        plugin = (each.get('user') or {}).get('exec') if each.get('name') == user else None
+        if plugin:
+            raise PrerequisiteError(
+                f"'{plugin.get('command')}', by which the kubeconfig logs '{user}' in, gave no "
+                'credentials', ' '.join(str(plugin.get('installHint') or '').split())
+                or 'is it installed, and are you logged in? `kubectl get pods` asks the same')
 
 
 def _tls(configuration: Any) -> dict[str, Any]:

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The API server's side of requests and watches, with an API server that does as it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import http.server
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+import yaml
+
+from fogros2 import kubernetes_api
+from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
+from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.testing.shell_contract import raised
+
+pytest.importorskip('kubernetes', reason="needs the client: pip install 'fogros2[kubernetes]'")
+
+#: What a request is answered: a status and an object, or lines and whether to hold on then.
+Answer = tuple[int, Any]
+
+
+class Server(http.server.ThreadingHTTPServer):
+    """Answers each request by the next of ``answers``, and notes it."""
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(('127.0.0.1', 0), Handler)
+        self.answers: list[Answer | Callable[[], Answer]] = []
+        self.asked: list[tuple[str, str, dict[str, list[str]], dict[str, str]]] = []
+        self.ended = threading.Event()
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+
+    protocol_version = 'HTTP/1.1'
+    server: Server
+
+    def do_GET(self) -> None:
+        self.rfile.read(int(self.headers.get('content-length') or 0))
+        url = urlsplit(self.path)
+        self.server.asked.append(
+            (self.command, url.path, parse_qs(url.query), dict(self.headers)))
+        answer = self.server.answers.pop(0)
+        status, what = answer() if callable(answer) else answer
+        self.send_response(status)
+        if isinstance(what, list):
+            self.send_header('transfer-encoding', 'chunked')
+            self.end_headers()
+            for event in what:
+                if event == 'hold':
+                    self.server.ended.wait(20.0)
+                    break
+                line = json.dumps(event).encode() + b'\n'
+                self.wfile.write(f'{len(line):x}\r\n'.encode() + line + b'\r\n')
+                self.wfile.flush()
+            self.wfile.write(b'0\r\n\r\n')
+            return
+        data = json.dumps(what).encode()
+        self.send_header('content-length', str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    do_POST = do_PATCH = do_DELETE = do_GET
+
+    def log_message(self, *words: object) -> None:
+        """Say nothing."""
+
+
+def kubeconfig(path: Path, server: str, **user: Any) -> Path:
+    path.write_text(yaml.safe_dump({
+        'apiVersion': 'v1', 'kind': 'Config', 'current-context': 'first',
+        'clusters': [{'name': 'c', 'cluster': {'server': server}}],
+        'users': [{'name': 'u', 'user': user or {'token': 'a-token'}}],
+        'contexts': [
+            {'name': 'first', 'context': {'cluster': 'c', 'user': 'u', 'namespace': 'robots'}},
+            {'name': 'second', 'context': {'cluster': 'c', 'user': 'u'}}]}))
+    return path
+
+
+@pytest.fixture
+def server():
+    with Server() as found:
+        thread = threading.Thread(target=found.serve_forever, args=(0.02,))
+        thread.start()
+        yield found
+        found.ended.set()
+        found.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def api(server, tmp_path, monkeypatch):
+    path = kubeconfig(tmp_path / 'config', f'http://127.0.0.1:{server.server_port}')
+    monkeypatch.setenv('KUBECONFIG', str(path))
+    return kubernetes_api.connect()
+
+
+def refusal(status: int, reason: str, message: str) -> Answer:
+    return status, {'kind': 'Status', 'status': 'Failure', 'reason': reason, 'message': message}
+
+
+def event(kind: str, name: str) -> dict[str, Any]:
+    return {'type': kind, 'object': {'metadata': {'name': name}}}
+
+
+def follow(api, look, **more: Any) -> Any:
+    return api.follow('/api/v1/pods', look, **{
+        'timeout': 10.0, 'what': 'the pod', 'labelSelector': 'a=b', **more})
+
+
+def names_of(seen: list[str]) -> Callable[[str, dict[str, Any]], str | None]:
+    def look(kind: str, thing: dict[str, Any]) -> str | None:
+        name = str(thing['metadata']['name'])
+        seen.append(f'{kind} {name}')
+        return name if name == 'last' else None
+    return look
+
+
+def test_the_context_says_where_and_as_whom(api, server):
+    server.answers = [(200, {'items': []})]
+    assert (api.context, api.namespace) == ('first', 'robots')
+    api.request('GET', '/api/v1/pods', labelSelector='a=b,c', nothing=None)
+    (method, path, query, headers), = server.asked
+    assert (method, path, query) == ('GET', '/api/v1/pods', {'labelSelector': ['a=b,c']})
+    assert headers['authorization'] == 'Bearer a-token'
+
+
+def test_one_context_by_two_names_is_one(api):
+    assert kubernetes_api.connect('first') is api
+    other = kubernetes_api.connect('second')
+    assert other is not api
+    assert other.namespace == 'default'
+
+
+def test_a_context_that_is_not_there_is_named(api):
+    error = raised(PrerequisiteError, lambda: kubernetes_api.connect('third'))
+    assert "'third'" in str(error)
+    assert 'first, second' in error.hint
+
+
+def test_a_kubeconfig_that_is_none_is_told(tmp_path, monkeypatch):
+    path = tmp_path / 'config'
+    monkeypatch.setenv('KUBECONFIG', str(path))
+    assert not kubernetes_api.configured()
+    error = raised(PrerequisiteError, kubernetes_api.connect)
+    assert 'kubeconfig' in str(error)
+    for text in ('', 'no: [yaml', '[]', 'contexts: 3'):
+        path.write_text(text)
+        assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_api.connect))
+
+
+def test_credentials_that_a_plugin_does_not_give_are_told(tmp_path, monkeypatch):
+    monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9', **{
+        'exec': {'apiVersion': 'client.authentication.k8s.io/v1', 'interactiveMode': 'Never',
+                 'command': '/no/such/plugin', 'args': []}})))
+    error = raised(PrerequisiteError, kubernetes_api.connect)
+    assert '/no/such/plugin' in str(error)
+
+
+def test_a_refusal_keeps_its_words(api, server):
+    server.answers = [refusal(409, 'AlreadyExists', 'jobs.batch "x" already exists')]
+    error = raised(ApiError, lambda: api.request('POST', '/x', {'a': 1}))
+    assert isinstance(error, ApiError)
+    assert (error.status, error.reason) == (409, 'AlreadyExists')
+    assert str(error) == 'jobs.batch "x" already exists'
+    assert server.asked[0][3]['content-type'] == 'application/json'
+
+
+def test_an_overloaded_server_is_asked_again(api, server):
+    server.answers = [refusal(429, 'TooManyRequests', 'later'), (503, 'no JSON object'),
+                      (200, {'a': 1})]
+    assert api.request('GET', '/x') == {'a': 1}
+
+
+def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9')))
+    api = kubernetes_api.connect()
+    begin = time.monotonic()
+    error = raised(Unreachable, lambda: api.request('GET', '/x', patience=0.5))
+    assert 0.4 < time.monotonic() - begin < 10.0
+    assert 'Connection refused' in str(error)
+    assert '0x' not in str(error)
+
+
+def test_a_right_that_lacks_is_believed_but_not_after_a_restart(api, server):
+    lacking = refusal(403, 'Forbidden', 'User "robot" cannot get resource "jobs"')
+    server.answers = [lacking]
+    raised(ApiError, lambda: api.request('GET', '/x'))
+    server.answers = [lacking, lacking, (200, {})]
+    api.request('DELETE', '/x', doubt=5.0)
+    api.lost()
+    server.answers = [lacking, (200, {})]
+    api.request('GET', '/x')
+
+
+def test_a_watch_tells_what_is_there_and_what_comes(api, server):
+    seen: list[str] = []
+    server.answers = [(200, [event('ADDED', 'a'), event('MODIFIED', 'a'), event('ADDED', 'last'),
+                             'hold'])]
+    assert follow(api, names_of(seen)) == 'last'
+    assert seen == ['ADDED a', 'MODIFIED a', 'ADDED last']
+    assert server.asked[0][2] == {'watch': ['true'], 'labelSelector': ['a=b']}
+
+
+def test_a_watch_that_ends_is_begun_anew_from_what_is_there_then(api, server):
+    seen: list[str] = []
+    asked: list[int] = []
+    server.answers = [(200, [event('ADDED', 'a')]), refusal(410, 'Expired', 'too old'),
+                      refusal(503, '', 'restarting'), (200, [event('ADDED', 'last'), 'hold'])]
+
+    def again() -> None:
+        asked.append(len(server.asked))
+
+    assert follow(api, names_of(seen), again=again, resourceVersion='7') == 'last'
+    assert seen == ['ADDED a', 'ADDED last']
+    assert 'resourceVersion' in server.asked[0][2]
+    assert all('resourceVersion' not in query for _, _, query, _ in server.asked[1:])
+    assert asked == [1, 2, 3]
+
+
+def test_what_is_there_after_a_loss_may_be_enough(api, server):
+    server.answers = [(200, [])]
+    assert follow(api, lambda kind, thing: None, again=lambda: 'gone') == 'gone'
+
+
+def test_a_watch_that_is_not_allowed_says_so(api, server):
+    server.answers = [refusal(403, 'Forbidden', 'cannot watch resource "pods"')]
+    error = raised(ApiError, lambda: follow(api, lambda kind, thing: None))
+    assert 'cannot watch' in str(error)
+
+
+def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server):
+    server.answers = [(200, ['hold']), (200, ['hold'])]
+    cancel = threading.Event()
+    timer = threading.Timer(0.2, cancel.set)
+    timer.start()
+    begin = time.monotonic()
+    raised(Cancelled, lambda: follow(api, lambda kind, thing: None, cancel=cancel))
+    timer.join()
+    raised(DeadlineExceeded, lambda: follow(api, lambda kind, thing: None, timeout=0.3))
+    # nobody waits for a thread that reads on
+    assert time.monotonic() - begin < 3.0
+    assert not [thread for thread in threading.enumerate() if thread.name == 'fog-watch']
+
+
+def test_something_else_can_end_a_watch(api, server):
+    server.answers = [(200, ['hold'])]
+    ticks: list[int] = []
+
+    def tick() -> str | None:
+        ticks.append(1)
+        return 'late' if len(ticks) > 2 else None
+
+    assert follow(api, lambda kind, thing: None, tick=tick) == 'late'
+
+
+def test_the_provider_is_there_without_the_client():
+    """``ros2 fog list`` names it, and must not take the time that the client takes to load."""
+    code = ('import sys; import fogros2.provider.kubernetes, fogros2.shell.kubernetes, '
+            'fogros2.kubernetes_api; '
+            'print([m for m in ("kubernetes", "urllib3", "websocket") if m in sys.modules])')
+    told = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=True, env={**os.environ, 'KUBECONFIG': '/nowhere'})
+    assert told.stdout == '[]\n'
