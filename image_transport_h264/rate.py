@@ -26,6 +26,10 @@ LOST = 1.5
 MEMORY, ARRIVALS = 10.0, 0.5
 #: What is left of the measured rate, and how the bitrate grows afterwards.
 YIELD, GROWTH, GROWTH_INTERVAL, CALM = 0.8, 1.15, 0.25, 0.5
+#: A queue shrinks after the bitrate has given way. What stays, and isn't so many times as long, is
+#: no queue of ours but a busy computer, say: the bitrate waits for so many seconds before it gives
+#: way again, and for twice as many each time, up to a limit.
+WORSE, PATIENCE, MOST_PATIENCE = 1.3, 5.0, 60.0
 #: Seconds after a loss for which more are expected.
 LOSS_MEMORY = 20.0
 #: Bits per pixel below which fewer pictures look better than worse ones.
@@ -56,6 +60,8 @@ class Governor:
         self._arrivals: deque[tuple[float, int]] = deque()
         self._waits: deque[tuple[float, float]] = deque()
         self._cut = -1e9
+        self._waited = 0.0
+        self._patience = 0.0
         self._calm_since = 0.0
         self._grown = 0.0
         self._rate = 0.0
@@ -110,8 +116,13 @@ class Governor:
         if least > QUEUE:
             self._calm_since = now
             if (sent.when > self._cut and len(self._waits) >= QUEUE_ACKNOWLEDGEMENTS
-                    and now - self._waits[0][0] > 0.7 * QUEUE_SECONDS):
+                    and now - self._waits[0][0] > 0.7 * QUEUE_SECONDS
+                    and (now - self._cut > self._patience or least > WORSE * self._waited)):
+                self._patience = min(MOST_PATIENCE, max(PATIENCE, 2 * self._patience))
+                self._waited = least
                 self._yield(now)
+        elif now - self._calm_since > CALM:
+            self._patience = 0.0
 
     def may_send(self, now: float, pixels: int, interval: float) -> bool:
         """

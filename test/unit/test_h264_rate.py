@@ -107,6 +107,19 @@ def test_a_link_with_room_is_left_alone() -> None:
     assert {record.bitrate for record in records} == {8_000_000}
 
 
+def test_a_computer_that_is_busy_for_long_is_no_slow_link() -> None:
+    """All acknowledgements late, for seconds: giving way again and again would help nobody."""
+    chance = random.Random(2)
+
+    def stall(now: float) -> float:
+        return 0.08 + chance.uniform(0.0, 0.02) if 101 < now < 107 else 0.0
+
+    control = Control(Settings(bitrate=8_000_000))
+    records = stream(lambda now: 50e6, 10, control=control, stall=stall)
+    used = bits(between(records, 0, 1), 1)
+    assert min(record.bitrate for record in records) > 0.4 * used
+
+
 def test_the_rate_drops_from_10_to_1_megabit_and_returns() -> None:
     """Within a second the stream fits; latency stays bounded; it recovers afterwards."""
     records = stream(lambda now: 1e6 if 104 <= now < 110 else 10e6, 20)
