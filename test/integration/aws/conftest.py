@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from importlib import metadata
 import os
 from pathlib import Path
 import shutil
@@ -17,8 +18,29 @@ from fogros2.testing.ec2 import Ec2Box
 from fogros2.testing.launched import Launched, launching, ros2
 from fogros2.waiting import wait_until
 
+HERE = Path(__file__).parent
+BOX = 'test_ec2_box.py'
 #: The region that the user of these tests has configured.
 REGION = 'us-east-1'
+
+
+#: What is tried on ROS 2 as well as on the embedded default: what its launch and nodes have a part
+#: in. All else is AWS's and the box's, the same on either, and takes minutes.
+ON_BOTH = (
+    'test_the_talker_from_nothing_to_nothing', 'test_fogros2s_own_launch_file_runs_unchanged',
+    'test_fogros2s_own_choice_of_region_and_type', 'test_two_regions_hear_each_other')
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave to the embedded default what is the same there, unless it is asked for by name."""
+    embedded = any(found.name == 'ros2-embedded' for found in metadata.distributions())
+    if embedded or config.option.keyword or 
+            'aws' in word or 'ec2' in word for word in config.args):
+        return
+    left = [item for item in items if item.path.parent == HERE or item.path.name == BOX
+            if item.name not in ON_BOTH]
+    items[:] = [item for item in items if item not in left]
+    config.hook.pytest_deselected(items=left)
 
 
 class Robot:
