@@ -40,6 +40,9 @@ class FogError(RuntimeError):
     :param hint: what to do about it, in one line; may be empty.
     """
 
+    #: Set by who was asked to make something: nothing was made, and there is nothing to look for.
+    refused: bool = False
+
     def __init__(self, message: str, hint: str = '') -> None:
         super().__init__(message)
         self.hint = hint

@@ -67,8 +67,11 @@ class Watched:
     def _called(self, params, model, **words):
         self.calls.append((f'{model.service_model.endpoint_prefix}:{model.name}', dict(params)))
 
-    def refuse(self, operation: str, *codes: str | None, said: str = 'as AWS said') -> None:
+    def refuse(
+        self, operation: str, *codes: str | None, said: str = 'as AWS said', status: int = 400,
+    ) -> None:
         """Answer the next calls of an operation so; None lets one through."""
+        self.status = status
         self.refusals[operation] = [code and (code, said) for code in codes]
 
     def _sent(self, event_name, request, **words):
@@ -83,7 +86,8 @@ class Watched:
             body = (f'<Response><Errors><Error><Code>{code}</Code><Message>{said}</Message>'
                     '</Error></Errors><RequestID>1</RequestID></Response>')
         self.sent.append(code)
-        status = 503 if code == 'RequestLimitExceeded' else 500 if 'Capacity' in code else 400
+        status = 503 if code == 'RequestLimitExceeded' else 500 if 'Capacity' in code \
+            else self.status
         return AWSResponse(request.url, status, {}, _Raw(body.encode()))
 
     def count(self) -> Counter[str]:
@@ -465,6 +469,7 @@ def test_a_refusal_is_one_line_with_a_hint_and_leaves_nothing(aws, operation, co
     with pytest.raises(FogError) as caught:
         aws.provider.create(*ask())
     assert words in str(caught.value)
+    assert caught.value.refused
     assert '\n' not in str(caught.value)
     assert HOME in str(caught.value)
     assert left() == NOTHING
@@ -571,9 +576,18 @@ def test_an_answer_that_got_lost_may_have_been_a_yes(aws, monkeypatch):
         return answer
 
     monkeypatch.setattr(Account, 'call', lost)
-    with pytest.raises(PrerequisiteError):
+    with pytest.raises(PrerequisiteError) as caught:
         aws.provider.create(spec, request)
+    assert not caught.value.refused
     assert left() == NOTHING
+
+
+def test_a_fault_of_aws_leaves_open_whether_there_is_a_machine(aws, monkeypatch):
+    monkeypatch.setattr('fogros2.provider.aws.clients.ATTEMPTS', 2)
+    aws.refuse('RunInstances', *['InternalError'] * 2, status=500)
+    with pytest.raises(AwsError) as caught:
+        aws.provider.create(*ask())
+    assert not caught.value.refused
 
 
 def test_the_nearest_region_has_neighbours_to_go_on_in(aws, monkeypatch):

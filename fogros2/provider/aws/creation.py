@@ -53,6 +53,8 @@ class Creation:
         self._robot_address = robot_address
         self._ask_price = price
         self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
+        #: Whether an instance may have been made that nobody has told us of.
+        self._unsure = False
         self._images: dict[tuple[str, str, bool], Mapping[str, Any]] = {}
 
     def run(self, regions: list[str], types: list[str]) -> MachineId:
@@ -62,6 +64,13 @@ class Creation:
         :raises NameTaken: a machine of that name is there, made under another token.
         :raises FogError: see :mod:`~fogros2.provider.aws.failures`; nothing is left behind.
         """
+        try:
+            return self._in_regions(regions, types)
+        except FogError as error:
+            error.refused = not self._unsure
+            raise
+
+    def _in_regions(self, regions: list[str], types: list[str]) -> MachineId:
         first: Optional[AwsError] = None
         for region in regions:
             try:
@@ -180,8 +189,9 @@ class Creation:
                 answer = self.account.call(
                     'ec2', region, 'run_instances',
                     f"creating '{self.spec.name}' ({place.kind})", **words)
-            except AwsError as error:
-                if error.code not in NO_ROOM:
+            except FogError as error:
+                self._unsure = self._unsure or not error.refused
+                if not isinstance(error, AwsError) or error.code not in NO_ROOM:
                     raise
                 # a quota holds for the whole region, a lack of machines for a zone
                 if error.code in NO_ROOM_IN_REGION:

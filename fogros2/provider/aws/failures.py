@@ -197,6 +197,18 @@ def refused(
     decode: Optional[Callable[[str], str]] = None,
 ) -> FogError:
     """Return the error for an answer of AWS's that says no; ``response`` as botocore has it."""
+    error = _refusal(response, operation, what, region, decode)
+    code = str((response.get('Error') or {}).get('Code', ''))
+    status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
+    # a fault of AWS's own may have come after the deed
+    error.refused = status < 500 or code in NO_ROOM
+    return error
+
+
+def _refusal(
+    response: Any, operation: str, what: str, region: str,
+    decode: Optional[Callable[[str], str]],
+) -> FogError:
     details = response.get('Error') or {}
     code = str(details.get('Code', ''))
     said = _plain(str(details.get('Message', '')))
