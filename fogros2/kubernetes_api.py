@@ -13,18 +13,22 @@ from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import json
 import os
-from pathlib import Path
 import queue
 import threading
 import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode
 
-from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError, ProviderError
+from fogros2 import kubernetes_config
+from fogros2.errors import Cancelled, DeadlineExceeded, ProviderError
+from fogros2.kubernetes_config import configured, words
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
     import websocket
+
+__all__ = [
+    'Api', 'ApiError', 'configured', 'connect', 'items', 'path', 'selector', 'Unreachable']
 
 T = TypeVar('T')
 #: Query parameters; a list repeats the name.
@@ -40,8 +44,6 @@ PATIENCE = 30.0
 DOUBT = 15.0
 #: Seconds of silence after which a watch is begun anew: its connection may be gone.
 SILENCE = 240.0
-#: Token, certificate and namespace of a pod that may use the API itself.
-_IN_CLUSTER = Path('/var/run/secrets/kubernetes.io/serviceaccount')
 
 
 class ApiError(ProviderError):
@@ -76,7 +78,7 @@ class Api:
     """
 
     def __init__(self, context: str = '') -> None:
-        self.context, self.namespace, self._client = _load(context)
+        self.context, self.namespace, self._client = kubernetes_config.load(context)
         #: Requests made so far, for the figures.
         self.calls = 0
         self._lost = -DOUBT
@@ -181,7 +183,7 @@ class Api:
     def _unreachable(self, error: BaseException) -> Unreachable:
         self.lost()
         return Unreachable(
-            f'the API server {self.server} does not answer: {_words(error)}',
+            f'the API server {self.server} does not answer: {words(error)}',
             'is the cluster up, and reachable from this robot? `kubectl cluster-info` asks the '
             'same')
 
@@ -347,82 +349,6 @@ def connect(context: str = '') -> Api:
         return found
 
 
-def kubeconfig_files() -> list[Path]:
-    """Return the files that the kubeconfig is made of, those that exist."""
-    names = os.environ.get('KUBECONFIG') or '~/.kube/config'
-    paths = [Path(name).expanduser() for name in names.split(os.pathsep) if name]
-    return [path for path in paths if path.is_file()]
-
-
-def configured() -> bool:
-    """Return whether there is a kubeconfig, or this is a pod that may use the API."""
-    return bool(kubeconfig_files()) or (_IN_CLUSTER / 'token').is_file()
-
-
-def _load(context: str) -> tuple[str, str, Any]:
-    """Return a context's name, its namespace and a client of the SDK."""
-    try:
-        import kubernetes.client
-        import kubernetes.config
-    except ImportError as error:
-        raise PrerequisiteError(
-            f"Kubernetes' client for Python is missing: {error}",
-            "python3 -m pip install 'fogros2[kubernetes]'") from error
-    import yaml
-    config: Any = kubernetes.config
-    if not kubeconfig_files():
-        if not configured():
-            raise PrerequisiteError(
-                'there is no kubeconfig on this computer',
-                "set KUBECONFIG, or get one: 'aws eks update-kubeconfig', "
-                "'gcloud container clusters get-credentials', 'az aks get-credentials'")
-        config.load_incluster_config()
-        namespace = (_IN_CLUSTER / 'namespace').read_text().strip()
-        return '', namespace, kubernetes.client.ApiClient()
-    files = os.environ.get('KUBECONFIG') or str(Path('~/.kube/config').expanduser())
-    try:
-        contexts, active = config.list_kube_config_contexts(files)
-        names = [str(each['name']) for each in contexts]
-        name = context or str((active or {}).get('name', ''))
-        if name not in names:
-            raise PrerequisiteError(
-                f"the kubeconfig has no context '{name}'", f"there are: {', '.join(names)}")
-        entry = next(each for each in contexts if each['name'] == name)
-        settings = type.__call__(kubernetes.client.Configuration)
-        config.load_kube_config(files, context=name, client_configuration=settings)
-        # a connection for each of many machines that come up at once
-        settings.connection_pool_maxsize = 64
-        client = kubernetes.client.ApiClient(settings)
-        _check_plugin(str(entry['context'].get('user', '')), settings)
-    except (config.ConfigException, yaml.YAMLError, OSError, ValueError, TypeError, KeyError,
-            AttributeError) as error:
-        raise PrerequisiteError(f"the kubeconfig {files} can't be used: {_words(error)}",
-                                '`kubectl config view` shows it') from error
-    return name, str(entry['context'].get('namespace') or 'default'), client
-
-
-def _check_plugin(user: str, settings: Any) -> None:
-    """
-    Look whether the program that a kubeconfig names has given credentials.
-
-    The client goes on without, as nobody, and every request would be refused.
-
-    :raises PrerequisiteError: it hasn't.
-    """
-    if settings.auth_settings() or settings.cert_file:
-        return
-    import yaml
-    texts = (yaml.safe_load(path.read_text()) or {} for path in kubeconfig_files())
-    known = [each for text in texts for each in text.get('users') or ()]
-    for each in known:
-        plugin = (each.get('user') or {}).get('exec') if each.get('name') == user else None
-        if plugin:
-            raise PrerequisiteError(
-                f"'{plugin.get('command')}', by which the kubeconfig logs '{user}' in, gave no "
-                'credentials', ' '.join(str(plugin.get('installHint') or '').split())
-                or 'is it installed, and are you logged in? `kubectl get pods` asks the same')
-
-
 def _tls(configuration: Any) -> dict[str, Any]:
     """Return how the WebSocket checks the API server, the same way as the requests."""
     import ssl
@@ -460,14 +386,6 @@ def _refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
         if status == 401 else ''
     return ApiError(' '.join(message.split()), hint, status=status,
                     reason=str(answer.get('reason') or ''), details=answer.get('details'))
-
-
-def _words(error: BaseException) -> str:
-    """Return the innermost reason of a chain of the client's errors, in one line."""
-    reason: object = getattr(error, 'reason', None) or error
-    text = ' '.join(str(reason).split())
-    # urllib3 puts its object in front
-    return text.rpartition('>: ')[2] or text or type(error).__name__
 
 
 def cancelled(cancel: Optional[threading.Event], what: str) -> None:

@@ -24,7 +24,8 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
-from fogros2.shell.kubernetes_link import Channel, Link
+from fogros2.shell.kubernetes_channel import Channel
+from fogros2.shell.kubernetes_link import Link
 from fogros2.waiting import wait_until
 
 #: Seconds after a command's end in which something it left behind may hold its output open.

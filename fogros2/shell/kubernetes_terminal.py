@@ -12,7 +12,8 @@ from typing import Optional
 from fogros2.errors import FogError
 from fogros2.model import Command
 from fogros2.shell import ssh_terminal
-from fogros2.shell.kubernetes_link import Channel, Link
+from fogros2.shell.kubernetes_channel import Channel
+from fogros2.shell.kubernetes_link import Link
 
 
 def attach(link: Link, command: Optional[Command]) -> int:

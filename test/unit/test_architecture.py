@@ -20,8 +20,8 @@ LAYERS = [
     {'errors'},
     {'waiting', 'report', 'process', 'plugin_system'},
     {'store', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
-     'agent_client', 'agent', 'cloud_launch', 'kubernetes_api', 'workspace', 'wheels',
-     'bootstrap'},
+     'agent_client', 'agent', 'cloud_launch', 'kubernetes_api', 'kubernetes_config', 'workspace',
+     'wheels', 'bootstrap'},
     {'deploy', 'testing'},
     {'actions'},
 ]
@@ -30,7 +30,7 @@ SEAMS = ('provider', 'shell', 'vpn', 'dds', 'image_transport')
 ROS_ALLOWED = ('actions', 'cloud_launch')
 ROS = ('launch', 'launch_ros', 'rclpy', 'ros2cli', 'ament_index_python')
 #: SDKs belong to one plugin each.
-SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_api',
+SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_config',
         'paramiko': 'shell', 'av': 'image_transport'}
 
 

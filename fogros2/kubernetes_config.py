@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The kubeconfig, read by the official client, which also gets and renews the credentials.
+
+The client is loaded here alone, and when it is needed.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from fogros2.errors import PrerequisiteError
+
+#: Token, certificate and namespace of a pod that may use the API itself.
+_IN_CLUSTER = Path('/var/run/secrets/kubernetes.io/serviceaccount')
+
+
+def kubeconfig_files() -> list[Path]:
+    """Return the files that the kubeconfig is made of, those that exist."""
+    names = os.environ.get('KUBECONFIG') or '~/.kube/config'
+    paths = [Path(name).expanduser() for name in names.split(os.pathsep) if name]
+    return [path for path in paths if path.is_file()]
+
+
+def configured() -> bool:
+    """Return whether there is a kubeconfig, or this is a pod that may use the API."""
+    return bool(kubeconfig_files()) or (_IN_CLUSTER / 'token').is_file()
+
+
+def load(context: str) -> tuple[str, str, Any]:
+    """
+    Return a context's name, its namespace and a client of the SDK.
+
+    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    """
+    try:
+        import kubernetes.client
+        import kubernetes.config
+    except ImportError as error:
+        raise PrerequisiteError(
+            f"Kubernetes' client for Python is missing: {error}",
+            "python3 -m pip install 'fogros2[kubernetes]'") from error
+    import yaml
+    config: Any = kubernetes.config
+    if not kubeconfig_files():
+        if not configured():
+            raise PrerequisiteError(
+                'there is no kubeconfig on this computer',
+                "set KUBECONFIG, or get one: 'aws eks update-kubeconfig', "
+                "'gcloud container clusters get-credentials', 'az aks get-credentials'")
+        config.load_incluster_config()
+        namespace = (_IN_CLUSTER / 'namespace').read_text().strip()
+        return '', namespace, kubernetes.client.ApiClient()
+    files = os.environ.get('KUBECONFIG') or str(Path('~/.kube/config').expanduser())
+    try:
+        contexts, active = config.list_kube_config_contexts(files)
+        names = [str(each['name']) for each in contexts]
+        name = context or str((active or {}).get('name', ''))
+        if name not in names:
+            raise PrerequisiteError(
+                f"the kubeconfig has no context '{name}'", f"there are: {', '.join(names)}")
+        entry = next(each for each in contexts if each['name'] == name)
+        settings = type.__call__(kubernetes.client.Configuration)
+        config.load_kube_config(files, context=name, client_configuration=settings)
+        # a connection for each of many machines that come up at once
+        settings.connection_pool_maxsize = 64
+        client = kubernetes.client.ApiClient(settings)
+        _check_plugin(str(entry['context'].get('user', '')), settings)
+    except (config.ConfigException, yaml.YAMLError, OSError, ValueError, TypeError, KeyError,
+            AttributeError) as error:
+        raise PrerequisiteError(f"the kubeconfig {files} can't be used: {words(error)}",
+                                '`kubectl config view` shows it') from error
+    return name, str(entry['context'].get('namespace') or 'default'), client
+
+
+def _check_plugin(user: str, settings: Any) -> None:
+    """
+    Look whether the program that a kubeconfig names has given credentials.
+
+    The client goes on without, as nobody, and every request would be refused.
+
+    :raises PrerequisiteError: it hasn't.
+    """
+    if settings.auth_settings() or settings.cert_file:
+        return
+    import yaml
+    texts = (yaml.safe_load(path.read_text()) or {} for path in kubeconfig_files())
+    known = [each for text in texts for each in text.get('users') or ()]
+    for each in known:
+        plugin = (each.get('user') or {}).get('exec') if each.get('name') == user else None
+        if plugin:
+            raise PrerequisiteError(
+                f"'{plugin.get('command')}', by which the kubeconfig logs '{user}' in, gave no "
+                'credentials', ' '.join(str(plugin.get('installHint') or '').split())
+                or 'is it installed, and are you logged in? `kubectl get pods` asks the same')
+
+
+def words(error: BaseException) -> str:
+    """Return the innermost reason of a chain of the client's errors, in one line."""
+    reason: object = getattr(error, 'reason', None) or error
+    text = ' '.join(str(reason).split())
+    # urllib3 puts its object in front
+    return text.rpartition('>: ')[2] or text or type(error).__name__
