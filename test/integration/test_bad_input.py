@@ -338,7 +338,8 @@ def test_a_full_disk_where_the_workspace_goes(refused, computer, small):
 def test_a_home_too_small_for_what_is_missing(refused, cloud_network, tmp_path):
     with bare_computer(f'fogt-small-{NAME}', tmp_path / 'computer', cloud_network,
                        options=['--tmpfs', '/home/fog:size=1m,mode=1777']) as computer:
-        error, _ = refused(ssh(computer, bootstrap='embedded'))
+        # what is to be sent may have to be made first
+        error, _ = refused(ssh(computer, bootstrap='embedded'), within=60.0)
     assert 'are free in /home/fog, 300 are needed' in error
     assert 'make room there' in error
 
