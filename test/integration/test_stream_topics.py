@@ -99,15 +99,40 @@ finally:
 """
 
 
-def test_images_cross_encoded_both_ways(tmp_path: Path, cloud_network: str) -> None:
+#: From the robot to one machine, from there to another, and back.
+CHAIN = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
+from launch.actions import ExecuteProcess, Shutdown
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    first = ContainerInstance(name='{name}-a', network='{network}', ros_workspace='')
+    second = ContainerInstance(name='{name}-b', network='{network}', ros_workspace='')
+    return FogROSLaunchDescription([
+        CloudNode(machine=second, package='fogros2_examples', executable='image_processor',
+                  remappings=[('camera', '/between'), ('annotated', '/seen')],
+                  stream_topics=[StreamTopic('/between', 'h264', source=first),
+                                 StreamTopic('/seen', 'h264', 'to_robot')]),
+        CloudNode(machine=first, package='fogros2_examples', executable='image_processor',
+                  remappings=[('camera', '/front/camera'), ('annotated', '/between')],
+                  stream_topics=[('/front/camera', 'h264')]),
+        Node(package='fogros2_examples', executable='camera', namespace='front'),
+        ExecuteProcess(cmd=['{python}', '{viewer}'], output='screen', on_exit=Shutdown()),
+    ])
+"""
+
+
+@pytest.mark.parametrize('description', [LAUNCH, CHAIN], ids=['both ways', 'machine to machine'])
+def test_images_cross_encoded(tmp_path: Path, cloud_network: str, description: str) -> None:
     viewer = tmp_path / 'viewer.py'
     viewer.write_text(VIEWER)
     path = tmp_path / 'stream.launch.py'
-    path.write_text(LAUNCH.format(
+    path.write_text(description.format(
         name=NAME, network=cloud_network, python=sys.executable, viewer=viewer))
     with launching() as launch:
         launched = launch(str(path))
-        assert launched.ended(40.0) == 0, launched.text
+        assert launched.ended(60.0) == 0, launched.text
     said = re.search(r'viewer says (.*)', launched.text)
     assert said, launched.text
     found = json.loads(said[1])
