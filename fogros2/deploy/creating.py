@@ -152,8 +152,10 @@ class Creation:
                 token=token, authorized_key=key, tags=tags,
                 vpn_port=plan.machine_port(job.launch.id), agent_config=config,
                 dependencies=dependencies, cancel=job.cancel))
-        except ProviderError:
-            self._refused = True
+        except FogError as error:
+            # of one that was refused nothing has to be looked for
+            self._asked = not error.refused
+            self._refused = isinstance(error, ProviderError)
             raise
         job.save(machine_id=machine_id)
 

@@ -49,7 +49,7 @@ from fogros2.store import MachineDirectory, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2.waiting import Timeouts, wait_until
 
-SPEC = MachineSpec('planner', 'fake')
+SPEC, SPEC2 = MachineSpec('planner', 'fake'), MachineSpec('slam', 'fake')
 ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', guarded=True)
 
 
@@ -104,6 +104,13 @@ def test_of_a_refused_creation_nothing_is_told_but_the_refusal(launch, provider)
     provider.failures.update(create=refused, find=refused)
     with pytest.raises(ProviderError, match='has expired'):
         launch.up(SPEC)
+    assert 'find' in provider.calls
+    provider.calls.clear()
+    refused.refused = True
+    provider.failures.update(create=refused)
+    with pytest.raises(ProviderError, match='has expired'):
+        launch.up(SPEC2)
+    assert 'find' not in provider.calls
     assert launch.down() == []
 
 
