@@ -102,6 +102,7 @@ def main() -> None:
     try:
         rclpy.spin(Camera())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+    except SystemExit:
         rclpy.try_shutdown()
+        raise

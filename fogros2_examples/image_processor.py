@@ -59,6 +59,4 @@ def main() -> None:
     try:
         rclpy.spin(ImageProcessor())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way

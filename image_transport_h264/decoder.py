@@ -56,10 +56,9 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        pass  # what causes it shuts rclpy down, in a thread of its own: not twice
     finally:
         failed = node.failed
         node.destroy_node()
-        rclpy.try_shutdown()
     if failed:
         raise SystemExit(1)
