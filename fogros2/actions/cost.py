@@ -26,10 +26,15 @@ def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
 
 
 def hours(seconds: float) -> str:
-    """Return a time in hours, as prices are for hours, with what is worth telling of it."""
-    return f'{seconds / 3600:.2f} h' if seconds >= 360 else f'{seconds / 3600:.4f} h'
+    """Return a time in hours, as prices are for hours; of a short one what is worth telling."""
+    return f'{_plain(Decimal(seconds) / 3600, below=Decimal("0.1"))} h'
 
 
 def dollars(cost: Decimal) -> str:
-    """Return US dollars to the cent, or to what is worth telling of less than ten."""
-    return f'{cost:.2f}' if cost >= Decimal('0.095') else f'{cost:.4f}'
+    """Return US dollars to the cent; of a few cents what is worth telling."""
+    return _plain(cost, below=Decimal('0.1'))
+
+
+def _plain(value: Decimal, *, below: Decimal) -> str:
+    # two digits that aren't zero, and no exponent
+    return f'{Decimal(f"{value:.2g}"):f}' if 0 < value < below else f'{value:.2f}'

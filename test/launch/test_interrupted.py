@@ -399,7 +399,7 @@ def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
         'exited', node, returncode=0, respawns=False)
     machine = ContainerInstance(name='planner', ros_workspace='')
     assert run(LaunchDescription([talker(machine=machine)])) == 0
-    assert 'planner: 1.50 h at $0.0416 an hour, $0.0624' in capfd.readouterr().out
+    assert 'planner: 1.50 h at $0.0416 an hour, $0.062' in capfd.readouterr().out
 
 
 # -- what takes a while to know -------------------------------------------------------------------
