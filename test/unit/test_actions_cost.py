@@ -21,7 +21,7 @@ def test_one_machine():
 
 def test_several_have_a_sum():
     assert cost.lines([('a', Decimal('1.10'), 3600.0), ('b', Decimal('20'), 36.0)]) == [
-        'a: 1.00 h at $1.1 an hour, $1.10', 'b: 0.010 h at $20 an hour, $0.20',
+        'a: 1.00 h at $1.1 an hour, $1.10', 'b: 0.01 h at $20 an hour, $0.20',
         'all machines: $1.30']
 
 
