@@ -35,8 +35,8 @@ it: the VPN's, and the one that ends the machine.
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
-``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where the nodes' launch process ended without
-having been told to.
+``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where
+the nodes' launch process ended without having been told to.
 """
 
 from __future__ import annotations

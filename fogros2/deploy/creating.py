@@ -155,7 +155,8 @@ class Creation:
         except FogError as error:
             # of one that was refused nothing has to be looked for
             self._asked = not error.refused
-            self._refused = isinstance(error, ProviderError)
+            self._refused = isinstance(
+                error, (ConfigurationError, PrerequisiteError, ProviderError))
             raise
         job.save(machine_id=machine_id)
 
