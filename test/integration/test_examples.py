@@ -215,7 +215,8 @@ def test_a_launch_with_everything_beside_another(launch, cloud_network, tmp_path
     # another terminal joins
     heard = subprocess.run(
         ['sh', '-ec', f'eval "$(ros2 fog env {name})"; '
-         'exec ros2 topic echo --once /chatter std_msgs/msg/String'],
+         # a daemon would stay
+         'exec ros2 topic echo --no-daemon --once /chatter std_msgs/msg/String'],
         text=True, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
     assert heard.returncode == 0, heard.stderr
     assert f'data: Hello World from {name} ' in heard.stdout.replace("'", '')
