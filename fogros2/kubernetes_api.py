@@ -263,6 +263,25 @@ class Api:
             raise self._unreachable(error) from error
 
 
+    def execute(
+        self, path: str, container: str, command: Sequence[str], *, timeout: float,
+    ) -> None:
+        """
+        Run a command in a pod, and wait for its first word or its end, so many seconds at most.
+
+        :raises ApiError: refused, or no such pod.
+        :raises Unreachable: the API server doesn't answer.
+        """
+        import websocket
+
+        link = self.websocket(path, {
+            'container': container, 'command': list(command), 'stdout': 'true',
+            'stderr': 'true'}, timeout=timeout)
+        with contextlib.suppress(websocket.WebSocketException, OSError):
+            link.recv()
+        link.close(timeout=0)
+
+
 class _Watch:
     """One watch: a thread reads its lines, so that whoever waits can be cancelled."""
 

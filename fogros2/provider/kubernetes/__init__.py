@@ -20,7 +20,7 @@ from fogros2.errors import (
 from fogros2.kubernetes_api import Api, ApiError, items, path, selector
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_ON_EXIT
-from fogros2.provider.kubernetes import boot, hints, manifests, names, pods, ways
+from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.start import Start
@@ -28,10 +28,6 @@ from fogros2.provider.kubernetes.start import Start
 _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 #: Seconds for which an API server is waited for before anything has begun.
 _FIRST = 5.0
-#: Seconds that a pod is given when the robot ends it: its nodes have ended before.
-_GRACE = 1
-#: Seconds in which everything of a machine has to be gone.
-_GONE = 120.0
 
 
 class KubernetesProvider(Provider):
@@ -223,81 +219,8 @@ class KubernetesProvider(Provider):
         api = kubernetes_api.connect(where.context)
         for known in (self._made, self._services, self._pods):
             known.pop(machine_id, None)
-        target = path('jobs', where.namespace, where.job)
-
-        def gone() -> Optional[bool]:
-            try:
-                now = api.request('GET', target)
-            except ApiError as error:
-                if error.status == 404:
-                    return True
-                raise
-            return True if now['metadata']['uid'] != where.uid else None
-
         with _translated(f"deleting '{where.job}'", where.namespace):
-            try:
-                answer = api.request('DELETE', target, {
-                    'kind': 'DeleteOptions', 'apiVersion': 'v1',
-                    'propagationPolicy': 'Foreground', 'preconditions': {'uid': where.uid}},
-                    doubt=kubernetes_api.DOUBT)
-            except ApiError as error:
-                # gone, or gone and another of the name in its place
-                if error.status in (404, 409):
-                    return
-                raise
-            self._end_pods(api, where)
-            api.follow(
-                path('jobs', where.namespace),
-                lambda event, job: True if event == 'DELETED' else None, again=gone,
-                timeout=_GONE, what=f"'{where.job}' to be deleted",
-                fieldSelector=f'metadata.name={where.job}',
-                resourceVersion=(answer.get('metadata') or {}).get('resourceVersion'))
-
-    def _end_pods(self, api: Api, where: MachineId) -> None:
-        """End the pods of a Job that is being deleted, quicker than the cluster would."""
-        target = path('pods', where.namespace)
-        labels = selector({names.MACHINE: where.job})
-
-        def delete(grace: int) -> list[dict[str, Any]]:
-            # without a say the pod has the time that it gets when the cluster takes it away
-            return list(items(api.request('DELETE', target, {
-                'kind': 'DeleteOptions', 'apiVersion': 'v1', 'gracePeriodSeconds': grace},
-                labelSelector=labels)))
-
-        found = delete(_GRACE)
-        left = {str(pod['metadata']['uid']) for pod in found if not pods.has_ended(pod)}
-
-        def look(event: str, pod: dict[str, Any]) -> Optional[bool]:
-            if event == 'DELETED' or pods.has_ended(pod):
-                left.discard(str(pod['metadata']['uid']))
-            return None if left else True
-
-        def again() -> Optional[bool]:
-            now = items(api.request('GET', target, labelSelector=labels))
-            left.intersection_update(
-                str(pod['metadata']['uid']) for pod in now if not pods.has_ended(pod))
-            return None if left else True
-
-        if left:
-            for pod in found:
-                self._tell(api, pod)
-            api.follow(target, look, again=again, timeout=_GONE, labelSelector=labels,
-                       what=f"the pod of '{where.job}' to end")
-        if found:
-            # nothing runs in it any more; the node would take seconds to tidy up first
-            delete(0)
-
-    def _tell(self, api: Api, pod: Mapping[str, Any]) -> None:
-        """Have a pod end itself: it may be in the time it was given to move its nodes."""
-        meta = pod['metadata']
-        # where it doesn't hear us, the node ends it
-        with contextlib.suppress(ProviderError, OSError, ValueError):
-            link = api.websocket(
-                path('pods', str(meta['namespace']), str(meta['name']), 'exec'), {
-                    'container': names.CONTAINER, 'command': boot.END_COMMAND,
-                    'stdout': 'true', 'stderr': 'true'}, timeout=2.0)
-            with contextlib.closing(link):
-                link.recv()  # its status, or the end
+            ending.end(api, where)
 
     # -- what all of them need ------------------------------------------------------------------
 
