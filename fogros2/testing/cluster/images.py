@@ -165,7 +165,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     root = base(cache, say)
     packed = wheels.collect()
     system = cache / f'system-{_checksum(f"1 {root.name}")}'
-    target = cache / f'images-{_checksum(f"1 {system.name} {packed.key}")}'
+    target = cache / f'images-{_checksum(f"2 {system.name} {packed.key}")}'
     for path in (system, target):
         if path.is_dir():
             os.utime(path)
@@ -220,6 +220,9 @@ def _add_embedded(shell: RootShell) -> None:
     bootstrap.ensure(
         shell, under,  # type: ignore[arg-type]  # nothing there asks for put, open, interactive
         MachineSpec(name='image', provider='', bootstrap='embedded'), timeout=300.0)
+    # or each pod would compile what it imports, once for each of its processes that begin together
+    shell.run(Command(('python3', '-m', 'compileall', '-q', bootstrap.INSTALL_FOLDER),
+                      what='compile the embedded default'), timeout=300.0)
 
 
 def sandbox_layer(target: Path) -> None:

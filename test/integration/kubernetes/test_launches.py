@@ -25,6 +25,8 @@ pytestmark = [
                        'image with ROS 2: none can be made from what this computer has'),
 ]
 
+#: Seconds for what takes a few on a computer that has nothing else to do.
+PATIENCE = 150.0
 #: Seconds after its end for which a Job stays, by its ttlSecondsAfterFinished.
 TTL = 60
 
@@ -91,7 +93,7 @@ def killed(kubernetes, namespaces_of_module, tmp_path_factory):
             + "        talker(pod('killed', robot_timeout=3)), listener()])\n")
         with launching() as start:
             run = start(str(path))
-            run.wait_for('I heard')
+            run.wait_for('I heard', timeout=PATIENCE)
             run.kill()
         when = time.monotonic()
         yield space, when
@@ -114,7 +116,7 @@ def test_the_example(namespace):
     with launching() as start:
         run = start('fogros2_examples', 'talker.kube.launch.py', 'name:=planner',
                     f'image:={READY}', 'count:=2')
-        assert run.ended() == 0, run.text
+        assert run.ended(PATIENCE) == 0, run.text
     assert run.text.count('I heard: [Hello World from planner ') >= 2
     assert clean(run), run.text
     assert 'node_port' in run.text, f'it says which way UDP took: {run.text}'
@@ -126,7 +128,7 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
     run = launch(
         "talker(pod('dialler', expose='pod_dials_robot', "
         f"robot_host='{kubernetes.layout.host}'))", 'listener()')
-    run.wait_for('I heard: [Hello World from dialler ', times=2)
+    run.wait_for('I heard: [Hello World from dialler ', times=2, timeout=PATIENCE)
     assert namespace.all('services') == []
     run.interrupt()
     assert run.ended() == 0, run.text
@@ -140,8 +142,8 @@ def test_two_pods_talk_to_each_other(launch, namespace):
         "talker(pod('speaker'))",
         "CloudNode(machine=pod('hearer'), package='fogros2_examples', executable='listener', "
         "output='screen')", "listener(name='robot_listener')")
-    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2)
-    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ')
+    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2, timeout=PATIENCE)
+    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ', timeout=PATIENCE)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert clean(run), run.text
@@ -151,7 +153,7 @@ def test_two_pods_talk_to_each_other(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
     run = launch("talker(pod('victim'))", 'listener()')
-    run.wait_for('I heard')
+    run.wait_for('I heard', timeout=PATIENCE)
     (pod,) = namespace.all('pods')
     namespace.client.ask(
         'DELETE', f"/api/v1/namespaces/{namespace.name}/pods/{pod['metadata']['name']}",
@@ -164,7 +166,7 @@ def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_nodes_of_an_evicted_pod_go_on_on_the_robot(launch, namespace):
     run = launch("talker(pod('evicted', on_interrupt='robot'))", 'listener()')
-    run.wait_for('I heard: [Hello World from evicted ')
+    run.wait_for('I heard: [Hello World from evicted ', timeout=PATIENCE)
     (pod,) = namespace.all('pods')
     name = pod['metadata']['name']
     namespace.client.create(
@@ -187,14 +189,14 @@ def test_an_api_server_that_restarts_is_waited_for(launch, namespace, kubernetes
     wait_until(lambda: namespace.all('jobs') or None, timeout=60.0, what='the Job')
     kubernetes.stop('kube-apiserver')
     kubernetes.start('kube-apiserver')
-    run.wait_for('I heard: [Hello World from patient ')
+    run.wait_for('I heard: [Hello World from patient ', timeout=PATIENCE)
     kubernetes.stop('kube-apiserver')
     before = run.text.count('I heard')
     run.wait_for('I heard', times=before + 5, timeout=20.0)
     kubernetes.start('kube-apiserver')
     # the agent's events come again
     before = run.text.count('[patient.talker-1]')
-    run.wait_for('[patient.talker-1]', times=before + 5)
+    run.wait_for('[patient.talker-1]', times=before + 5, timeout=PATIENCE)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert namespace.left() == []
@@ -206,7 +208,7 @@ def test_a_kept_pod_is_a_warm_start(launch, namespace):
     pods = []
     for _ in range(2):
         run = launch(*entities)
-        run.wait_for('I heard')
+        run.wait_for('I heard', timeout=PATIENCE)
         run.interrupt()
         assert run.ended() == 0, run.text
         assert clean(run), run.text
@@ -225,7 +227,7 @@ def test_twenty_pods_of_one_launch(launch, namespace):
     run = launch(*(f"talker(pod('many-{n}'), namespace='n{n}')" for n in range(20)),
                  *(f"listener(namespace='n{n}')" for n in (0, 19)))
     for number in (0, 19):
-        run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=240.0)
+        run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=2 * PATIENCE)
     run.wait_for('.talker-1]', times=20)
     assert len(namespace.all('pods')) == 20
     run.interrupt()
