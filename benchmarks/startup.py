@@ -6,7 +6,9 @@ Against EC2 in a box (``fogros2.testing.ec2``), whose instances boot as slowly a
 *Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
 without the installation of ROS 2 on an image that has none.
 
-    python benchmarks/startup.py [--provider aws] [--runs 3]
+    python benchmarks/startup.py [--provider aws|kubernetes] [--runs 3]
+
+For pods see ``startup_kubernetes``.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import tempfile
 import time
 
 from figures import Row, write
+import startup_kubernetes
 
 from fogros2.testing.ec2 import Ec2Box
 from fogros2.testing.launched import launching, ros2
@@ -169,9 +172,12 @@ def several(runs: int) -> Iterator[Row]:
 def main() -> None:
     """Take the figures of a provider."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--provider', choices=['aws'], default='aws')
+    parser.add_argument('--provider', choices=['aws', 'kubernetes'], default='aws')
     parser.add_argument('--runs', type=int, default=3)
     arguments = parser.parse_args()
+    if arguments.provider == 'kubernetes':
+        startup_kubernetes.measure(arguments.runs)
+        return
     write(f'startup_{arguments.provider}', 'From ros2 launch to the first message, EC2 in a box',
           [*start(arguments.runs), *several(arguments.runs)])
 

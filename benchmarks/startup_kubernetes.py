@@ -31,6 +31,7 @@ from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
+SCRIPT = ROOT / 'tools' / 'kubernetes.sh'
 MANY = 20
 
 LAUNCH = """\
@@ -75,7 +76,7 @@ class Robot:
                 raise SystemExit(f'the launch failed:\n{run.text}')
         asked = self._cluster.requests('robot')[before:]
         return total, Counter(
-            f"{event['verb']} {event['objectRef']['resource']}" for event in asked
+            f"{event['verb']} {what_of(event['objectRef'])}" for event in asked
             if 'objectRef' in event)
 
     def machines(self, number: int) -> float:
@@ -104,6 +105,11 @@ class Robot:
         """Wait until nothing of the launches before is left to do for the cluster."""
         wait_until(lambda: not self._space.left() or None, timeout=120.0,
                    what='the namespace to be empty')
+
+
+def what_of(reference: dict[str, str]) -> str:
+    """Return what a request is for, such as ``pods/exec``."""
+    return '/'.join(filter(None, (reference['resource'], reference.get('subresource'))))
 
 
 def rows(here: Robot, runs: int) -> Iterator[Row]:
@@ -135,11 +141,7 @@ def robot() -> Iterator[Robot]:
         if folder := os.environ.get('FOGROS2_CLUSTER'):
             there = running_cluster(Path(folder))
         else:
-            script = ROOT / 'tools' / 'kubernetes.sh'
-            reason = subprocess.check_output([script, '--why-not'], text=True).strip()
-            if reason:
-                raise SystemExit(f'no Kubernetes to measure: {reason}')
-            binaries = Path(subprocess.check_output([script], text=True).strip())
+            binaries = Path(subprocess.check_output([SCRIPT], text=True).strip())
             there = stack.enter_context(cluster(binaries.parent, binaries))
         make = stack.enter_context(making_namespaces(
             there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
@@ -148,7 +150,11 @@ def robot() -> Iterator[Robot]:
 
 
 def measure(runs: int) -> None:
-    """Take the figures and write them down."""
+    """Take the figures and write them down, where there can be a cluster."""
+    reason = subprocess.check_output([SCRIPT, '--why-not'], text=True).strip()
+    if reason:
+        print(f'no Kubernetes to measure: {reason}')
+        return
     with robot() as here:
         write('startup_kubernetes', 'From ros2 launch to the first message, a local cluster',
               [*rows(here, runs)])
