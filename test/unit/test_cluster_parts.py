@@ -11,8 +11,6 @@ import ssl
 import tarfile
 import threading
 
-import pytest
-
 from fogros2.testing.cluster import images, node, services
 from fogros2.testing.cluster.certificates import Authority, rsa_key
 from fogros2.testing.cluster.images import Image
