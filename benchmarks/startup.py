@@ -4,7 +4,8 @@ How long a launch on a rented machine takes from ``ros2 launch`` to the first me
 
 Against EC2 in a box (``fogros2.testing.ec2``), whose instances boot as slowly as they are told.
 *Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
-without the installation of ROS 2 on an image that has none.
+without the installation of ROS 2 on an image that has none. The instances are this computer's own
+containers: where many boot at once they share its cores, as EC2's wouldn't.
 
     python benchmarks/startup.py [--provider aws|kubernetes] [--runs 3]
 
