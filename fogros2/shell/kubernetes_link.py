@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 RESUME = 45.0
 #: Seconds of silence after which the pod is asked for a word.
 ASK = 15.0
+#: Seconds for which a frame may stand still half-way, in or out: whoever moves one holds the lock,
+#: and a cut in the middle of it would hold up everybody else, the end of the launch too.
+STALL = 10.0
 _STDIN, _STDOUT, _STDERR, _ERROR = range(4)
 #: Reads the program from its standard input, of which it is the beginning.
 _LOADER = ('import os,sys;n={size};s=b""\n'
@@ -174,7 +177,7 @@ class Link:
         except FogError:
             link.close(timeout=0.1)
             raise
-        link.settimeout(None)
+        link.settimeout(STALL)
         with self._lock:
             self._confirmed(count)
             self._socket = link

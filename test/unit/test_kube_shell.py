@@ -61,6 +61,10 @@ class Pipe:
             data += more
         return data
 
+    def stand_still(self) -> None:
+        """Have the beginning of a message arrive, and nothing after it."""
+        self._far.sendall(b'\0')
+
     def cut(self) -> None:
         """Lose both ends' streams, whatever was under way."""
         with contextlib.suppress(OSError):
@@ -143,6 +147,19 @@ def test_what_runs_goes_on_where_it_was_when_the_connection_breaks(api, shell, t
     assert result.returncode == 3
     assert lines == [str(n) for n in range(400)]
     assert len(api.links) == 4
+
+
+def test_a_message_that_stops_half_way_holds_up_nobody(api, shell, monkeypatch):
+    monkeypatch.setattr(kubernetes_link, 'STALL', 0.3)
+    assert shell.run(Command(('echo', 'one')), timeout=10.0).stdout == 'one\n'
+    api.links[-1].stand_still()
+    assert shell.run(Command(('echo', 'two')), timeout=10.0).stdout == 'two\n'
+    assert len(api.links) == 2
+    api.links[-1].stand_still()
+    closing = threading.Thread(target=shell.close, daemon=True)
+    closing.start()
+    closing.join(5.0)
+    assert not closing.is_alive()
 
 
 def test_what_is_sent_arrives_once_when_the_connection_breaks(api, shell, tmp_path):
