@@ -20,7 +20,6 @@ from fogros2.errors import (
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
-    ProviderError,
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineState
@@ -155,8 +154,8 @@ class Creation:
         except FogError as error:
             # of one that was refused nothing has to be looked for
             self._asked = not error.refused
-            self._refused = isinstance(
-                error, (ConfigurationError, PrerequisiteError, ProviderError))
+            # where there was no answer there may be a machine: only a look tells
+            self._refused = isinstance(error, (ConfigurationError, PrerequisiteError))
             raise
         job.save(machine_id=machine_id)
 
@@ -223,4 +222,4 @@ class Creation:
         except FogError:
             if not self._refused:
                 raise
-            return []  # by its own word nothing is left; this was a second look
+            return []  # it couldn't even be asked; this was a second look

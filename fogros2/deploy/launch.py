@@ -310,9 +310,12 @@ class Launch:
                     ended.append(pool.submit(up.result().close))
         with self._lock:
             self._ups.clear()
-            for future in ended:
-                self._note(future.exception())
-            self.undo.close()
+            try:
+                for future in ended:
+                    self._note(future.exception())
+            finally:
+                # whatever it was that went wrong there: the interface goes
+                self.undo.close()
             failures, self._failures = self._failures, []
         return failures
 

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 import contextlib
 import json
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -49,7 +51,7 @@ from fogros2.store import MachineDirectory, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2.waiting import Timeouts, wait_until
 
-SPEC, SPEC2 = MachineSpec('planner', 'fake'), MachineSpec('slam', 'fake')
+SPEC = MachineSpec('planner', 'fake')
 ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', guarded=True)
 
 
@@ -101,17 +103,37 @@ def test_a_machine_is_ended_whose_creation_failed_half_way(launch, provider, mon
 
 def test_of_a_refused_creation_nothing_is_told_but_the_refusal(launch, provider):
     refused = ProviderError('your token has expired')
-    provider.failures.update(create=refused, find=refused)
-    with pytest.raises(ProviderError, match='has expired'):
-        launch.up(SPEC)
-    assert 'find' in provider.calls
-    provider.calls.clear()
     refused.refused = True
     provider.failures.update(create=refused)
     with pytest.raises(ProviderError, match='has expired'):
-        launch.up(SPEC2)
+        launch.up(SPEC)
     assert 'find' not in provider.calls
     assert launch.down() == []
+    assert not launch.store.machine(SPEC.name).exists()
+
+
+def test_a_machine_that_may_have_been_made_is_not_forgotten(launch, provider):
+    lost = ProviderError('the API server does not answer')
+    provider.failures.update(create=lost, find=lost)
+    with pytest.raises(ProviderError, match='does not answer'):
+        launch.up(SPEC)
+    assert 'find' in provider.calls
+    assert launch.down() == [lost]
+    assert launch.store.machine(SPEC.name).exists()
+
+
+def test_the_interface_goes_though_a_machine_ends_with_an_error_of_no_known_kind(launch):
+    def fail():
+        raise KeyError('InstanceId')
+
+    gone = []
+    up = Future()
+    up.set_result(SimpleNamespace(close=fail))
+    launch._ups['talker'] = up
+    launch.undo.callback(gone.append, 'interface')
+    with pytest.raises(KeyError):
+        launch.down()
+    assert gone == ['interface']
 
 
 def kept(store, provider, **changes):
