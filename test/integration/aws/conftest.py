@@ -126,8 +126,7 @@ def box(engine: str) -> Iterator[Ec2Box]:
     if shutil.which('ros2') is None:
         pytest.skip('needs ros2 on PATH')
     if os.geteuid() != 0:
-        pytest.skip("needs to be root: sudo, which leads into the robot's network, takes no Ctrl-C "
-                    'from a user')
+        pytest.skip("needs root itself: sudo, the way into the robot's network, takes no Ctrl-C")
     pytest.importorskip('boto3', reason='needs boto3')
     pytest.importorskip('moto', reason='needs moto[server]')
     with Ec2Box() as box:
