@@ -8,6 +8,7 @@ import threading
 from typing import Any, Optional
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -33,6 +34,11 @@ PIECES_QOS = QoSProfile(
 REQUEST_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
+
+
+#: Bytes from which on a message is waited for, and the longest that it is, in seconds: a reader
+#: that hangs holds up the others.
+LARGE, LONGEST = 200_000, 2.0
 
 
 def best_effort(qos: QoSProfile) -> QoSProfile:
@@ -64,6 +70,21 @@ class LazyNode(Node):
             if not rclpy.ok(context=self.context):
                 return
             self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
+
+    def put_through(self, publisher: Publisher, message: Any) -> None:
+        """
+        Publish a message, and if it is a large one, wait until it is there.
+
+        Large images in quick succession leave a slow link no room for what it lost of them: none
+        would ever be whole. What comes meanwhile is left out, but for the newest.
+        """
+        self.put_out(publisher, message)
+        if len(message.data) >= LARGE:
+            try:
+                publisher.wait_for_all_acked(Duration(seconds=LONGEST))
+            except RuntimeError:  # RCLError, in rclpy's words: the end has come meanwhile
+                if rclpy.ok(context=self.context):
+                    raise
 
     def complain(self, cause: str, message: str) -> None:
         """Warn of a cause, the first time it comes up."""

@@ -75,7 +75,7 @@ class RawSender(Sender):
 
     def send(self, image: Image) -> None:
         """Publish the image."""
-        self._node.put_out(self._publisher, image)
+        self._node.put_through(self._publisher, image)
 
 
 class StillSender(Sender):
@@ -98,7 +98,7 @@ class StillSender(Sender):
         except CodecError as error:
             self._node.complain(error.cause, f'image not sent: {error}')
             return
-        self._node.put_out(self._publisher, CompressedImage(
+        self._node.put_through(self._publisher, CompressedImage(
             header=image.header, format=form, data=message.octets(data)))
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:

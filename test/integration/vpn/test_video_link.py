@@ -19,8 +19,13 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
 
 
-def stream(vpn: Any, *parameters: str) -> Any:
-    """Start camera and encoder on the robot, decoder and viewer on the machine; the viewer."""
+def stream(vpn: Any, *parameters: str, codec: str = 'h264', images: int = 30) -> Any:
+    """
+    Start camera and encoder on the robot, decoder and viewer on the machine; return the viewer.
+
+    :param images: so many have come when it returns.
+    """
+    common = ['-p', f'codec:={codec}', '-p', f'stream:=/camera/{codec}']
     def start(host: str, *words: str) -> Any:
         name = vpn.interfaces[host].name
         interfaces = (vpn.dds.robot_interfaces(name, vpn.lan_name, {}) if host == 'robot'
@@ -33,13 +38,12 @@ def stream(vpn: Any, *parameters: str) -> Any:
         return vpn.start(host, [sys.executable, *words], **environment)
 
     scripts = ROOT / 'image_transport_h264/scripts'
-    start('robot', str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera',
+    start('robot', str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera', *common,
           *parameters)
-    start('machine', str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen',
-          '-p', 'stream:=/camera/h264')
+    start('machine', str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen', *common)
     viewer = start('machine', str(HERE / 'video_node.py'), 'viewer')
     start('robot', str(HERE / 'video_node.py'), 'camera').wait('ready', timeout=30.0)
-    viewer.wait('image', count=30, timeout=30.0)
+    viewer.wait('image', count=images, timeout=30.0)
     return viewer
 
 
@@ -67,6 +71,13 @@ def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
     back = during(viewer, time.monotonic() + 5.0, 2.0)
     assert len(back) > 45
     assert sorted(line['latency'] for line in back)[len(back) // 2] < 0.15
+
+
+def test_large_images_take_turns_on_a_slow_link(vpn: Any) -> None:
+    """One takes 0.7 s of it. With all of them sent, the link would be full and none whole."""
+    vpn.relay.tell({'rate': 10e6})
+    viewer = stream(vpn, codec='raw', images=2)
+    assert len(during(viewer, time.monotonic(), 10.0)) >= 5
 
 
 def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
