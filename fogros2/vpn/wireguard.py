@@ -243,7 +243,10 @@ def _link(interface: VpnInterface) -> _Step:
 if wg show {name} listen-port >/dev/null 2>&1; then :
 elif said=$(ip link add dev {name} type wireguard 2>&1); then :
 elif command -v wireguard-go >/dev/null; then
-  [ -c /dev/net/tun ] || {{ mkdir -p /dev/net; mknod -m 666 /dev/net/tun c 10 200; }}
+  [ -c /dev/net/tun ] || {{ mkdir -p /dev/net && mknod -m 666 /dev/net/tun c 10 200; }} || {{
+    echo "no WireGuard in this kernel ($said), and no /dev/net/tun nor the right to make it" >&2
+    exit 1
+  }}
   [ -e /sys/class/net/{name} ] || ip tuntap add dev {name} mode tun
   rm -f {socket}
   said=$(setsid wireguard-go {name} 2>&1 >/dev/null) || {{ echo "$said" >&2; exit 1; }}

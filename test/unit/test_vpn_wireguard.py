@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 import subprocess
 
 import pytest
@@ -154,3 +155,19 @@ def test_status_asks_for_nothing_secret_and_is_understood() -> None:
 def test_status_that_isnt_wireguards_is_an_error(text: str) -> None:
     with pytest.raises(VpnError, match='counters'):
         WireGuard().parse_status(text)
+
+
+def test_a_machine_that_can_have_no_tun_says_so(tmp_path: Path) -> None:
+    """A pod has no such device, and some runtimes let nobody make it."""
+    for name in ('wg', 'ip', 'mknod', 'wireguard-go'):
+        program = tmp_path / name
+        program.write_text(f'#!/bin/sh\necho "{name} refuses" >&2\nexit 1\n')
+        program.chmod(0o755)
+    command, = WireGuard().up(MACHINE, [TO_ROBOT])
+    text = command.argv[-1].replace('/dev/net', str(tmp_path / 'net'))
+    told = subprocess.run(['sh', '-ec', text], capture_output=True, text=True,
+                          env={'PATH': f'{tmp_path}:/usr/bin:/bin'})
+    assert told.returncode == 1
+    assert told.stderr.splitlines()[-1] == (
+        'no WireGuard in this kernel (ip refuses), and no '
+        f'{tmp_path}/net/tun nor the right to make it')
