@@ -34,6 +34,8 @@ _DRAIN = 2.0
 MAX_LINE = 32 << 20
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 20
+#: Seconds that one attempt to connect may take: a cancel isn't seen sooner.
+_ATTEMPT = 10.0
 
 
 class KubernetesShell:
@@ -56,35 +58,70 @@ class KubernetesShell:
         self._timeout = timeout
         self._lock = threading.Lock()
         self._link: Optional[Link] = None
+        # one attempt to connect at a time, on which close() doesn't wait
+        self._connecting = threading.Lock()
+        self._closings = 0
 
     # -- connection -----------------------------------------------------------------------------
 
-    def _connected(self, timeout: float) -> Link:
+    def _connected(
+        self, timeout: float, cancel: Optional[threading.Event] = None,
+    ) -> Link:
         """Return the connection, which is opened as needed; waits for an API server's restart."""
-        patience = min(self._timeout, timeout)
+        until = time.monotonic() + min(self._timeout, timeout)
+        link, _ = self._known()
+        if link is not None:
+            return link
+        try:
+            wait_until(lambda: self._connecting.acquire(timeout=0.05), interval=0.0,
+                       timeout=until - time.monotonic(), cancel=cancel,
+                       what=f"a connection to '{self.name}'")
+        except DeadlineExceeded as error:
+            raise ConnectError(f"'{self.name}' can't be reached: nothing has answered in time",
+                               "check the robot's network") from error
+        try:
+            link, closings = self._known()
+            if link is not None:
+                return link
+            link = self._connect(max(0.5, until - time.monotonic()), cancel)
+            with self._lock:
+                if closings == self._closings:
+                    self._link = link
+                    return link
+            link.close()
+            raise ConnectError(f"the connection to '{self.name}' was closed while it came up")
+        finally:
+            self._connecting.release()
+
+    def _known(self) -> tuple[Optional[Link], int]:
+        """Return the connection if there is one, and how often there was none any more."""
         with self._lock:
-            if self._link is not None and self._link.alive:
-                return self._link
-            last: list[ConnectError] = []
+            link = self._link
+            return link if link is not None and link.alive else None, self._closings
 
-            def attempt() -> Optional[Link]:
-                try:
-                    return Link(self.endpoint, name=self.name, timeout=patience)
-                except ConnectError as error:
-                    last[:] = [error]
-                    return None
+    def _connect(self, patience: float, cancel: Optional[threading.Event]) -> Link:
+        last: list[FogError] = []
 
+        def attempt() -> Optional[Link]:
             try:
-                self._link = wait_until(attempt, timeout=patience, interval=0.1,
-                                        what=f"a connection to '{self.name}'")
-            except DeadlineExceeded as error:
-                raise last[0] if last else error from error
-            return self._link
+                return Link(self.endpoint, name=self.name, timeout=min(patience, _ATTEMPT))
+            except (ConnectError, DeadlineExceeded) as error:
+                last[:] = [error]
+                return None
 
-    def _open(self, command: Command, timeout: float) -> Channel:
+        try:
+            return wait_until(attempt, timeout=patience, interval=0.1, cancel=cancel,
+                              what=f"a connection to '{self.name}'")
+        except DeadlineExceeded as error:
+            raise last[0] if last else error from error
+
+    def _open(
+        self, command: Command, timeout: float, cancel: Optional[threading.Event] = None,
+    ) -> Channel:
         for attempt in (1, 2):
+            link = self._connected(timeout, cancel)
             try:
-                return self._connected(timeout).open(command)
+                return link.open(command)
             except ConnectError:
                 # lost, as we find out only now, and nothing has been begun
                 if attempt == 2:
@@ -95,6 +132,7 @@ class KubernetesShell:
         """Drop the connection; the next call would open it again."""
         with self._lock:
             link, self._link = self._link, None
+            self._closings += 1
         if link is not None:
             link.close()
 
@@ -111,7 +149,7 @@ class KubernetesShell:
         if cancel is not None and cancel.is_set():
             raise Cancelled(what)
         output = _Output(on_output)
-        with contextlib.closing(self._open(command, timeout)) as channel:
+        with contextlib.closing(self._open(command, timeout, cancel)) as channel:
             feeder = _feed(channel, command.input)
             self._collect(channel, output, begin + timeout, cancel, what)
             returncode = channel.exit_status

@@ -15,7 +15,7 @@ import threading
 import pytest
 
 from fogros2 import kubernetes_api
-from fogros2.errors import ConnectError, ShellError
+from fogros2.errors import Cancelled, ConnectError, ShellError
 from fogros2.kubernetes_api import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_link
@@ -184,6 +184,30 @@ def test_what_is_sent_arrives_once_when_the_connection_breaks(api, shell, tmp_pa
 def test_an_api_server_that_restarts_is_waited_for(api, shell):
     api.refusals = [Unreachable('refused'), ApiError('no', status=503), Unreachable('refused')]
     assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
+
+
+def test_a_cluster_that_does_not_answer_holds_up_no_ctrl_c(api, shell):
+    api.refusals += [Unreachable('refused')] * 1000
+    cancel, ended = threading.Event(), []
+
+    def ask() -> None:
+        with pytest.raises(Cancelled):
+            shell.run(Command(('true',)), timeout=30.0, cancel=cancel)
+        ended.append('cancelled')
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    wait_until(lambda: len(api.refusals) < 1000, timeout=10.0, what='an attempt')
+    with pytest.raises(ConnectError):
+        shell.run(Command(('true',)), timeout=0.2)  # one attempt at a time; its own patience
+    closing = threading.Thread(target=shell.close, daemon=True)
+    closing.start()
+    closing.join(2.0)
+    assert not closing.is_alive()
+    assert thread.is_alive()
+    cancel.set()
+    thread.join(3.0)
+    assert ended == ['cancelled']
 
 
 def test_a_pod_that_is_gone_is_told_at_once(api, shell):
