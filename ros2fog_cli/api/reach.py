@@ -72,7 +72,8 @@ def session(
     Yield the machine's shell, which connects when first used; closed after the block.
 
     Behind a firewall that the launch has closed, it goes through the VPN while the robot has one
-    to it; else this robot is let in for as long as the block takes.
+    to it; else this robot is let in for as long as the block takes. Another robot's machine isn't
+    opened: that would lock its own robot out, which may be on its way in.
 
     :raises FogError: it can't be reached.
     """
@@ -82,7 +83,7 @@ def session(
             inside = through_vpn(entry, to)
             if inside is not None:
                 to = inside
-            else:
+            elif entry.own:
                 _open(entry, to.port, undo)
         found = shells.connect(to, name=entry.name, timeout=timeout)
         undo.callback(found.close)

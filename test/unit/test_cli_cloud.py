@@ -320,6 +320,14 @@ def test_a_session_without_a_store(shells: list[Endpoint]) -> None:
     assert shells[0].host_key == 'ssh-ed25519 AAAA' and shells[0].key_file is None
 
 
+def test_a_session_leaves_another_robot_s_door_as_it_is(shells: list[Endpoint]) -> None:
+    found = machine('slam')
+    machine('slam', tags={**found.tags, TAG_ROBOT: 'another'})
+    assert run('connect', 'slam') == 0
+    assert [call for call in Cloud.calls if call[0] == 'allow'] == []
+    assert shells[0].host == '198.51.100.7'
+
+
 def test_a_session_leaves_the_door_open_for_a_launch(
     shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
