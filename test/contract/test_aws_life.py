@@ -523,6 +523,21 @@ def test_a_quota_leads_to_the_next_type_at_once(aws):
     assert aws.provider.describe(machine_id).kind == 't3.large'
 
 
+def test_a_type_to_go_on_with_keeps_to_the_cap_and_has_its_own_price(aws, monkeypatch):
+    prices = {'t3.medium': Decimal('0.04'), 't3.xlarge': Decimal('0.17')}
+    monkeypatch.setattr(aws.provider, '_price', lambda region, kind, spot: prices.get(kind))
+    aws.refuse('RunInstances', 'VcpuLimitExceeded', 'VcpuLimitExceeded')
+    # the price of t3.large nobody knows, that of t3.xlarge is above the cap
+    with pytest.raises(AwsError):
+        aws.provider.create(*ask(instance_types=['t3.large', 't3.xlarge'], max_price=0.1))
+    assert [params['InstanceType'] for params in aws.asked('RunInstances')] == ['t3.medium']
+    assert left() == NOTHING
+    aws.refuse('RunInstances', 'VcpuLimitExceeded')
+    machine_id = aws.provider.create(*ask('other', instance_types=['t3.large']))
+    found = aws.provider.describe(machine_id)
+    assert (found.kind, found.cost_per_hour) == ('t3.large', None)
+
+
 def test_no_room_in_a_region_leads_to_the_next_and_leaves_nothing_there(aws):
     aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
     machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))

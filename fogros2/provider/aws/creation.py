@@ -178,13 +178,12 @@ class Creation:
             if self.request.cancel is not None and self.request.cancel.is_set():
                 raise Cancelled(f"creating '{self.spec.name}'")
             price = self._price(region, place.kind)
-            if price is not None:
-                tags = {**tags, instances.TAG_PRICE: str(price)}
-                if self.options.max_price is not None and price > self.options.max_price:
-                    continue
+            if self._too_dear(price):
+                continue
+            priced = {} if price is None else {instances.TAG_PRICE: str(price)}
             words = instances.run_request(
                 self.spec, self.request, self.options, place=place, image=image_of[place.kind],
-                group=group, tags=tags, user_data=data)
+                group=group, tags={**tags, **priced}, user_data=data)
             try:
                 answer = self.account.call(
                     'ec2', region, 'run_instances',
@@ -200,9 +199,16 @@ class Creation:
                 continue
             return str(answer['Instances'][0]['InstanceId'])
         raise refused or AwsError(
-            f"no machine for '{self.spec.name}' in {region} costs at most "
+            f"no machine for '{self.spec.name}' in {region} is known to cost at most "
             f'max_price={self.options.max_price}', 'ros2 fog price shows what there is',
             code='SpotMaxPriceTooLow')
+
+    def _too_dear(self, price: Optional[Decimal]) -> bool:
+        """Return whether a price is above the cap, or may be: AWS itself holds a spot price."""
+        cap = self.options.max_price
+        if cap is None:
+            return False
+        return not self.options.spot if price is None else price > cap
 
     def _places(self, region: str, types: list[str]) -> Iterator[Place]:
         """Yield the tries: where EC2 likes best first, then zone by zone, type by type."""
