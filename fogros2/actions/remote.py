@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fogros2.actions.session import Session
     from fogros2.image_transport.streams import Entry
 
+
 class RemoteProcess(ExecuteLocal):
     """
     A process action whose process is on a machine.

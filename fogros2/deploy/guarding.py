@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import contextlib
 import functools
+import shlex
 import threading
 from typing import Any, Optional
 
@@ -105,7 +106,7 @@ class Guard:
         job = self._job
         job.on(shell, [Command.script(
             f'install -d -m 755 {AGENT_FOLDER}; '
-            f'install -d -m 700 -o {config["user"]} {self.directory}', sudo=True,
+            f'install -d -m 700 -o {shlex.quote(config["user"])} {self.directory}', sudo=True,
             what="make the agent's folder")])
         shell.put(agent_source().read_bytes(), program, mode=0o700)
         # of this launch alone: another robot may be doing the same at this moment

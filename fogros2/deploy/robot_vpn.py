@@ -11,7 +11,7 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2 import plan, plugin_system, process
-from fogros2.errors import FogError
+from fogros2.errors import Cancelled, FogError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import step, StepFailed
 from fogros2.vpn import addresses, Vpn
@@ -48,10 +48,18 @@ class RobotVpn:
             launch.id, network, addresses.choose_port(), str(folder / 'vpn.key'))
 
     def ensure(self) -> Peer:
-        """Bring the interface up if it isn't; return the robot as the machines' peer."""
+        """
+        Bring the interface up if it isn't; return the robot as the machines' peer.
+
+        :raises Cancelled: it has been taken down for good.
+        """
         with self._lock:
             if not self._up:
                 launch = self._launch
+                if self._stop.is_set():
+                    # a thread that was about to tell a machine its peers: nobody would take the
+                    # interface down a second time
+                    raise Cancelled('the VPN interface')
                 with step(launch.report, '', 'VPN interface') as detail:
                     launch.undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
                     self.down = False

@@ -52,6 +52,8 @@ from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2.waiting import Timeouts, wait_until
 
 SPEC = MachineSpec('planner', 'fake')
+#: As it is; the fixture below has it do nothing.
+ENSURE = RobotVpn.ensure
 ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', guarded=True)
 
 
@@ -267,6 +269,15 @@ def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
     monkeypatch.setattr(robot._stop, 'wait', lambda timeout: robot._stop.is_set())
     robot._keep()
     assert len(seen) == 2
+
+
+def test_an_interface_that_was_taken_down_does_not_come_up_again(launch, monkeypatch):
+    robot = launch.robot_vpn()
+    robot._stop.set()
+    monkeypatch.setattr(process, 'run', None)
+    with pytest.raises(Cancelled):
+        ENSURE(robot)
+    assert robot.down
 
 
 class Members:
