@@ -501,6 +501,16 @@ def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
     assert aws.count()['ec2:DeleteSecurityGroup'] == 3
 
 
+def test_a_machine_that_ends_before_ec2_knows_it_ends_all_the_same(aws):
+    machine_id = aws.provider.create(*ask())
+    aws.refuse('TerminateInstances', 'InvalidInstanceID.NotFound')
+    aws.provider.destroy(machine_id)
+    assert left() == NOTHING
+    # and then it is known to be gone, at once
+    aws.provider.destroy(machine_id)
+    assert aws.count()['ec2:TerminateInstances'] == 2
+
+
 def test_no_room_in_a_zone_leads_to_the_next(aws):
     aws.refuse('RunInstances', 'InsufficientInstanceCapacity', 'Unsupported')
     aws.provider.create(*ask())

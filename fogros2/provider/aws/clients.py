@@ -8,6 +8,7 @@ import contextlib
 import os
 from pathlib import Path
 import threading
+import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError
@@ -18,6 +19,8 @@ ATTEMPTS = 8
 #: The same, where no answer comes at all.
 UNANSWERED = 2
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
+#: Seconds for which EC2 may not know an instance that it has just made.
+SETTLING = 60.0
 #: Variables and files that say that somebody has set AWS up on this computer.
 _VARIABLES = (
     'AWS_ACCESS_KEY_ID', 'AWS_PROFILE', 'AWS_DEFAULT_PROFILE', 'AWS_WEB_IDENTITY_TOKEN_FILE',
@@ -86,6 +89,11 @@ class Account:
         self._clients: dict[tuple[str, str, bool], Any] = {}
         # making clients of one session in several threads isn't safe; using them is
         self._lock = threading.RLock()
+
+    def just_made(self, instance: str) -> bool:
+        """Return whether EC2 may not know an instance yet that this process has made."""
+        made = self.made.get(instance)
+        return made is not None and time.monotonic() - made < SETTLING
 
     def session(self) -> Any:
         """

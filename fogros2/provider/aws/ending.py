@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Optional
 
 from fogros2.provider import TAG_NAME
 from fogros2.provider.aws import instances, network
@@ -36,20 +36,26 @@ def destroy(account: Account, machine: MachineId) -> None:
                 lambda: not _there(account, machine), timeout=PATIENCE, first=1.0, interval=4.0,
                 longest=15.0, what=f'{machine.instance} in {machine.region} to be terminated',
                 hint='ros2 fog delete again later')
+    account.made.pop(machine.instance, None)
     sweep(account, machine.region, machine.attempt)
 
 
 def _terminate(account: Account, machine: MachineId) -> bool:
     """Have an instance end; returns whether there is something to wait for."""
-    try:
-        answer = account.call('ec2', machine.region, 'terminate_instances',
-                              f'ending {machine.instance}', InstanceIds=[machine.instance])
-    except AwsError as error:
-        if code_of(error) in GONE:
-            return False
-        raise
-    return any(entry['CurrentState']['Name'] != 'terminated'
-               for entry in answer['TerminatingInstances'])
+    def ask() -> Optional[list[Mapping[str, Any]]]:
+        try:
+            return list(account.call(
+                'ec2', machine.region, 'terminate_instances', f'ending {machine.instance}',
+                InstanceIds=[machine.instance])['TerminatingInstances'])
+        except AwsError as error:
+            if code_of(error) not in GONE:
+                raise
+            # EC2 may not know one that was made a moment ago, and which would run on
+            return None if account.just_made(machine.instance) else []
+
+    told = wait_until(ask, timeout=PATIENCE, interval=1.0, longest=5.0,
+                      what=f'{machine.instance} in {machine.region} to be known')
+    return any(entry['CurrentState']['Name'] != 'terminated' for entry in told)
 
 
 def _there(account: Account, machine: MachineId) -> bool:

@@ -35,8 +35,6 @@ T = TypeVar('T')
 
 #: Names the regions that 'all regions' means, such as 'eu-central-1 us-east-1'.
 REGIONS_VARIABLE = 'FOGROS2_AWS_REGIONS'
-#: Seconds for which EC2 may not know an instance that it has just made.
-SETTLING = 60.0
 #: Regions asked at once.
 PARALLEL = 20
 #: Regions beside the nearest one to go on in where it has no room.
@@ -213,8 +211,7 @@ class AWSProvider(Provider):
             found = []
         if found:
             return found[0]
-        made = self._account.made.get(machine.instance)
-        if made is not None and time.monotonic() - made < SETTLING:
+        if self._account.just_made(machine.instance):
             return None
         raise MachineNotFound(f'there is no {machine.instance} in {machine.region} any more')
 
