@@ -98,7 +98,7 @@ def base(cache: Path, say: Callable[[str], None]) -> Path:
                 'unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec',
                 'debootstrap --variant=minbase --include="$2" "$3" "$1" "$4" >&2; '
                 f'umount "$1/proc" "$1/sys" 2>/dev/null || :; {_SHRINK}; '
-                'mknod -m 666 "$1/dev/null" c 1 3',
+                'mknod -m 666 "$1/dev/null" c 1 3; chown 0:0 "$1"; chmod 755 "$1"',
                 'sh', str(aside), ','.join(PACKAGES), codename, address),
                 sudo=True, what='make a Debian system'), timeout=900.0)
             process.run(Command(('mv', '-T', str(aside), str(target)), sudo=True), timeout=10.0)
@@ -167,7 +167,8 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     system = cache / f'system-{_checksum(f"1 {root.name}")}'
     target = cache / f'images-{_checksum(f"2 {system.name} {packed.key}")}'
     for path in (system, target):
-        if path.is_dir():
+        # root's; one who isn't can't say that it was used
+        with contextlib.suppress(FileNotFoundError, PermissionError):
             os.utime(path)
     if target.is_dir():
         return target
