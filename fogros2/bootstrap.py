@@ -47,6 +47,7 @@ APT_PACKAGES = (
     f'ros-{DISTRO}-ros-base', f'ros-{DISTRO}-{RMW.replace("_", "-")}',
     'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
     'wireguard-tools', 'rsync', 'iproute2',
+    'sudo',  # rosdep's way to root, which an image of ROS has not
 )
 #: Variables that list folders; those of the robot's hold only where the folder travels.
 _PATH_VARIABLES = (

@@ -388,3 +388,20 @@ def _include(paths: Sequence[Path], root: Path) -> Iterator[str]:
             yield f'/{relative}/***'
         else:
             yield f'/{relative}'
+
+
+def find_workspace(environment: Mapping[str, str]) -> Optional[str]:
+    """
+    Return the workspace whose install space comes first in the environment, None without one.
+
+    An install space is a folder that colcon marked as one, beside a ``src`` folder: an installed
+    distribution has the marker too, or none.
+    """
+    for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
+        for entry in environment.get(variable, '').split(os.pathsep):
+            # an isolated install space has one prefix a package below it
+            for folder in (Path(entry), Path(entry).parent) if entry else ():
+                marked = (folder / '.colcon_install_layout').is_file()
+                if marked and (folder.parent / 'src').is_dir():
+                    return str(folder.parent)
+    return None

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import difflib
 import inspect
 import os
-from pathlib import Path
 import re
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
@@ -22,6 +21,7 @@ from fogros2.model import (
     OnInterrupt,
 )
 from fogros2.store import check_name
+from fogros2.workspace import find_workspace
 
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType
@@ -300,23 +300,6 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
         raise ConfigurationError(
             f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
     return seconds
-
-
-def find_workspace(environment: Mapping[str, str]) -> Optional[str]:
-    """
-    Return the workspace whose install space comes first in the environment, None without one.
-
-    An install space is a folder that colcon marked as one, beside a ``src`` folder: an installed
-    distribution has the marker too, or none.
-    """
-    for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
-        for entry in environment.get(variable, '').split(os.pathsep):
-            # an isolated install space has one prefix a package below it
-            for folder in (Path(entry), Path(entry).parent) if entry else ():
-                marked = (folder / '.colcon_install_layout').is_file()
-                if marked and (folder.parent / 'src').is_dir():
-                    return str(folder.parent)
-    return None
 
 
 def _choice(kind: Any) -> Any:

@@ -20,7 +20,8 @@ from ros2fog_cli.verb import (
 _USAGE = """\
 ros2 fog image [OPTIONS] NAME [NAME ...]
        ros2 fog image list [OPTIONS]
-       ros2 fog image delete [OPTIONS] IMAGE [IMAGE ...]"""
+       ros2 fog image delete [OPTIONS] IMAGE [IMAGE ...]
+       ros2 fog image create --registry REGISTRY [OPTIONS]"""
 
 
 class ImageVerb(VerbExtension):
@@ -30,12 +31,13 @@ class ImageVerb(VerbExtension):
         """Add the verb's arguments."""
         parser.usage = _USAGE
         first = parser.add_argument(
-            'first', metavar='list | delete | NAME',
-            help="'list', 'delete' with ids or names of images, or a machine to make an image of")
+            'first', metavar='list | delete | create | NAME',
+            help="'list', 'delete' with ids or names of images, 'create' for pods (see "
+                 "'ros2 fog image create -h'), or a machine to make an image of")
         first.completer = (  # type: ignore[attr-defined]
             lambda prefix, **more: [
                 *complete_names(prefix, **more),
-                *(word for word in ('list', 'delete') if word.startswith(prefix))])
+                *(word for word in ('list', 'delete', 'create') if word.startswith(prefix))])
         _add_options(parser)
         parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
                             help='more of them; options may come anywhere')
@@ -43,6 +45,8 @@ class ImageVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Do what the first word says."""
         from fogros2.errors import ConfigurationError
+        if args.first == 'create':
+            return _create(args)
         first, rest = args.first, _among(args)
         if first == 'list':
             if rest:
@@ -76,6 +80,39 @@ def _among(args: argparse.Namespace) -> list[str]:
     late.add_argument('words', nargs='*')
     words: list[str] = late.parse_intermixed_args(args.rest, args).words
     return words
+
+
+def _create(args: argparse.Namespace) -> int:
+    parser = argparse.ArgumentParser(
+        prog='ros2 fog image create',
+        description='Build the image for pods, with all in it that a launch from this terminal '
+                    'would install, and push it.')
+    parser.add_argument('--registry', required=True,
+                        help="where it goes, such as 'registry.example/robots'")
+    parser.add_argument('--base', default='', help='image to begin with')
+    parser.add_argument('--workspace', help='whose dependencies go in (default: the one that is '
+                                            "sourced; '' for none)")
+    parser.add_argument('--engine', choices=('auto', 'podman', 'docker', 'buildah'),
+                        default='auto', help='what builds it (default: the first that is there)')
+    parser.add_argument('--folder', default='fogros2_image',
+                        help='where the Containerfile is written (default: %(default)s)')
+    parser.add_argument('--no-push', action='store_true', help='build it, and leave it here')
+    parser.add_argument('--dry-run', action='store_true', help='print the Containerfile alone')
+    words = parser.parse_args(args.rest)
+    from pathlib import Path
+
+    from ros2fog_cli.api import pod_image
+    recipe = pod_image.recipe(words.registry, base=words.base, folder=words.workspace)
+    if words.dry_run or args.dry_run:
+        print(dict(recipe.files)['Containerfile'], end='')
+        return 0
+    made = pod_image.build(
+        recipe, Path(words.folder), engine=words.engine, push=not words.no_push,
+        say=lambda line: print(line, file=sys.stderr))
+    print(f"{'built' if words.no_push else 'pushed'} {made}")
+    registry = made.rpartition(':')[0]
+    print(f"launch files take it by container_image='{registry}:{{dependencies}}'")
+    return 0
 
 
 def _list(args: argparse.Namespace) -> int:

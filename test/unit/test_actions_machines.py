@@ -13,11 +13,11 @@ import pytest
 from fogros2.actions.machines import (
     CloudInstance,
     ContainerInstance,
-    find_workspace,
     parse_duration,
     SSHInstance,
 )
 from fogros2.errors import ConfigurationError
+from fogros2.workspace import find_workspace
 
 
 @pytest.fixture

@@ -485,6 +485,23 @@ def test_image_with_wrong_words(words: tuple[str, ...]) -> None:
     assert run('image', *words) not in (0, None)
 
 
+def test_an_image_for_pods_holds_what_a_launch_would_install(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    (tmp_path / 'ros2').touch(mode=0o755)
+    monkeypatch.setenv('PATH', str(tmp_path))
+    words = ('image', 'create', '--registry', 'registry.example/robots', '--workspace', '')
+    assert run(*words, '--base', 'ubuntu:24.04', '--dry-run') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert 'FROM ubuntu:24.04' in lines
+    assert any(line.split() == ['wireguard-tools', '\\'] for line in lines)
+    assert 'can\'t be a registry' in str(run(*words, '--registry', 'no registry', '--dry-run'))
+    monkeypatch.setattr('fogros2.process.which', lambda program: None)
+    assert 'podman, docker, buildah' in str(run(*words, '--folder', str(tmp_path / 'image')))
+    monkeypatch.setenv('PATH', '')
+    assert 'ros2 is not on PATH' in str(run(*words, '--dry-run'))
+
+
 # -- prices and regions -------------------------------------------------------------------
 
 

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image that saves pods their installing: what goes in is what a launch here would install."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import os
+from pathlib import Path
+import shutil
+from typing import Optional
+
+from fogros2 import bootstrap, plan, workspace
+from fogros2.errors import PrerequisiteError
+from fogros2.model import MachineSpec
+from fogros2.provider.kubernetes import image
+
+#: What a pod takes besides, where the node has no module for the VPN.
+PACKAGES = (*bootstrap.APT_PACKAGES, 'wireguard-go', 'nftables')
+
+
+def recipe(
+    registry: str, *, base: str = '', folder: Optional[str] = None,
+    environment: Optional[Mapping[str, str]] = None,
+) -> image.Recipe:
+    """
+    Return how to build the image for launches from this terminal.
+
+    :param base: image to begin with; '' for the default one of pods.
+    :param folder: the workspace; None for the one that is sourced, '' for none.
+    :raises PrerequisiteError: there is no ROS 2 here to know the needs of.
+    """
+    environment = os.environ if environment is None else environment
+    root = workspace.find_workspace(environment) if folder is None else folder
+    if root:
+        root = os.path.abspath(os.path.expanduser(root))
+        workspace.inspect(Path(root))
+    ros2 = shutil.which('ros2', path=environment.get('PATH'))
+    if ros2 is None:
+        raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
+    under = plan.underlay(environment, root or None, ros2)
+    spec = MachineSpec('image', 'kubernetes', workspace=root or None)
+    more = {'base': base} if base else {}
+    return image.recipe(
+        registry, dependencies=bootstrap.dependencies(spec, under), packages=PACKAGES,
+        keys=workspace.dependencies(root) if root else (),
+        distro=under.environment.get('ROS_DISTRO') or bootstrap.DISTRO, **more)
+
+
+def build(
+    what: image.Recipe, folder: Path, *, engine: str, push: bool, say: Callable[[str], None],
+) -> str:
+    """
+    Write the recipe to ``folder``, build the image and push it; return its reference.
+
+    :raises FogError: what failed, with the engine's last words.
+    """
+    return image.build(
+        what, folder, program=image.engine(engine), push=push, on_output=say)
