@@ -9,7 +9,7 @@ from pathlib import Path
 import shutil
 from typing import Optional
 
-from fogros2 import bootstrap, plan, workspace
+from fogros2 import bootstrap, host, plan, workspace
 from fogros2.errors import PrerequisiteError
 from fogros2.model import MachineSpec
 from fogros2.provider.kubernetes import image
@@ -43,7 +43,7 @@ def recipe(
     return image.recipe(
         registry, dependencies=bootstrap.dependencies(spec, under), packages=PACKAGES,
         keys=workspace.dependencies(root) if root else (),
-        distro=under.environment.get('ROS_DISTRO') or bootstrap.DISTRO, **more)
+        distro=under.environment.get('ROS_DISTRO') or host.DISTRO, **more)
 
 
 def build(

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import json
+from pathlib import Path
 import os
 import socket
 import threading
@@ -495,10 +496,10 @@ def test_an_image_for_pods_holds_what_a_launch_would_install(
     lines = capsys.readouterr().out.splitlines()
     assert 'FROM ubuntu:24.04' in lines
     assert any(line.split() == ['wireguard-tools', '\\'] for line in lines)
-    assert 'can\'t be a registry' in str(run(*words, '--registry', 'no registry', '--dry-run'))
+    assert "can't be a registry" in str(run(*words, '--registry', 'no registry', '--dry-run'))
     monkeypatch.setattr('fogros2.process.which', lambda program: None)
     assert 'podman, docker, buildah' in str(run(*words, '--folder', str(tmp_path / 'image')))
-    monkeypatch.setenv('PATH', '')
+    (tmp_path / 'ros2').unlink()
     assert 'ros2 is not on PATH' in str(run(*words, '--dry-run'))
 
 
