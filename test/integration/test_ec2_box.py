@@ -198,6 +198,12 @@ def test_a_disk_outlives_a_stop(box, key):
     assert it.described()['State']['Name'] == 'stopping'
     refused('IncorrectInstanceState', lambda: it.ec2.start_instances(InstanceIds=[it.id]))
     box.wait_for(it.id, 'stopped')
+    # started at once: nothing of that stop may reach the next boot
+    it.ec2.start_instances(InstanceIds=[it.id])
+    it.runs()
+    assert it.ssh('sleep 2.5; echo still').stdout == 'still\n'
+    it.ec2.stop_instances(InstanceIds=[it.id])
+    box.wait_for(it.id, 'stopped')
     it.ec2.terminate_instances(InstanceIds=[it.id])
     box.wait_for(it.id, 'terminated')
 

@@ -60,6 +60,7 @@ class Machine:
     ready: float = 0.0
     news: threading.Event = dataclasses.field(default_factory=threading.Event)
     thread: Optional[threading.Thread] = None
+    cutting: Optional[threading.Timer] = None
 
 
 class Cloud:
@@ -81,7 +82,8 @@ class Cloud:
         self.addresses = network.Addresses()
         self.machines: dict[str, Machine] = {}
         self._mounts = mounts
-        self._lock = threading.RLock()
+        #: Held by who changes an instance's state.
+        self.lock = threading.RLock()
         self._closing = threading.Event()
 
     # -- what callers of the API cause ----------------------------------------------------
@@ -91,7 +93,7 @@ class Cloud:
         machine = Machine(
             instance, Computer(self.mark, self.disks / str(instance.id), self._mounts), spot,
             str(instance.image_id))
-        with self._lock:
+        with self.lock:
             self.machines[str(instance.id)] = machine
         self._begin(machine)
 
@@ -114,7 +116,7 @@ class Cloud:
     def end(self, instance: Any, wanted: str, reason: str = BY_USER) -> None:
         """Stop or terminate an instance; what waits for it to be over looks at its state."""
         machine = self.machines[str(instance.id)]
-        with self._lock:
+        with self.lock:
             if machine.wanted == 'terminate':
                 return
             stopped = _state(instance) == 'stopped'
@@ -132,9 +134,9 @@ class Cloud:
 
     def _press(self, machine: Machine) -> None:
         machine.computer.ask_to_end()
-        timer = threading.Timer(_PATIENCE, machine.computer.cut)
-        timer.daemon = True
-        timer.start()
+        machine.cutting = threading.Timer(_PATIENCE, machine.computer.cut)
+        machine.cutting.daemon = True
+        machine.cutting.start()
 
     def reboot(self, instance: Any) -> None:
         """Start an instance's computer again."""
@@ -172,7 +174,7 @@ class Cloud:
         if _state(instance) == 'pending':
             if machine.news.wait(self.boot_delay * _PENDING):
                 return False
-            with self._lock:
+            with self.lock:
                 if machine.wanted == 'run':
                     instance.nics[0].public_ip = machine.public or None
                     _set_state(instance, 'running')
@@ -198,7 +200,7 @@ class Cloud:
             machine.computer.start(Boot(
                 f'{network.PREFIX}{self.mark}{link}',
                 plan['hostname'] or f"ip-{private.replace('.', '-')}", machine.space, plan))
-            with self._lock:
+            with self.lock:
                 machine.runs = True
                 asked = machine.wanted != 'run'
             if asked:
@@ -218,7 +220,7 @@ class Cloud:
             machine.again = True
         if machine.wanted == 'run' and not machine.again:
             behaviour = machine.instance.instance_initiated_shutdown_behavior
-            with self._lock:
+            with self.lock:
                 if machine.wanted == 'run':
                     machine.wanted = 'stop' if behaviour == 'stop' and not machine.spot \
                         else 'terminate'
@@ -229,6 +231,8 @@ class Cloud:
 
     def _clear(self, machine: Machine) -> None:
         """Take away what a computer that is off doesn't have."""
+        if machine.cutting is not None:
+            machine.cutting.cancel()  # the next boot isn't meant
         machine.computer.remove()
         machine.host = None
         if machine.space:
@@ -238,23 +242,21 @@ class Cloud:
                 self.protect()
 
     def _finish(self, machine: Machine) -> None:
-        """Bring an instance to its last state, and give its addresses back."""
+        """Give an instance's addresses back, and bring it to its last state."""
         self._clear(machine)
         instance = machine.instance
-        private = str(instance.private_ip)
+        gone, machine.public = [machine.public], ''
         if machine.wanted == 'terminate':
             computer.remove_disk(machine.computer.disk)
-            MOTO['terminate'](instance)
-            self.addresses.give_back([private])
-        else:
-            MOTO['stop'](instance)
-        if machine.public:
-            self.addresses.give_back([machine.public])
-            machine.public = ''
-        text = f'{machine.reason}: {_WORDS[machine.reason]}'
-        instance.state_reason.code, instance.state_reason.message = machine.reason, text
-        if machine.reason != BY_USER:
-            instance._reason = text
+            gone.append(str(instance.private_ip))
+        self.addresses.give_back(filter(None, gone))
+        # all at once: from this moment on it may be started again
+        with self.lock:
+            MOTO['terminate' if machine.wanted == 'terminate' else 'stop'](instance)
+            text = f'{machine.reason}: {_WORDS[machine.reason]}'
+            instance.state_reason.code, instance.state_reason.message = machine.reason, text
+            if machine.reason != BY_USER:
+                instance._reason = text
 
     # -- images ---------------------------------------------------------------------------
 
@@ -283,7 +285,7 @@ class Cloud:
 
     def protect(self) -> None:
         """Bring the router's rules in line with the security groups."""
-        with self._lock:
+        with self.lock:
             # another thread may take a host away meanwhile: looked at once
             there = [(host, machine.instance) for machine in self.machines.values()
                      if (host := machine.host) is not None]
@@ -298,7 +300,7 @@ class Cloud:
     def close(self) -> None:
         """End every computer at once."""
         self._closing.set()
-        with self._lock:
+        with self.lock:
             machines = list(self.machines.values())
             for machine in machines:
                 machine.wanted = 'terminate'

@@ -55,10 +55,11 @@ def install(cloud: Cloud) -> None:
         return reservation
 
     def start(self: Any) -> Any:
-        before = copy.copy(self._state)
-        if before.name == 'stopped':
-            MOTO['start'](self)
-            cloud.start(self)
+        with cloud.lock:
+            before = copy.copy(self._state)
+            if before.name == 'stopped':
+                MOTO['start'](self)
+                cloud.start(self)
         return before
 
     def stop(self: Any) -> Any:
