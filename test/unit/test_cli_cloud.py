@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import json
-from pathlib import Path
 import os
+from pathlib import Path
 import socket
 import threading
 import time
