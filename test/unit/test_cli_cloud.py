@@ -22,6 +22,7 @@ from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
     MachineNotFound,
+    PrerequisiteError,
     ProviderError,
     Unsupported,
 )
@@ -41,7 +42,7 @@ from fogros2.provider.aws.prices import InstanceType
 from fogros2.provider.aws.regions import Latency
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell
-from ros2fog_cli.api import doctor, endings, images, reach, table
+from ros2fog_cli.api import doctor, endings, images, pod_image, reach, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -499,8 +500,8 @@ def test_an_image_for_pods_holds_what_a_launch_would_install(
     assert "can't be a registry" in str(run(*words, '--registry', 'no registry', '--dry-run'))
     monkeypatch.setattr('fogros2.process.which', lambda program: None)
     assert 'podman, docker, buildah' in str(run(*words, '--folder', str(tmp_path / 'image')))
-    (tmp_path / 'ros2').unlink()
-    assert 'ros2 is not on PATH' in str(run(*words, '--dry-run'))
+    with pytest.raises(PrerequisiteError, match='ros2 is not on PATH'):
+        pod_image.recipe('registry.example', folder='', environment={'PATH': '/nowhere'})
 
 
 # -- prices and regions -------------------------------------------------------------------
