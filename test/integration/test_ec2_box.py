@@ -425,9 +425,10 @@ def traces_of(mark):
 
 
 @pytest.mark.parametrize('whose', ['test', 'box'])
-def test_a_box_leaves_nothing_whoever_dies(box, whose):
+def test_a_box_leaves_nothing_whoever_dies(box, whose, tmp_path):
+    # its log's folder is what the one that is killed can't take away
     child = subprocess.Popen([sys.executable, '-c', STARTER, UBUNTU], stdout=subprocess.PIPE,
-                             text=True)
+                             text=True, env={**os.environ, 'TMPDIR': str(tmp_path)})
     mark, pid = child.stdout.readline().split()
     assert traces_of(mark)
     if whose == 'test':
