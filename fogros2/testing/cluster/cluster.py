@@ -130,7 +130,7 @@ def cluster(
     }
     started = run_node(runs, {
         'commands': services.commands(layout), 'binaries': str(binaries / 'bin'),
-        'images': str(store), 'server': layout.server,
+        'images': str(store), 'server': layout.server, 'pods': layout.pods,
         'authority': authority.certificate.decode(), 'token': users['cluster'][0],
         'cable': {'name': f'fogt{run_folder_mark}',
                   'host': f'{layout.host}/{layout.prefix}',

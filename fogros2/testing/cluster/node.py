@@ -207,7 +207,8 @@ class Node:
     The services of the node, their parent the first process of its namespaces.
 
     :param plan: ``commands`` (service -> words, in the order of their start), ``binaries``,
-        ``cable``, ``images`` (containerd's folder to begin with), how to ask the API server
+        ``cable``, ``pods`` (range of addresses that leave the node as its own), ``images``
+        (containerd's folder to begin with), how to ask the API server
         (``server``, ``authority``, ``token``) and ``owner`` (uid, gid of the user whose test this
         is). Or, instead of running a cluster, ``import``: image archives; what containerd makes of
         them is moved to ``keep``.
@@ -246,6 +247,9 @@ class Node:
             wait_until(Path('/proc/sys/net/ipv4/conf/uplink').exists, 'the cable')
             call('ip', 'address', 'add', cable['node'], 'dev', 'uplink')
             call('ip', 'link', 'set', 'uplink', 'up')
+        if 'pods' in self.plan:
+            call('iptables', '-w', '-t', 'nat', '-A', 'POSTROUTING', '-s', self.plan['pods'],
+                 '!', '-d', self.plan['pods'], '-j', 'MASQUERADE')
 
     # -- services
 
