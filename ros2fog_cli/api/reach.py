@@ -9,6 +9,7 @@ import dataclasses
 import os
 import re
 import socket
+import sys
 import threading
 import time
 from typing import Any, Optional
@@ -16,7 +17,7 @@ from typing import Any, Optional
 from fogros2 import plan, plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.errors import AgentError, ConnectError, FogError
+from fogros2.errors import AgentError, ConnectError, FogError, MachineNotFound
 from fogros2.model import Command, Endpoint
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
@@ -122,8 +123,13 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
             with contextlib.suppress(FogError):
                 record = Store().machine(entry.name).load()
         if record is None or not record.launch_alive:
-            with contextlib.suppress(FogError):  # the machine may be gone by now
+            try:
                 provider.allow(machine_id, port, [])
+            except MachineNotFound:
+                pass  # gone, and its firewall with it
+            except FogError as error:
+                print(f'{entry.name}: its TCP port {port} is still open to this computer, as '
+                      f'closing it failed: {error}', file=sys.stderr)
 
     undo.callback(close)
 

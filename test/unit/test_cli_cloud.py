@@ -316,6 +316,21 @@ def test_a_session_lets_this_robot_in_and_closes_again(shells: list[Endpoint]) -
     assert shells[1].user == 'root'
 
 
+def test_a_door_that_stays_open_is_told(
+    shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('slam')
+    record('slam')
+
+    def allow(self: Cloud, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        if not sources:
+            raise ProviderError('throttled')
+
+    monkeypatch.setattr(Cloud, 'allow', allow)
+    assert run('connect', 'slam') == 0
+    assert 'slam: its TCP port 22 is still open' in capsys.readouterr().err
+
+
 def test_a_session_without_a_store(shells: list[Endpoint]) -> None:
     machine('slam')
     assert run('connect', 'slam') == 0
