@@ -65,7 +65,9 @@ class PrivateSshd:
     def start(self) -> None:
         """Start it and wait until it listens."""
         config = self.folder / 'sshd_config'
-        config.write_text(_CONFIG.format(port=self.port, folder=self.folder) + self.extra)
+        # of two lines with one keyword sshd takes the first
+        config.write_text(
+            self.extra + _CONFIG.format(port=self.port, folder=self.folder))
         sshd = process.which('sshd')
         assert sshd is not None
         # its children belong to its session: one signal ends them all
@@ -121,7 +123,7 @@ def private_sshd(folder: Path, extra: str = '') -> Iterator[PrivateSshd]:
     Run an SSH server for the time of the block.
 
     :param folder: an empty folder for its files.
-    :param extra: more lines for its configuration.
+    :param extra: more lines for its configuration, which win over its own.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in ('host_key', 'id'):

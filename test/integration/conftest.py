@@ -28,13 +28,17 @@ def domain() -> str:
     return str(1 + uuid.uuid4().int % 100)
 
 
+@pytest.fixture(scope='session', autouse=True)
+def no_dds_of_others() -> None:
+    """Forget what tests that run nodes in this process have set, all of which came before."""
+    os.environ.pop('CYCLONEDDS_URI', None)
+
+
 @pytest.fixture(autouse=True)
 def own_domain(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the tests' nodes among themselves and off the network of this computer."""
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    # of tests that run nodes in this process
-    monkeypatch.delenv('CYCLONEDDS_URI', raising=False)
     # by this, a process is known to be this run's
     monkeypatch.setenv(RUN, f'{os.getpid()}-{domain}')
 

@@ -147,7 +147,7 @@ def test_a_machine_without_rsync_is_told_so(source, tmp_path):
     programs.mkdir()
     for name in ('sh', 'bash', 'mkdir', 'ls', 'head', 'env'):
         (programs / name).symlink_to(process.which(name))
-    with private_sshd(tmp_path / 'sshd', f'SetEnv PATH={programs}\n') as server, \
+    with private_sshd(tmp_path / 'sshd', f'SetEnv PATH={programs} SHLVL=2\n') as server, \
             contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell:
         with pytest.raises(ShellError, match="'planner' has no rsync .*apt-get install rsync"):
             shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
