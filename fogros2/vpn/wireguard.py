@@ -236,10 +236,17 @@ def _link(interface: VpnInterface) -> _Step:
     ``wireguard-go`` exits when its socket goes, and makes the TUN itself where there is none; made
     by ``ip tuntap`` it stays when that process dies, and so do the sockets of the nodes. It is
     told from others of its name, in containers say, by its network namespace.
+
+    A port that somebody has is found before: ``wireguard-go`` may bind it after all has been set,
+    and tell nobody that it couldn't.
     """
     name = _name(interface)
     socket = f'/var/run/wireguard/{name}.sock'
     do = f"""\
+[ -e /sys/class/net/{name} ] || ! ss -Hlun 'sport = :{interface.port}' | grep -q . || {{
+  echo "UDP port {interface.port}: Address already in use" >&2
+  exit 1
+}}
 if wg show {name} listen-port >/dev/null 2>&1; then :
 elif said=$(ip link add dev {name} type wireguard 2>&1); then :
 elif command -v wireguard-go >/dev/null; then
