@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import statistics
 import subprocess
 import sys
@@ -30,6 +31,8 @@ def imports(statement: str, before: str = '') -> float:
 
 def main() -> None:
     """Take the commands in turn, with a container machine up that ``list`` shows."""
+    # With it each import would compile its modules anew, which no user's does.
+    os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
     listed, bare, package, node = [], [], [], []
     launch = Launch()
     try:
