@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands as one line for a remote shell; pure."""
+"""Commands as one line for a remote shell, and what came of them; pure."""
 
 from __future__ import annotations
 
 import shlex
 
-from fogros2.model import Command
+from fogros2.errors import CommandError
+from fogros2.model import Command, Result
 
 _ANNOUNCE = 'echo $$; exec "$@"'
 
@@ -54,6 +55,24 @@ def write_script(target: str, mode: int) -> str:
         f'umask 077; target={path}; mkdir -p -- "$(dirname -- "$target")"; '
         'aside="$target.$$.new"; trap \'rm -f -- "$aside"\' EXIT; '
         f'cat > "$aside"; chmod {mode:o} "$aside"; mv -f -- "$aside" "$target"')
+
+
+def writing(data: bytes, target: str, mode: int) -> Command:
+    """Return the command that writes a file (folders made as needed)."""
+    return Command(('sh', '-ec', write_script(target, mode)), input=data,
+                   what=f'writing {target}')
+
+
+def checked(command: Command, result: Result, where: str) -> Result:
+    """
+    Return the result.
+
+    :raises CommandError: it isn't one of success.
+    """
+    if result.returncode != 0:
+        raise CommandError(
+            command, result, where, hint_for(result.returncode, result.stderr, where))
+    return result
 
 
 def hint_for(returncode: int, stderr: str, where: str) -> str:

@@ -17,7 +17,6 @@ from typing import Optional
 from fogros2 import process
 from fogros2.errors import (
     Cancelled,
-    CommandError,
     ConnectError,
     DeadlineExceeded,
     FogError,
@@ -26,12 +25,11 @@ from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
 from fogros2.shell.kubernetes_channel import Channel
 from fogros2.shell.kubernetes_link import Link
+from fogros2.shell.lines import LineStream, Output
 from fogros2.waiting import wait_until
 
 #: Seconds after a command's end in which something it left behind may hold its output open.
 _DRAIN = 2.0
-#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
-MAX_LINE = 32 << 20
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 20
 #: Seconds that one attempt to connect may take: a cancel isn't seen sooner.
@@ -148,7 +146,7 @@ class KubernetesShell:
         what = command.what or command.argv[0]
         if cancel is not None and cancel.is_set():
             raise Cancelled(what)
-        output = _Output(on_output)
+        output = Output(on_output)
         with contextlib.closing(self._open(command, timeout, cancel)) as channel:
             feeder = _feed(channel, command.input)
             self._collect(channel, output, begin + timeout, cancel, what)
@@ -159,14 +157,10 @@ class KubernetesShell:
             raise ConnectError(f"the connection to '{self.name}' was lost while {what} ran there",
                                "check the robot's network")
         result = Result(returncode, *output.text(), time.monotonic() - begin)
-        if check and returncode != 0:
-            raise CommandError(
-                command, result, f"'{self.name}'",
-                command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
-        return result
+        return command_line.checked(command, result, f"'{self.name}'") if check else result
 
     def _collect(
-        self, channel: Channel, output: _Output, deadline: float,
+        self, channel: Channel, output: Output, deadline: float,
         cancel: Optional[threading.Event], what: str,
     ) -> None:
         """Read until both streams have ended and the command too, or the time is up."""
@@ -197,10 +191,7 @@ class KubernetesShell:
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file there (folders made as needed): aside first, then moved into place."""
-        script = command_line.write_script(target, mode)
-        self.run(
-            Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
-            timeout=timeout)
+        self.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
@@ -240,7 +231,8 @@ class KubernetesShell:
 
     def open(self, command: Command) -> Stream:
         """Start a program there and return its streams; it ends with the stream."""
-        stream = KubernetesStream(self._open(command, self._timeout), self.name)
+        channel = self._open(command, self._timeout)
+        stream = LineStream(channel, self.name, channel.discard_errors)
         if command.input:
             stream.write(command.input)
         return stream
@@ -248,74 +240,6 @@ class KubernetesShell:
     def interactive(self, command: Optional[Command] = None) -> int:
         """Give the user's terminal to the login shell there, or to ``command``."""
         return kubernetes_terminal.attach(self._connected(self._timeout), command)
-
-
-class KubernetesStream:
-    """Both ends of a program that runs in a pod, line by line."""
-
-    def __init__(self, channel: Channel, name: str) -> None:
-        self._channel = channel
-        self._name = name
-        self._buffer = b''
-
-    def write(self, data: bytes) -> None:
-        """Send to its standard input."""
-        try:
-            self._channel.sendall(data)
-        except OSError as error:
-            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
-
-    def readline(self) -> bytes:
-        """Return its next line of output with the newline, b'' at the end."""
-        parts = [self._buffer]
-        size = len(self._buffer)
-        while b'\n' not in parts[-1]:
-            if size > MAX_LINE:
-                self.close()
-                self._buffer = b''
-                return b''
-            data = b''
-            with contextlib.suppress(FogError):
-                data = self._channel.recv(1 << 16)
-                self._channel.discard_errors()
-            if not data:
-                self._buffer = b''
-                return b''.join(parts)
-            parts.append(data)
-            size += len(data)
-        line, _, self._buffer = b''.join(parts).partition(b'\n')
-        return line + b'\n'
-
-    def close(self) -> None:
-        """End it; a ``readline`` in another thread returns b''."""
-        self._channel.close()
-
-
-class _Output:
-    """What a command wrote, and its lines as they become whole."""
-
-    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
-        self._on_output = on_output
-        self._out: list[bytes] = []
-        self._err: list[bytes] = []
-        self._rest = b''
-
-    def add(self, out: bytes, err: bytes) -> None:
-        """Take what has arrived."""
-        self._out.append(out)
-        self._err.append(err)
-        if self._on_output is not None and out:
-            *lines, self._rest = (self._rest + out).split(b'\n')
-            for line in lines:
-                self._on_output(line.decode(errors='replace'))
-
-    def text(self) -> tuple[str, str]:
-        """Return standard output and standard error; the last line goes out, if not whole."""
-        if self._on_output is not None and self._rest:
-            self._on_output(self._rest.decode(errors='replace'))
-            self._rest = b''
-        return (b''.join(self._out).decode(errors='replace'),
-                b''.join(self._err).decode(errors='replace'))
 
 
 def _load() -> None:

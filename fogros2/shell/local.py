@@ -36,9 +36,7 @@ class LocalShell:
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file (folders made as needed): aside first, then moved into place."""
-        script = command_line.write_script(target, mode)
-        process.run(Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
-                    timeout=timeout)
+        process.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
+import functools
 from pathlib import Path
 import threading
 import time
@@ -12,13 +13,13 @@ from typing import Optional, TYPE_CHECKING
 
 from fogros2.errors import (
     Cancelled,
-    CommandError,
     ConnectError,
     DeadlineExceeded,
     FogError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, ssh_connection, ssh_terminal, Stream, sync
+from fogros2.shell.lines import LineStream, Output
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ _DRAIN = 2.0
 _INLINE = 1 << 16
 #: Seconds that one attempt to connect, or to open a session, may take: a cancel isn't seen sooner.
 _ATTEMPT = 10.0
-#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
-MAX_LINE = 32 << 20
 
 
 class SSHShell:
@@ -156,7 +155,7 @@ class SSHShell:
         if cancel is not None and cancel.is_set():
             raise Cancelled(_what(command))
         channel = self.start(line, timeout, cancel)
-        output = _Output(on_output)
+        output = _Announced(on_output)
         try:
             feeder = _feed(channel, command.input)
             self._collect(channel, output, begin + timeout, cancel, command)
@@ -169,11 +168,7 @@ class SSHShell:
         finally:
             channel.close()
         result = Result(returncode, *output.text(), time.monotonic() - begin)
-        if check and returncode != 0:
-            raise CommandError(
-                command, result, f"'{self.name}'",
-                command_line.hint_for(returncode, result.stderr, f"'{self.name}'"))
-        return result
+        return command_line.checked(command, result, f"'{self.name}'") if check else result
 
     def start(
         self, line: str, timeout: Optional[float] = None,
@@ -201,7 +196,7 @@ class SSHShell:
         raise AssertionError('the second attempt returns or raises')
 
     def _collect(
-        self, channel: paramiko.Channel, output: _Output, deadline: float,
+        self, channel: paramiko.Channel, output: Output, deadline: float,
         cancel: Optional[threading.Event], command: Command,
     ) -> None:
         """Read until both streams have ended, the time is up, or ``cancel`` is set."""
@@ -217,7 +212,8 @@ class SSHShell:
             try:
                 data = channel.recv(1 << 16)
             except TimeoutError:
-                if output.errors(channel):
+                if errors := _take_errors(channel):
+                    output.add(err=errors)
                     quiet_since = 0.0
                 elif channel.exit_status_ready():
                     # it has ended; what it left in the background holds its output open
@@ -225,16 +221,15 @@ class SSHShell:
                     if now - quiet_since >= _DRAIN:
                         return
                 continue
-            output.errors(channel)
+            output.add(data, _take_errors(channel))
             quiet_since = 0.0
             if data:
-                output.add(data)
                 continue
             # the end of standard output; standard error ends with the channel
             channel.settimeout(max(0.05, min(_DRAIN, deadline - now)))
             try:
                 while more := channel.recv_stderr(1 << 16):
-                    output.stderr += more
+                    output.add(err=more)
             except TimeoutError:
                 pass
             lost = channel.closed or not channel.get_transport().is_alive()
@@ -261,10 +256,7 @@ class SSHShell:
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file there (folders made as needed): aside first, then moved into place."""
-        script = command_line.write_script(target, mode)
-        self.run(
-            Command(('sh', '-ec', script), input=data, what=f'writing {target}'),
-            timeout=timeout)
+        self.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
@@ -280,7 +272,8 @@ class SSHShell:
         """Start a program there and return its streams; it ends with the stream."""
         channel = self.start(command_line.remote_line(command, user=self.user), _ATTEMPT)
         _feed(channel, command.input, end=False)
-        return SSHStream(channel, self.name)
+        channel.settimeout(None)
+        return LineStream(channel, self.name, functools.partial(_take_errors, channel))
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Give the user's terminal to the login shell there, or to ``command``."""
@@ -288,101 +281,28 @@ class SSHShell:
         return ssh_terminal.attach(self.channel(), line, self.name)
 
 
-class SSHStream:
-    """Both ends of a program that runs on a machine, line by line."""
+class _Announced(Output):
+    """The output of a command whose first line isn't its own: the number of its process."""
 
-    def __init__(self, channel: paramiko.Channel, name: str) -> None:
-        self._channel = channel
-        self._name = name
-        self._buffer = b''
-        channel.settimeout(None)
+    _head: Optional[bytes] = b''
+    pid = 0
 
-    def write(self, data: bytes) -> None:
-        """Send to its standard input."""
-        try:
-            self._channel.sendall(data)
-        except OSError as error:
-            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
-
-    def readline(self) -> bytes:
-        """Return its next line of output with the newline, b'' at the end."""
-        parts = [self._buffer]
-        size = len(self._buffer)
-        while b'\n' not in parts[-1]:
-            if size > MAX_LINE:
-                self.close()
-                self._buffer = b''
-                return b''
-            try:
-                data = self._channel.recv(1 << 16)
-            except OSError:
-                data = b''
-            if not data:
-                self._buffer = b''
-                return b''.join(parts)
-            self._discard_errors()
-            parts.append(data)
-            size += len(data)
-        line, _, self._buffer = b''.join(parts).partition(b'\n')
-        return line + b'\n'
-
-    def _discard_errors(self) -> None:
-        # unread, they would fill the channel's window and stop the program
-        while self._channel.recv_stderr_ready():
-            self._channel.recv_stderr(1 << 16)
-
-    def close(self) -> None:
-        """End it; a ``readline`` in another thread returns b''."""
-        self._channel.close()
-
-
-class _Output:
-    """
-    What a command wrote, and its lines as they become whole.
-
-    The first line isn't the command's: it is the number of its process.
-    """
-
-    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
-        self._on_output = on_output
-        self._parts: list[bytes] = []
-        self._rest = b''
-        self._head: Optional[bytes] = b''
-        self.pid = 0
-        self.stderr = b''
-
-    def add(self, data: bytes) -> None:
-        """Take what has arrived of standard output."""
+    def add(self, out: bytes = b'', err: bytes = b'') -> None:
+        """Take what has arrived."""
         if self._head is not None:
-            first, newline, data = (self._head + data).partition(b'\n')
-            if not newline:
-                self._head = first
-                return
-            self._head = None
-            self.pid = int(first) if first.isdigit() else 0
-            if not data:
-                return
-        self._parts.append(data)
-        if self._on_output is not None:
-            *lines, self._rest = (self._rest + data).split(b'\n')
-            for line in lines:
-                self._on_output(line.decode(errors='replace'))
+            first, newline, out = (self._head + out).partition(b'\n')
+            self._head = None if newline else first
+            if newline and first.isdigit():
+                self.pid = int(first)
+        super().add(out, err)
 
-    def errors(self, channel: paramiko.Channel) -> bool:
-        """Take what is there of standard error; return whether there was any."""
-        found = False
-        while channel.recv_stderr_ready():
-            self.stderr += channel.recv_stderr(1 << 16)
-            found = True
-        return found
 
-    def text(self) -> tuple[str, str]:
-        """Return standard output and standard error; the last line goes out, if not whole."""
-        if self._on_output is not None and self._rest:
-            self._on_output(self._rest.decode(errors='replace'))
-            self._rest = b''
-        return (b''.join(self._parts).decode(errors='replace'),
-                self.stderr.decode(errors='replace'))
+def _take_errors(channel: paramiko.Channel) -> bytes:
+    """Return what is there of standard error."""
+    parts = []
+    while channel.recv_stderr_ready():
+        parts.append(channel.recv_stderr(1 << 16))
+    return b''.join(parts)
 
 
 def _what(command: Command) -> str:

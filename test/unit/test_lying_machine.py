@@ -13,7 +13,7 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 from fogros2.actions.session import Session
 from fogros2.deploy import RunningMachine
 from fogros2.model import MachineSpec
-from fogros2.shell import ssh
+from fogros2.shell import lines
 
 
 class Endless:
@@ -21,23 +21,20 @@ class Endless:
 
     closed = False
 
-    def settimeout(self, seconds):
-        pass
-
     def recv(self, size):
         return b'x' * size
 
-    def recv_stderr_ready(self):
-        return False
+    def sendall(self, data):
+        raise AssertionError(data)
 
     def close(self):
         self.closed = True
 
 
 def test_a_line_without_an_end_fills_no_memory(monkeypatch):
-    monkeypatch.setattr(ssh, 'MAX_LINE', 1 << 20)
+    monkeypatch.setattr(lines, 'MAX_LINE', 1 << 20)
     channel = Endless()
-    assert ssh.SSHStream(channel, 'planner').readline() == b''
+    assert lines.LineStream(channel, 'planner', bytes).readline() == b''
     assert channel.closed
 
 

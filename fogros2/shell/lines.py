@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a program on a machine writes, line by line, over whichever channel leads to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+from typing import Optional, Protocol
+
+from fogros2.errors import ConnectError, FogError
+
+#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
+MAX_LINE = 32 << 20
+_CHUNK = 1 << 16
+
+
+class Channel(Protocol):
+    """What a shell has for each program that it runs; failures are OSErrors or FogErrors."""
+
+    def recv(self, size: int, /) -> bytes:
+        """Wait for some of its standard output, and return it; b'' at the end."""
+
+    def sendall(self, data: bytes, /) -> None:
+        """Send to its standard input, as fast as it reads."""
+
+    def close(self) -> None:
+        """Let it go; it ends if it runs still."""
+
+
+class LineStream:
+    """
+    Both ends of a program that runs on a machine, line by line.
+
+    :param name: the machine's name, for messages.
+    :param discard_errors: drops what it wrote to standard error: unread, that would fill the
+        channel's window and stop the program.
+    """
+
+    def __init__(self, channel: Channel, name: str, discard_errors: Callable[[], object]) -> None:
+        self._channel = channel
+        self._name = name
+        self._discard_errors = discard_errors
+        self._buffer = b''
+
+    def write(self, data: bytes) -> None:
+        """Send to its standard input."""
+        try:
+            self._channel.sendall(data)
+        except OSError as error:
+            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
+
+    def readline(self) -> bytes:
+        """Return its next line of output with the newline, b'' at the end."""
+        parts = [self._buffer]
+        size = len(self._buffer)
+        while b'\n' not in parts[-1]:
+            if size > MAX_LINE:
+                self.close()
+                self._buffer = b''
+                return b''
+            data = b''
+            with contextlib.suppress(OSError, FogError):
+                data = self._channel.recv(_CHUNK)
+                self._discard_errors()
+            if not data:
+                self._buffer = b''
+                return b''.join(parts)
+            parts.append(data)
+            size += len(data)
+        line, _, self._buffer = b''.join(parts).partition(b'\n')
+        return line + b'\n'
+
+    def close(self) -> None:
+        """End it; a ``readline`` in another thread returns b''."""
+        self._channel.close()
+
+
+class Output:
+    """
+    What a command wrote, and its lines as they become whole.
+
+    :param on_output: gets each line of standard output.
+    """
+
+    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
+        self._on_output = on_output
+        self._out: list[bytes] = []
+        self._err: list[bytes] = []
+        self._rest = b''
+
+    def add(self, out: bytes = b'', err: bytes = b'') -> None:
+        """Take what has arrived of standard output and standard error."""
+        self._out.append(out)
+        self._err.append(err)
+        if self._on_output is not None and out:
+            *lines, self._rest = (self._rest + out).split(b'\n')
+            for line in lines:
+                self._on_output(line.decode(errors='replace'))
+
+    def text(self) -> tuple[str, str]:
+        """Return standard output and standard error; the last line goes out, if not whole."""
+        if self._on_output is not None and self._rest:
+            self._on_output(self._rest.decode(errors='replace'))
+            self._rest = b''
+        return (b''.join(self._out).decode(errors='replace'),
+                b''.join(self._err).decode(errors='replace'))
