@@ -55,8 +55,8 @@ setup(
         'kubernetes': KUBERNETES,
         'test': [
             'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy', 'pytest',
-            'pytest-timeout', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS, *KUBERNETES,
-            *VIDEO],
+            'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
+            *KUBERNETES, *VIDEO],
         'video': VIDEO,
     },
     zip_safe=False,

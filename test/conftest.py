@@ -26,6 +26,22 @@ def pytest_configure() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """
+    Keep together, where several processes share the tests, what shares something costly.
+
+    That is the cluster of the pods and the simulated EC2; of all else, the fixtures of a module.
+    The two take longest, so they come first.
+    """
+    def group(item: pytest.Item) -> str:
+        folder = item.path.parent.name
+        return folder if folder in ('kubernetes', 'aws') else str(item.path)
+
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(group(item)))
+    items.sort(key=lambda item: group(item) not in ('kubernetes', 'aws'))
+
+
 @pytest.fixture(autouse=True)
 def state_home(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch,

@@ -28,10 +28,12 @@ def domain() -> str:
     return str(1 + uuid.uuid4().int % 100)
 
 
-@pytest.fixture(scope='session', autouse=True)
-def no_dds_of_others() -> None:
-    """Forget what tests that run nodes in this process have set, all of which came before."""
-    os.environ.pop('CYCLONEDDS_URI', None)
+@pytest.fixture(scope='module', autouse=True)
+def no_dds_of_others() -> Iterator[None]:
+    """Forget what tests that run nodes in this process have set, for launches of a module too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv('CYCLONEDDS_URI', raising=False)
+        yield
 
 
 @pytest.fixture(autouse=True)
