@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import importlib.util
 import json
-from pathlib import Path
 from typing import Any
 
+from fogros2.provider.agent_file import agent_file
 from fogros2.provider.container_root import Archive
 
 #: Where the machine finds what FogROS2 brought, without the leading slash.
@@ -112,16 +111,6 @@ AcceptEnv LANG LC_*
 Subsystem sftp internal-sftp
 SetEnv {environment}
 """
-
-
-def agent_file() -> Path | None:
-    """Return where this installation keeps the agent, without importing it."""
-    spec = importlib.util.find_spec('fogros2')
-    for folder in (spec.submodule_search_locations or ()) if spec else ():
-        path = Path(folder, 'agent.py')
-        if path.is_file():
-            return path
-    return None
 
 
 def add(

@@ -49,8 +49,8 @@ def _relay(channel: Channel) -> None:
             last = False
             while not last:
                 out, err, last = channel.read(None)
-                _write(1, out)
-                _write(2, err)
+                ssh_terminal.write(1, out)
+                ssh_terminal.write(2, err)
         os.close(end)
 
     thread = threading.Thread(target=show, name='fog-screen', daemon=True)
@@ -71,8 +71,3 @@ def _relay(channel: Channel) -> None:
             break  # it has ended meanwhile
     thread.join()
     os.close(ended)
-
-
-def _write(target: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(target, data):]

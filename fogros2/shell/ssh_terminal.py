@@ -97,9 +97,9 @@ def _relay(channel: paramiko.Channel) -> None:
         ready, _, _ = select.select(sources, [], [])
         if channel in ready:
             while channel.recv_stderr_ready():
-                _write(2, channel.recv_stderr(1 << 15))
+                write(2, channel.recv_stderr(1 << 15))
             if channel.recv_ready():
-                _write(1, channel.recv(1 << 15))
+                write(1, channel.recv(1 << 15))
             elif channel.eof_received or channel.closed:
                 if not channel.recv_stderr_ready():
                     return
@@ -116,6 +116,7 @@ def _relay(channel: paramiko.Channel) -> None:
                 sources.remove(0)
 
 
-def _write(target: int, data: bytes) -> None:
+def write(target: int, data: bytes) -> None:
+    """Write all of it to a file descriptor."""
     while data:
         data = data[os.write(target, data):]

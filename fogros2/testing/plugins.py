@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plugin that is there for the time of a test, for the launches that it starts too."""
+"""Plugins that are there for the time of a test."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 import os
 from pathlib import Path
+from typing import Any, Union
+
+import pytest
+
+from fogros2 import plugin_system
+from fogros2.errors import FogError, MachineNotFound, ProviderError
+from fogros2.model import CreateRequest, Machine, MachineSpec
+from fogros2.provider import Provider
 
 
 def install(folder: Path, group: str, name: str, program: str, attribute: str) -> str:
     """
     Write a distribution with one entry point; return the PYTHONPATH by which it is found.
+
+    Launches that a test starts find it there, too.
 
     :param folder: an empty folder.
     :param group: such as ``fogros2.provider``.
@@ -25,3 +36,51 @@ def install(folder: Path, group: str, name: str, program: str, attribute: str) -
     (folder / f'{module}.py').write_text(program)
     before = os.environ.get('PYTHONPATH')
     return f'{folder}{os.pathsep}{before}' if before else str(folder)
+
+
+def instead(
+    patch: pytest.MonkeyPatch, group: str, known: Mapping[str, Union[type[Any], FogError]],
+) -> None:
+    """
+    Have a group hold these plugins and no others, in this process.
+
+    :param known: by name, the class, or the error with which it can't be loaded.
+    """
+    names, load = plugin_system.names, plugin_system.load
+
+    def loaded(asked: str, name: str) -> Any:
+        if asked != group:
+            return load(asked, name)
+        plugin = known[name]
+        if isinstance(plugin, FogError):
+            raise plugin
+        return plugin
+
+    patch.setattr(plugin_system, 'names', lambda asked: (
+        list(known) if asked == group else names(asked)))
+    patch.setattr(plugin_system, 'load', loaded)
+
+
+class MemoryProvider(Provider):
+    """A provider whose machines a test puts into a dictionary of the class."""
+
+    machines: dict[str, Machine]
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Refuse: what there is, the test has put there."""
+        raise ProviderError(f"'{spec.name}' can't be made: the test makes its machines itself")
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the one of that id."""
+        if machine_id not in self.machines:
+            raise MachineNotFound(machine_id)
+        return self.machines[machine_id]
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        """Return those that have the tags."""
+        return [machine for machine in self.machines.values()
+                if tags.items() <= machine.tags.items()]
+
+    def destroy(self, machine_id: str) -> None:
+        """Forget it."""
+        self.machines.pop(machine_id, None)

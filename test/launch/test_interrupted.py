@@ -32,12 +32,12 @@ from fogros2 import (
     ContainerInstance,
     FogROSLaunchDescription,
     MachineInterrupted,
-    plugin_system,
     StreamTopic,
 )
 from fogros2.actions import session
 from fogros2.errors import AgentError, ProviderError
 from fogros2.image_transport.h264 import H264
+from fogros2.testing.plugins import instead
 
 REASON = 'spot instance, at 12:00'
 #: Says where it runs, and ends when told to.
@@ -360,12 +360,7 @@ class Harmless(H264):
 
 @pytest.fixture
 def harmless(monkeypatch):
-    names, load = plugin_system.names, plugin_system.load
-    ours = 'fogros2.image_transport'
-    monkeypatch.setattr(plugin_system, 'names', lambda group: (
-        ['h264', 'raw'] if group == ours else names(group)))
-    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
-        Harmless if group == ours else load(group, name)))
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'raw': Harmless})
 
 
 def test_the_node_takes_topics_as_they_are(run, fake, harmless, planner, talker, watch):

@@ -27,10 +27,10 @@ from fogros2 import (
     CloudNode,
     ContainerInstance,
     FogROSLaunchDescription,
-    plugin_system,
     StreamTopic,
 )
 from fogros2.image_transport.h264 import H264
+from fogros2.testing.plugins import instead
 
 BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)
 
@@ -49,12 +49,7 @@ class Harmless(H264):
 
 @pytest.fixture(autouse=True)
 def transports(monkeypatch):
-    names, load = plugin_system.names, plugin_system.load
-    ours = 'fogros2.image_transport'
-    monkeypatch.setattr(plugin_system, 'names', lambda group: (
-        ['h264', 'raw'] if group == ours else names(group)))
-    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
-        Harmless if group == ours else load(group, name)))
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'raw': Harmless})
 
 
 @pytest.fixture

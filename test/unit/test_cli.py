@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 import dataclasses
 from decimal import Decimal
 import json
@@ -17,41 +17,29 @@ from typing import Any, Optional
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import plugin_system
-from fogros2.errors import MachineNotFound, PrerequisiteError, ProviderError, Unsupported
-from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, Result
-from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result
+from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
+from fogros2.testing.plugins import instead, MemoryProvider
 from ros2fog_cli.api import endings, machines, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
 
 
-class Memory(Provider):
+class Memory(MemoryProvider):
     """A provider with its machines in a dictionary."""
 
     name = 'memory'
     machines: dict[str, Machine] = {}
     regions: list[str] = []
 
-    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        raise ProviderError('not in these tests')
-
-    def describe(self, machine_id: str) -> Machine:
-        if machine_id not in self.machines:
-            raise MachineNotFound(machine_id)
-        return self.machines[machine_id]
-
-    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        return [machine for machine in self.machines.values()
-                if tags.items() <= machine.tags.items()]
-
     def destroy(self, machine_id: str) -> None:
         if machine_id == 'stuck':
             raise ProviderError('the cloud said no', 'ask again')
-        self.machines.pop(machine_id, None)
+        super().destroy(machine_id)
 
     def set_regions(self, regions: list[str]) -> None:
         type(self).regions = regions
@@ -68,26 +56,14 @@ class Untagged(Memory):
 
 
 @pytest.fixture(autouse=True)
-def providers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def providers(monkeypatch: pytest.MonkeyPatch) -> None:
     classes: dict[str, type[Memory]] = {'memory': Memory, 'untagged': Untagged}
     for provider in classes.values():
         provider.machines = {}
         provider.regions = []
-    names, load = plugin_system.names, plugin_system.load
-
-    def fake_names(group: str) -> list[str]:
-        return [*classes, 'nosdk'] if group == 'fogros2.provider' else names(group)
-
-    def fake_load(group: str, name: str) -> Any:
-        if group != 'fogros2.provider':
-            return load(group, name)
-        if name == 'nosdk':
-            raise PrerequisiteError("the provider 'nosdk' can't be loaded", 'pip install nosdk')
-        return classes[name]
-
-    monkeypatch.setattr(plugin_system, 'names', fake_names)
-    monkeypatch.setattr(plugin_system, 'load', fake_load)
-    yield
+    instead(monkeypatch, 'fogros2.provider', {
+        **classes,
+        'nosdk': PrerequisiteError("the provider 'nosdk' can't be loaded", 'pip install nosdk')})
 
 
 def machine(name: str, machine_id: str = '', **changes: Any) -> Machine:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import json
@@ -21,13 +21,11 @@ from fogros2 import plugin_system
 from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
-    MachineNotFound,
     PrerequisiteError,
     ProviderError,
     Unsupported,
 )
 from fogros2.model import (
-    CreateRequest,
     Endpoint,
     Image,
     Machine,
@@ -36,19 +34,20 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
-from fogros2.provider import Provider, TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
+from fogros2.provider import TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws import choices, prices, regions
 from fogros2.provider.aws.prices import InstanceType
 from fogros2.provider.aws.regions import Latency
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell
+from fogros2.testing.plugins import instead, MemoryProvider
 from ros2fog_cli.api import doctor, endings, images, pod_image, reach, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
 
 
-class Cloud(Provider):
+class Cloud(MemoryProvider):
     """A cloud in memory."""
 
     name = 'cloud'
@@ -67,21 +66,13 @@ class Cloud(Provider):
     def set_regions(self, regions: Sequence[str]) -> None:
         self.calls.append(('regions', *regions))
 
-    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        raise ProviderError('not in these tests')
-
-    def describe(self, machine_id: str) -> Machine:
-        if machine_id not in self.machines:
-            raise MachineNotFound(machine_id)
-        return self.machines[machine_id]
-
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
         self.calls.append(('find',))
-        return [one for one in self.machines.values() if tags.items() <= one.tags.items()]
+        return super().find(tags)
 
     def destroy(self, machine_id: str) -> None:
         if not self.lingering:
-            self.machines.pop(machine_id, None)
+            super().destroy(machine_id)
 
     def robot_address(self) -> str:
         return '198.51.100.9/32'
@@ -119,16 +110,11 @@ class Plain(Cloud):
 
 
 @pytest.fixture(autouse=True)
-def cloud(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Cloud]]:
+def cloud(monkeypatch: pytest.MonkeyPatch) -> type[Cloud]:
     Cloud.machines, Cloud.baked, Cloud.calls, Cloud.states = {}, [], [], []
     Cloud.up, Cloud.lingering = True, False
-    names, load = plugin_system.names, plugin_system.load
-    known = {'cloud': Cloud, 'plain': Plain}
-    monkeypatch.setattr(plugin_system, 'names', lambda group: (
-        list(known) if group == 'fogros2.provider' else names(group)))
-    monkeypatch.setattr(plugin_system, 'load', lambda group, name: (
-        known[name] if group == 'fogros2.provider' else load(group, name)))
-    yield Cloud
+    instead(monkeypatch, 'fogros2.provider', {'cloud': Cloud, 'plain': Plain})
+    return Cloud
 
 
 def machine(name: str, **changes: Any) -> Machine:

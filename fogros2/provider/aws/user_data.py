@@ -14,14 +14,13 @@ import ast
 from collections.abc import Mapping
 import functools
 import gzip
-import importlib.util
 import json
-from pathlib import Path
 import re
 import shlex
 from typing import Any, Optional
 
 from fogros2.errors import ProviderError
+from fogros2.provider.agent_file import agent_file
 from fogros2.provider.aws.host_key import HostKey
 
 #: Bytes that EC2 takes, before it is encoded.
@@ -145,20 +144,10 @@ def agent_program() -> str:
 
     :raises ProviderError: this installation has no agent.
     """
-    path = _agent_file()
+    path = agent_file()
     if path is None:
         raise ProviderError('this installation of FogROS2 has no agent.py', 'install it again')
     return shrunk(path.read_text(encoding='utf-8'))
-
-
-def _agent_file() -> Optional[Path]:
-    """Return where this installation keeps the agent, without importing it."""
-    spec = importlib.util.find_spec('fogros2')
-    for folder in (spec.submodule_search_locations or ()) if spec else ():
-        path = Path(folder, 'agent.py')
-        if path.is_file():
-            return path
-    return None
 
 
 def shrunk(source: str) -> str:
