@@ -20,6 +20,8 @@ it: the VPN's, and the one that ends the machine.
                Another ``launch`` than before: its nodes stop first, and what was kept for it goes;
                refused (kind ``busy``) while the earlier one sets the machine up or sends
                heartbeats, unless ``force`` names that earlier one: the robot knows it to be dead.
+               With ``again`` it claims nothing: refused (kind ``released``) unless its ``launch``
+               has the machine, since it may have been under way when that was released.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s)
 ``watch``      ``what``, ``argv`` run as root each ``interval`` (s, 5): once it exits with 0 there
                is one event of the name ``what``, its output as ``reason``, and the watch is over
@@ -31,7 +33,8 @@ it: the VPN's, and the one that ends the machine.
 ``log``        ``from`` seq, ``follow``: replies ``first`` and ``next`` (seqs that exist), then
                sends the events' lines; ``lost`` counts events that rotation took away
 ``release``    stop the nodes, take down what was kept, disarm the heartbeat, reply when done;
-               ``exit`` true: leave then
+               ``exit`` true: leave then; does nothing where ``launch`` names one that another
+               has followed
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
@@ -471,6 +474,8 @@ class Agent:
         self.stopping = self.ending = self.done = False
         #: Whether another launch than the one that made the machine has it.
         self.adopted = False
+        #: The launch that will have the machine when the former one's nodes are gone.
+        self.claimed = ''
         self.heart: Optional[socket.socket] = None
         self.since = time.time()
         self.mark = f'{os.getpid()}-{time.time_ns()}'
@@ -888,6 +893,9 @@ class Agent:
         if self.ending:
             raise Refused('this machine is ending', 'launch again', 'ending')
         taken_over = new.get('launch', self.config['launch']) != self.config['launch']
+        if taken_over and request.get('again'):
+            raise Refused(f"launch '{new['launch']}' doesn't have this machine any more",
+                          kind='released')
         age = self.sign_of_life()
         dead = request.get('force') or None
         if taken_over and age is not None and dead != self.config['launch']:
@@ -900,6 +908,9 @@ class Agent:
 
         def apply() -> Json:
             if taken_over:
+                if later and self.claimed != new['launch']:
+                    return {'error': 'the machine was released meanwhile', 'kind': 'released'}
+                self.claimed = ''
                 self.adopted = True
                 self.nodes.clear()
                 new.setdefault('heartbeat', None)
@@ -917,7 +928,9 @@ class Agent:
             return {'machine': self.config['machine'], 'next': self.log.next}
 
         left = taken_over and (self.launch is not None or bool(self.kept or self.watched))
-        if self.stopping or left or (self.launch and stale and not running):
+        later = self.stopping or left or bool(self.launch and stale and not running)
+        if later:
+            self.claimed = new['launch'] if taken_over else self.claimed
             reply = self.reply_later(client, request)
 
             def stopped() -> None:
@@ -1041,6 +1054,11 @@ class Agent:
 
     def do_release(self, client: Client, request: Json) -> None:
         """End a launch in order."""
+        asked, has = request.get('launch'), self.claimed or self.config['launch']
+        if asked and has and asked != has:
+            self.reply(client, request.get('id'), {})
+            return
+        self.claimed = ''
         self.config['on_exit'] = checked({
             'on_exit': request.get('on_exit', self.config['on_exit'])})['on_exit']
         self.watchdog.disarm()

@@ -97,9 +97,10 @@ class Guard:
             self.undo_nodes(agent)
             self._rearming = _Rearming(agent, job.launch.id, job.spec.robot_timeout / 4)
             job.undo.callback(self._rearming.close)
-            if job.provider.notice:
+            notice = job.provider.notice_for(machine)
+            if notice:
                 agent.request('watch', timeout=job.timeouts.agent, what='notice',
-                              argv=list(job.provider.notice), interval=NOTICE_INTERVAL)
+                              argv=list(notice), interval=NOTICE_INTERVAL)
             return agent
 
     def _install(self, shell: Shell, program: str, config: Mapping[str, Any]) -> None:
@@ -171,7 +172,7 @@ class Guard:
         robot = job.launch.robot_vpn().interface
         try:
             agent.request(
-                'configure', timeout=job.timeouts.agent,
+                'configure', timeout=job.timeouts.agent, launch=job.launch.id, again=True,
                 heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
                            'peer': robot.address},
                 environment={**ros.environment, **dds, **job.spec.environment},
@@ -217,7 +218,8 @@ class Guard:
             try:
                 # answers when the nodes are gone; out of reach, its watch gets there by itself
                 agent.request('release', timeout=job.patience(job.timeouts.command),
-                              on_exit=job.spec.on_exit, exit=not job.provider.agent_program)
+                              launch=job.launch.id, on_exit=job.spec.on_exit,
+                              exit=not job.provider.agent_program)
             except DeadlineExceeded as error:
                 job.hurry()
                 raise DeadlineExceeded(
@@ -238,7 +240,7 @@ class _Rearming:
     def _run(self) -> None:
         while not self._done.wait(self._interval):
             try:
-                self._agent.request('configure', launch=self._launch_id)
+                self._agent.request('configure', launch=self._launch_id, again=True)
             except FogError:
                 pass  # the next one may get through; the step under way says what is wrong
 

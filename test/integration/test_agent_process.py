@@ -794,6 +794,47 @@ def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
     client.request('configure', launch='def456')
 
 
+def test_what_comes_after_a_release_does_not_claim_the_machine_again(rig):
+    """Such as a sign of life that was under way when the connection broke."""
+    rig.serve(launch='first', on_exit='keep', boot_timeout=60.0)
+    client = rig.client()
+    client.request('configure', launch='first', again=True)
+    client.request('release', launch='first', on_exit='keep')
+    with pytest.raises(AgentError, match="launch 'first' doesn't have this machine any more"):
+        client.request('configure', launch='first', again=True)
+    assert client.request('status')['launch'] == ''
+    # nor does a release that was sent twice end the next launch
+    client.request('configure', launch='second')
+    client.request('release', launch='first', on_exit='keep')
+    assert client.request('status')['launch'] == 'second'
+
+
+def test_a_machine_that_is_released_before_it_was_quite_taken_stays_free(rig):
+    rig.serve(launch='first', on_exit='keep')
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', STUBBORN)])
+    rig.wait('output', node='n')
+    refused: list[AgentError] = []
+
+    def take() -> None:
+        try:
+            client.request('configure', launch='second', force='first')
+        except AgentError as error:
+            refused.append(error)
+
+    taking = threading.Thread(target=take)
+    taking.start()
+    wait_until(lambda: not client.request('status')['launch_running'], timeout=10,
+               what='the first one to be ended')
+    # the first one's own, which comes too late
+    client.request('release', launch='first', on_exit='keep')
+    assert client.request('status')['launch'] == 'first'
+    client.request('release', launch='second', on_exit='keep')
+    taking.join(20)
+    assert 'was released meanwhile' in str(refused[0])
+    assert client.request('status')['launch'] == ''
+
+
 @pytest.mark.parametrize('how', [
     {'command': 'release', 'on_exit': 'keep'},
     {'command': 'configure', 'launch': 'another', 'force': 'abc123'}])
