@@ -32,6 +32,7 @@ from image_transport_h264.repair import Assembler
 from image_transport_h264.worker import Worker
 
 Publish = Callable[[Image], None]
+#: A packet; its tag, if it is still to be acknowledged.
 Coded = tuple[Header, bytes, Optional[Tag]]
 #: Packets that may wait for the decoder; more of them means that it can't follow.
 WAITING = 8
@@ -162,9 +163,11 @@ class VideoReceiver(Receiver):
     def _take(self, header: Header, data: bytes, tag: Optional[Tag]) -> None:
         # what is acknowledged at once tells of the link; if decoding is what takes long, the
         # sender has to hear of that
-        if tag is not None and self._worker.waiting < BUSY:
+        late = self._worker.waiting >= BUSY
+        # the other thread goes to work while this one acknowledges
+        self._worker.put((header, data, tag if late else None))
+        if tag is not None and not late:
             self._acknowledge(tag)
-        self._worker.put((header, data, tag))
 
     def _acknowledge(self, tag: Tag) -> None:
         with self._acknowledging:
@@ -176,9 +179,9 @@ class VideoReceiver(Receiver):
             data=[self._identity, tag.sequence, lost]))
 
     def _decode(self, coded: Coded) -> None:
-        header, data, tag = coded
-        if tag is not None:
-            self._acknowledge(tag)
+        header, data, unacknowledged = coded
+        if unacknowledged is not None:
+            self._acknowledge(unacknowledged)
         try:
             picture = self._decoder.decode(data)
         except Missing as error:

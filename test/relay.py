@@ -16,10 +16,15 @@ from __future__ import annotations
 import argparse
 import asyncio
 from collections.abc import Callable
+import ctypes
 import dataclasses
+import heapq
+import itertools
 import json
+import os
 import random
 import socket
+import struct
 import sys
 import time
 from typing import Any, Optional
@@ -67,6 +72,65 @@ class Link:
         return now + max(0.0, self.delay + chance.uniform(-self.jitter, self.jitter))
 
 
+class Pending:
+    """
+    Packets under way, each delivered at its time to some hundredths of a millisecond.
+
+    An event loop's own timers wait for whole milliseconds, more than a small packet takes at
+    10 Mbit/s: Linux's timerfd does better (timerfd_create(2)). Python has it from 3.13 on.
+    """
+
+    _CLOCK_MONOTONIC, _ABSOLUTE = 1, 1
+
+    def __init__(self) -> None:
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._timer = self._checked(self._libc.timerfd_create(
+            self._CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC))
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = itertools.count()
+        asyncio.get_running_loop().add_reader(self._timer, self._due)
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def add(self, when: float, deliver: Callable[[], None]) -> None:
+        """Call ``deliver`` at a time of ``time.monotonic()``."""
+        first = not self._queue or when < self._queue[0][0]
+        heapq.heappush(self._queue, (when, next(self._number), deliver))
+        if first:
+            self._set()
+
+    def close(self) -> None:
+        """Drop what is under way."""
+        self._queue.clear()
+        asyncio.get_running_loop().remove_reader(self._timer)
+        os.close(self._timer)
+
+    def _due(self) -> None:
+        try:
+            os.read(self._timer, 8)
+        except BlockingIOError:
+            return  # set anew meanwhile
+        now = time.monotonic()
+        while self._queue and self._queue[0][0] <= now:
+            heapq.heappop(self._queue)[2]()
+        if self._queue:
+            self._set()
+
+    def _set(self) -> None:
+        # 0 would stop it
+        nanoseconds = max(1, round(self._queue[0][0] * 1e9))
+        # struct itimerspec: an interval, which is none, and the time; seconds, then nanoseconds
+        setting = struct.pack('@llll', 0, 0, *divmod(nanoseconds, 10 ** 9))
+        self._checked(self._libc.timerfd_settime(self._timer, self._ABSOLUTE, setting, None))
+
+    @staticmethod
+    def _checked(result: int) -> int:
+        if result < 0:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        return result
+
+
 class Relay:
     """A relay inside an event loop: ``await start()``, change ``up`` and ``down``, ``close()``."""
 
@@ -80,10 +144,11 @@ class Relay:
         self._chance = random.Random(seed)
         self._inside: Optional[socket.socket] = None
         self._outside: dict[Address, socket.socket] = {}
-        self._pending: set[asyncio.TimerHandle] = set()
+        self._pending: Optional[Pending] = None
 
     async def start(self, listen: Address) -> Address:
         """Listen, and return the address (port 0 takes any)."""
+        self._pending = Pending()
         self._inside = self._open(self._from_client)
         self._inside.bind(listen)
         address: Address = self._inside.getsockname()
@@ -94,9 +159,9 @@ class Relay:
         self.rebind()
         if self._inside is not None:
             self._close(self._inside)
-        for handle in self._pending:
-            handle.cancel()
-        self._pending.clear()
+        if self._pending is not None:
+            self._pending.close()
+            self._pending = None
 
     def rebind(self) -> None:
         """Let the target see the clients at new addresses, as a NAT does that has forgotten."""
@@ -120,7 +185,7 @@ class Relay:
                     raise ValueError(f'no setting is called {key!r}')
                 setattr(link, name, value)
         return {'passed': self.passed, 'lost': self.lost, 'bytes': self.bytes,
-                'under_way': len(self._pending), 'clients': len(self._outside)}
+                'under_way': len(self._pending or ()), 'clients': len(self._outside)}
 
     def _from_client(self, data: bytes, client: Address) -> None:
         self._send(self.up, data, lambda: self._to_target(data, client))
@@ -170,10 +235,12 @@ class Relay:
         one.close()
 
     def _send(self, link: Link, data: bytes, deliver: Callable[[], None]) -> None:
-        loop = asyncio.get_running_loop()
-        now = loop.time()
+        pending = self._pending
+        if pending is None:
+            return
+        now = time.monotonic()
         when = link.schedule(len(data), now, self._chance)
-        if when is None or len(self._pending) >= MOST:
+        if when is None or len(pending) >= MOST:
             self.lost += 1
             return
         self.passed += 1
@@ -181,13 +248,7 @@ class Relay:
         if when <= now:
             deliver()
             return
-
-        def arrive() -> None:
-            self._pending.discard(handle)
-            deliver()
-
-        handle = loop.call_at(when, arrive)
-        self._pending.add(handle)
+        pending.add(when, deliver)
 
 
 async def _control(relay: Relay, lifetime: float) -> None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import importlib.util
 from pathlib import Path
 import random
 import socket
 import sys
+import time
 from types import ModuleType
 
 import pytest
@@ -81,3 +83,43 @@ def test_packets_pass_both_ways_and_a_rebind_moves_the_client(relay: ModuleType)
     got, ports, counters = asyncio.run(run())
     assert got == [b're0', b're1'] and len(ports) == 2
     assert counters['passed'] == 4 and counters['lost'] == 0
+
+
+def test_packets_are_on_their_way_for_less_than_a_millisecond_where_they_should(
+    relay: ModuleType,
+) -> None:
+    async def run() -> list[float]:
+        pending, late = relay.Pending(), []
+        try:
+            for _ in range(30):
+                came = asyncio.Event()
+                begin = time.monotonic()
+                pending.add(begin + 2e-4, came.set)
+                await came.wait()
+                late.append(time.monotonic() - begin)
+            assert len(pending) == 0
+        finally:
+            pending.close()
+        return late
+
+    late = asyncio.run(run())
+    # a busy computer makes some late; what rounds to milliseconds makes all of them late
+    assert 2e-4 <= min(late) < 8e-4
+
+
+def test_packets_under_way_overtake_each_other_by_their_times(relay: ModuleType) -> None:
+    async def run() -> str:
+        order: list[str] = []
+        pending = relay.Pending()
+        done = asyncio.get_running_loop().create_future()
+        try:
+            now = time.monotonic()
+            pending.add(now + 0.03, lambda: done.set_result(None))
+            for delay, name in ((0.02, 'c'), (0.01, 'a'), (0.01, 'b'), (-1.0, 'first')):
+                pending.add(now + delay, functools.partial(order.append, name))
+            await asyncio.wait_for(done, 5.0)
+        finally:
+            pending.close()
+        return ' '.join(order)
+
+    assert asyncio.run(run()) == 'first a b c'
