@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import threading
+from types import TracebackType
+from typing import Optional
 
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.job import Job
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.model import Machine, MachineState
+from fogros2.report import StepFailed
 
 #: Seconds without an answer after which the provider is asked, and between two questions.
 SILENCE, INTERVAL = 5.0, 5.0
@@ -23,7 +27,9 @@ class Watch:
     """
     Asks the provider about a machine whose heartbeat stays away, until it is known to be gone.
 
-    A machine that is merely out of reach exists still: nothing is told of it.
+    A machine that is merely out of reach exists still: nothing is told of it. An error of no known
+    kind is a fault of ours, or of a plugin: it is said at once, as nobody watches from then on,
+    and raised by ``close``, so that the nodes needn't suffer from it.
 
     :param gone: is called with the reason, once, from the watch's own thread.
     :param found: is called with what the provider tells of one that exists.
@@ -39,13 +45,38 @@ class Watch:
         self._gone = gone
         self._found = found
         self._done = threading.Event()
+        self._fault: Optional[BaseException] = None
         threading.Thread(target=self._run, name='fog-watch', daemon=True).start()
 
     def close(self) -> None:
-        """Stop watching; a question under way is answered to nobody."""
+        """
+        Stop watching; a question under way is answered to nobody.
+
+        :raises BaseException: what had ended it before, once.
+        """
         self._done.set()
+        fault, self._fault = self._fault, None
+        if fault is not None:
+            raise fault
 
     def _run(self) -> None:
+        with contextlib.ExitStack() as end:
+            end.push(self._ended)
+            self._watch()
+
+    def _ended(
+        self, kind: Optional[type[BaseException]], error: Optional[BaseException],
+        traceback: Optional[TracebackType],
+    ) -> bool:
+        """Keep what ended the watch for ``close``, and say it."""
+        if error is not None:
+            self._fault = error
+            self._job.launch.report(StepFailed(
+                self._job.name, 'watch', 0.0, 'nobody looks any more whether the machine still '
+                f'exists: {type(error).__name__}: {error}', fatal=False))
+        return True
+
+    def _watch(self) -> None:
         pause = 1.0
         while not self._done.wait(pause):
             pause = 1.0

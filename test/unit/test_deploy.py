@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 import contextlib
+import dataclasses
 import json
 import socket
 import threading
@@ -15,7 +16,7 @@ import pytest
 
 from fogros2 import plan, plugin_system, process
 from fogros2.bootstrap import RosInstall
-from fogros2.deploy import entering, Launch, robot_vpn
+from fogros2.deploy import entering, Launch, robot_vpn, watching
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.deployment import Deployment
@@ -371,3 +372,30 @@ def test_a_machine_with_a_network_that_overlaps_the_vpn_s_keeps_it(launch, provi
     assert joining.fit(plain, ['10.0.0.0/8', '172.17.0.0/16']) == plain
     fitted = joining.fit(plain, ['10.0.0.0/8', '198.18.0.0/16'])
     assert fitted.host_routes and launch.store.machine('planner').load().vpn == fitted
+
+
+@pytest.mark.parametrize('where', ['describe', 'found', 'gone'])
+def test_a_watch_that_fails_says_so_and_is_a_fault_in_the_end(
+        launch, provider, monkeypatch, where):
+    heard = []
+    launch.report = heard.append
+    mine = Job(launch, SPEC)
+    mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
+    state = MachineState.DELETED if where == 'gone' else MachineState.RUNNING
+
+    def describe(machine_id):
+        if where == 'describe':
+            raise KeyError('Reservations')
+        return Machine('fake-1', 'planner', 'fake', state)
+
+    def fail(told):
+        raise KeyError('Reservations')
+
+    monkeypatch.setattr(provider, 'describe', describe)
+    watch = watching.Watch(mine, SimpleNamespace(silent_for=60.0), SimpleNamespace(age=60.0),
+                           gone=fail, found=fail)
+    wait_until(lambda: bool(heard), timeout=10, what='a word of it')
+    assert "KeyError: 'Reservations'" in heard[0].reason and heard[0].machine == 'planner'
+    with pytest.raises(KeyError):
+        watch.close()
+    watch.close()
