@@ -95,11 +95,11 @@ setup(
         'ros2cli.command': [
             'launch = ros2cli.command.launch:LaunchCommand',
             'run = ros2cli.command.run:RunCommand',
-            'pkg = ros2cli.command.pkg:PkgCommand',
-            'topic = ros2cli.command.topic:TopicCommand',
-            'node = ros2cli.command.node:NodeCommand',
-            'service = ros2cli.command.service:ServiceCommand',
-            'param = ros2cli.command.param:ParamCommand',
+            'pkg = ros2cli.command.verbs:PkgCommand',
+            'topic = ros2cli.command.verbs:TopicCommand',
+            'node = ros2cli.command.verbs:NodeCommand',
+            'service = ros2cli.command.verbs:ServiceCommand',
+            'param = ros2cli.command.verbs:ParamCommand',
         ],
         'ros2cli.extension_point': [
             'ros2cli.command = ros2cli.command:CommandExtension',
@@ -110,11 +110,11 @@ setup(
             'ros2pkg.verb = ros2cli.verb:VerbExtension',
         ],
         'ros2topic.verb': verbs(
-            'topic', list='ListVerb', info='InfoVerb', type='TypeVerb')
+            'topic', list='ListVerb', info='InfoVerb')
         + ['echo = ros2cli.verb.topic_echo:EchoVerb', 'pub = ros2cli.verb.topic_pub:PubVerb',
            'hz = ros2cli.verb.topic_rate:HzVerb', 'bw = ros2cli.verb.topic_rate:BwVerb'],
         'ros2node.verb': verbs('node', list='ListVerb', info='InfoVerb'),
-        'ros2service.verb': verbs('service', list='ListVerb', call='CallVerb', type='TypeVerb'),
+        'ros2service.verb': verbs('service', list='ListVerb', call='CallVerb'),
         'ros2param.verb': verbs('param', list='ListVerb', get='GetVerb', set='SetVerb'),
         'ros2pkg.verb': verbs(
             'pkg', list='ListVerb', prefix='PrefixVerb', executables='ExecutablesVerb'),

@@ -6,7 +6,7 @@ import argparse
 import os
 import signal
 import sys
-from typing import Any, List, Optional
+from typing import Any
 
 from ros2cli.command import add_subparsers_on_demand
 
@@ -31,15 +31,9 @@ def set_up_environment() -> None:
     os.environ.setdefault('ROS_PYTHON_VERSION', '3')
 
 
-def _is_external_shutdown(exc: BaseException) -> bool:
-    # Only where rclpy has been imported can its exception have been raised.
-    executors = sys.modules.get('rclpy.executors')
-    return executors is not None and isinstance(exc, executors.ExternalShutdownException)
-
-
 def main(
-    *, script_name: str = 'ros2', argv: Optional[List[str]] = None,
-    description: Optional[str] = None, extension: Any = None
+    *, script_name: str = 'ros2', argv: list[str] | None = None,
+    description: str | None = None, extension: Any = None
 ) -> Any:
     """
     Parse the arguments and call the command.
@@ -49,41 +43,35 @@ def main(
     """
     set_up_environment()
     parser = argparse.ArgumentParser(
-        description=description or (
-            f'{script_name} is an extensible command-line tool for ROS 2.'),
+        description=description or f'{script_name} is an extensible command-line tool for ROS 2.',
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        '--use-python-default-buffering', action='store_true', default=False,
-        help='Do not force line buffering in stdout and instead use the python default '
-             'buffering, which might be affected by PYTHONUNBUFFERED/-u and depends on '
-             'whatever stdout is interactive or not')
-    key = '_command'
-    if extension:
-        extension.add_arguments(parser, script_name)
-    else:
-        try:
-            add_subparsers_on_demand(
-                parser, script_name, key, 'ros2cli.command', required=False, argv=argv,
-                hide_extensions=['extension_points', 'extensions'])
-        except RuntimeError as exc:
-            return str(exc)
-    if os.environ.get('_ARGCOMPLETE') == '1':
-        from argcomplete import autocomplete  # type: ignore[import-not-found, unused-ignore]
-        autocomplete(parser, exclude=['-h', '--help'])
-    args = parser.parse_args(args=argv)
-    if not args.use_python_default_buffering and hasattr(sys.stdout, 'reconfigure'):
-        sys.stdout.reconfigure(line_buffering=True)
-    extension = extension or getattr(args, key, None)
-    if extension is None:
-        parser.print_help()
-        return 0
+        '--use-python-default-buffering', action='store_true',
+        help="Leave stdout's buffering to Python instead of forcing it to be by line")
     try:
+        if extension:
+            extension.add_arguments(parser, script_name)
+        else:
+            add_subparsers_on_demand(
+                parser, script_name, '_command', 'ros2cli.command', required=False, argv=argv)
+        if os.environ.get('_ARGCOMPLETE') == '1':
+            from argcomplete import autocomplete  # type: ignore[import-not-found, unused-ignore]
+            autocomplete(parser, exclude=['-h', '--help'])
+        args = parser.parse_args(args=argv)
+        if not args.use_python_default_buffering and hasattr(sys.stdout, 'reconfigure'):
+            sys.stdout.reconfigure(line_buffering=True)
+        extension = extension or getattr(args, '_command', None)
+        if extension is None:
+            parser.print_help()
+            return 0
         return extension.main(parser=parser, args=args)
     except KeyboardInterrupt:
         return signal.SIGINT
     except RuntimeError as exc:
         return str(exc)
     except Exception as exc:
-        if _is_external_shutdown(exc):
+        # Only where rclpy has been imported can its exception have been raised.
+        executors = sys.modules.get('rclpy.executors')
+        if executors is not None and isinstance(exc, executors.ExternalShutdownException):
             return signal.SIGTERM
         raise

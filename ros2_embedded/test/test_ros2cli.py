@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands ros2 launch, run and pkg, and how ros2 finds commands."""
 
+import importlib.util
 import os
 import shutil
 import signal
@@ -109,6 +110,19 @@ def test_help_names_the_commands(package):
     assert ros2()[1] == out
     status, _, err = ros2('no-such-command')
     assert status == 2 and "invalid choice: 'no-such-command'" in err
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
+                    reason='ROS 2 has them')
+@pytest.mark.parametrize('words', [
+    ('bag', 'record', '-a'), ('action', 'list', '-t'), ('topic', 'delay', '/x'),
+    ('service', 'type', '/x')])
+def test_what_is_lacking_is_named(words):
+    status, out, err = ros2(*words)
+    name = words[0] if words[0] in ('bag', 'action') else ' '.join(words[:2])
+    assert (status, out) == (1, '') and err.startswith(
+        f"'ros2 {name}' is not part of the embedded default; ROS 2 Jazzy has it: https://")
+    assert '\n  bag ' not in ros2('-h')[1]
 
 
 def test_launch_arguments_are_shown(package):

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
 import os
-from typing import Any, Dict, Iterable, Iterator, List, Optional, Set
+from typing import Any, Iterable, Iterator
 
 from ros2cli.entry_points import get_entry_points, get_first_line_doc
 from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION, satisfies_version
+
+#: Commands and verbs of ROS 2 that aren't here, by entry point group.
+_LACKING = {
+    'ros2cli.command': 'action bag component control daemon doctor extension_points extensions '
+                       'interface lifecycle multicast security test trace wtf',
+    'ros2node.verb': '',
+    'ros2param.verb': 'delete describe dump load',
+    'ros2pkg.verb': 'create xml',
+    'ros2service.verb': 'echo find info type',
+    'ros2topic.verb': 'delay find type',
+}
 
 
 class CommandExtension:
@@ -20,7 +32,7 @@ class CommandExtension:
     :raises PluginException: if the extension is for another version.
     """
 
-    NAME: Optional[str] = None
+    NAME: str | None = None
     EXTENSION_POINT_VERSION = '0.1'
 
     def __init__(self) -> None:
@@ -34,67 +46,65 @@ class CommandExtension:
         raise NotImplementedError()
 
 
-def get_command_extensions(
-    group_name: str, *, exclude_names: Optional[Iterable[str]] = None
-) -> Dict[str, Any]:
-    """Return the group's commands or verbs by name."""
-    extensions = instantiate_extensions(group_name, exclude_names=exclude_names)
-    for name, extension in extensions.items():
-        extension.NAME = name
-    return extensions
+class VerbsCommand(CommandExtension):
+    """A command that is nothing but verbs."""
+
+    GROUP: str
+
+    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
+        self._parser = parser
+        add_subparsers_on_demand(parser, cli_name, '_verb', self.GROUP, required=False, argv=argv)
+
+    def main(self, *, parser: Any, args: Any) -> Any:
+        if not hasattr(args, '_verb'):
+            self._parser.print_help()
+            return 0
+        return args._verb.main(args=args)
 
 
-def _describe(extensions: Dict[str, Any], hidden: Optional[Iterable[str]]) -> str:
-    names = [name for name in sorted(extensions) if name not in (hidden or ())]
-    width = max((len(name) for name in names), default=0)
-    return ''.join(
-        f'{name.ljust(width)}  {get_first_line_doc(extensions[name])}\n' for name in names)
+class _Lacking:
+    """Stands for a command or verb that isn't here."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def main(self, **_: Any) -> None:
+        from rclpy.exceptions import NotEmbeddedError
+        raise NotEmbeddedError(f"'{self.name}'")
 
 
-class _LateText:
-    """A text that argparse gets before there is one."""
+@contextlib.contextmanager
+def _quiet(parsers: Iterable[Any]) -> Iterator[None]:
+    """Keep parsers from printing help and from exiting with success."""
+    def exit_unless_success(parser: Any, status: int = 0, message: str | None = None) -> None:
+        if status:
+            type(parser).exit(parser, status, message)
 
-    def __init__(self) -> None:
-        self.value = ''
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.value, name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.value)
-
-    def __contains__(self, text: str) -> bool:
-        return text in self.value
-
-    def __mod__(self, values: Any) -> str:
-        return str(self.value % values)
-
-
-class SuppressUsageOutput:
-    """Keeps parsers, while entered, from printing help and from exiting with success."""
-
-    def __init__(self, parsers: Iterable[Any]) -> None:
-        self._parsers: Set[Any] = set(parsers)
-
-    def __enter__(self) -> None:
-        def exit_unless_success(
-            parser: Any, status: int = 0, message: Optional[str] = None
-        ) -> None:
-            if status:
-                type(parser).exit(parser, status, message)
-
-        for parser in self._parsers:
-            parser.print_help = lambda *args: None
-            parser.exit = exit_unless_success.__get__(parser)
-
-    def __exit__(self, *args: Any) -> None:
-        for parser in self._parsers:
+    for parser in parsers:
+        parser.print_help = lambda *args: None
+        parser.exit = exit_unless_success.__get__(parser)
+    try:
+        yield
+    finally:
+        for parser in parsers:
             del parser.print_help, parser.exit
+
+
+def _called(root_parser: Any, dest: str, argv: Any) -> Any:
+    """Say which of the subparsers the arguments, or the words to be completed, call."""
+    if os.environ.get('_ARGCOMPLETE') != '1':
+        return getattr(root_parser.parse_known_args(args=argv)[0], dest)
+    from argcomplete import split_line  # type: ignore[import-not-found, unused-ignore]
+    try:
+        words = split_line(os.environ['COMP_LINE'])[3][1:]
+        return getattr(root_parser.parse_known_args(args=words)[0], dest)
+    except SystemExit:
+        return None
 
 
 def add_subparsers_on_demand(
     parser: Any, cli_name: str, dest: str, group_name: str,
-    hide_extensions: Optional[List[str]] = None, required: bool = True, argv: Any = None
+    hide_extensions: list[str] | None = None, required: bool = True, argv: Any = None
 ) -> Any:
     """
     Add a parser for each extension, but load only the one that the arguments call.
@@ -103,54 +113,43 @@ def add_subparsers_on_demand(
     :param hide_extensions: what the help leaves out.
     :param argv: the arguments, by default the process's.
     """
-    description = _LateText()
     subparser = parser.add_subparsers(
-        title='Commands', description=description,
+        title='Commands', description='',
         metavar=f'Call `{cli_name} <command> -h` for more detailed usage.')
     # With a space no attribute of the namespace can be in the way.
     subparser.dest = ' ' + dest.lstrip('_')
     subparser.required = required
     names = get_entry_points(group_name).keys()
-    parsers = {
-        name: subparser.add_parser(
-            name, formatter_class=argparse.RawDescriptionHelpFormatter)
-        for name in sorted(names)}
-
+    lacking = set(_LACKING.get(group_name, '').split()) - names
+    parsers = {name: subparser.add_parser(
+        name, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=name in names)
+        for name in sorted({*names, *lacking})}
     root_parser = getattr(parser, '_root_parser', parser)
-    completing = os.environ.get('_ARGCOMPLETE') == '1'
-    words = argv
-    if completing:
-        from argcomplete import split_line
-        words = split_line(os.environ['COMP_LINE'])[3][1:]
-    with SuppressUsageOutput([parser, *parsers.values()]):
-        try:
-            known, _ = root_parser.parse_known_args(args=words)
-            called = getattr(known, subparser.dest)
-        except SystemExit:
-            if not completing:
-                raise
-            called = None
-    if called is None:
-        extensions = get_command_extensions(group_name)
-        description.value = _describe(extensions, hide_extensions)
-        for name, extension in extensions.items():
-            parsers[name].set_defaults(**{dest: extension})
+    with _quiet([parser, *parsers.values()]):
+        called = _called(root_parser, subparser.dest, argv)
+    if called in lacking:
+        parsers[called].set_defaults(**{dest: _Lacking(f'{cli_name} {called}')})
+        parsers[called].add_argument('rest', nargs=argparse.REMAINDER)
         return subparser
-
-    extensions = get_command_extensions(
-        group_name, exclude_names=[name for name in names if name != called])
+    extensions = instantiate_extensions(
+        group_name, exclude_names=called and [name for name in names if name != called])
+    if called is None:
+        shown = [name for name in sorted(extensions) if name not in (hide_extensions or ())]
+        width = max(map(len, shown), default=0)
+        parser._subparsers.description = ''.join(
+            f'{name.ljust(width)}  {get_first_line_doc(extensions[name])}\n' for name in shown)
+        return subparser
     if called not in extensions:
         # Why has been logged.
         raise RuntimeError(f"'{cli_name} {called}' can't be loaded")
     extension = extensions[called]
-    command_parser = parsers[called]
-    command_parser.set_defaults(**{dest: extension})
-    command_parser.description = get_first_line_doc(extension)
+    parsers[called].set_defaults(**{dest: extension})
+    parsers[called].description = get_first_line_doc(extension)
     if hasattr(extension, 'add_arguments'):
         kwargs = {}
         if 'argv' in inspect.signature(extension.add_arguments).parameters:
             kwargs['argv'] = argv
-        command_parser._root_parser = root_parser
-        extension.add_arguments(command_parser, f'{cli_name} {called}', **kwargs)
-        del command_parser._root_parser
+        parsers[called]._root_parser = root_parser
+        extension.add_arguments(parsers[called], f'{cli_name} {called}', **kwargs)
+        del parsers[called]._root_parser
     return subparser

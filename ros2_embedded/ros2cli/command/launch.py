@@ -4,116 +4,107 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Any, List, Optional, Union
+from typing import Any
 
-from ament_index_python.packages import PackageNotFoundError
-from ros2cli.api.launch import (
-    get_share_file_path_from_package,
-    launch_a_launch_file,
-    LaunchFileNameCompleter,
-    MultipleLaunchFilesError,
-    print_a_launch_file,
-    print_arguments_of_launch_file,
-)
-from ros2cli.api.pkg import package_name_completer
-from ros2cli.command import CommandExtension, get_command_extensions
-from ros2cli.plugin_system import satisfies_version
+from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
+from ros2cli.command import CommandExtension
 
 
-class OptionExtension:
-    """Further options of ``ros2 launch``; entry point group ``ros2launch.option``."""
+def _find(package: str, name: str) -> str:
+    """Return the path of a launch file, anywhere below its package's share directory."""
+    try:
+        share = get_package_share_directory(package)
+    except PackageNotFoundError as exc:
+        raise RuntimeError(f"Package '{package}' not found: {exc}") from exc
+    paths = [os.path.join(parent, name) for parent, _, names in os.walk(share) if name in names]
+    if len(paths) == 1:
+        return paths[0]
+    where = f"in the share directory of package '{package}'"
+    if not paths:
+        raise RuntimeError(f"file '{name}' was not found {where} which is at '{share}'")
+    listed = ', '.join(f"'{path}'" for path in paths)
+    raise RuntimeError(f"file '{name}' was found more than once {where}: [{listed}]")
 
-    NAME: Optional[str] = None
-    EXTENSION_POINT_VERSION = '0.1'
 
-    def __init__(self) -> None:
-        satisfies_version(self.EXTENSION_POINT_VERSION, '^0.1')
+def _print_arguments(description: Any) -> None:
+    print("Arguments (pass arguments as '<name>:=<value>'):")
+    arguments = description.get_launch_arguments()
+    for argument in arguments:
+        mark = '*' if argument._conditionally_included else ''
+        print(f"\n    '{argument.name}':{mark}\n        {argument.description}")
+        if argument.default_value is not None:
+            default = ' + '.join(token.describe() for token in argument.default_value)
+            print(f'        (default: {default})')
+    if not arguments:
+        print('\n  No arguments.')
+    elif any(argument._conditionally_included for argument in arguments):
+        print('\n* argument(s) which are only used if specific conditions occur')
 
-    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
-        """Add arguments to ``ros2 launch``."""
 
-    def prestart(self, args: Any) -> None:
-        """Act before anything is launched."""
-
-    def prelaunch(self, launch_description: Any, args: Any) -> Any:
-        """Return a tuple of the launch description to be launched."""
-        return (launch_description,)
-
-    def postlaunch(self, launch_return_code: int, args: Any) -> None:
-        """Act after the launch."""
+def _parse(arguments: list[str]) -> dict[str, str]:
+    """Return names and values; of a name given twice, the last value."""
+    parsed: dict[str, str] = {}
+    for argument in arguments:
+        name, _, value = argument.partition(':=')
+        if not name or not value:
+            raise RuntimeError(
+                f"malformed launch argument '{argument}', expected format '<name>:=<value>'")
+        parsed[name] = value
+    return parsed
 
 
 class LaunchCommand(CommandExtension):
     """Run a launch file."""
 
     def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
-        parser.add_argument(
-            '-n', '--noninteractive', default=not sys.stdin.isatty(), action='store_true',
+        add = parser.add_argument
+        add('-n', '--noninteractive', default=not sys.stdin.isatty(), action='store_true',
             help='Run the launch system non-interactively, with no terminal associated')
-        parser.add_argument(
-            '-d', '--debug', default=False, action='store_true',
-            help='Put the launch system in debug mode, provides more verbose output.')
+        add('-d', '--debug', action='store_true', help='More verbose output')
         group = parser.add_mutually_exclusive_group()
         group.add_argument(
-            '-p', '--print', '--print-description', default=False, action='store_true',
+            '-p', '--print', '--print-description', action='store_true',
             help='Print the launch description to the console without launching it.')
         group.add_argument(
-            '-s', '--show-args', '--show-arguments', default=False, action='store_true',
+            '-s', '--show-args', '--show-arguments', action='store_true',
             help='Show arguments that may be given to the launch file.')
-        parser.add_argument(
-            '-a', '--show-all-subprocesses-output', default=False, action='store_true',
-            help="Show all launched subprocesses' output by overriding their output "
-                 'configuration using the OVERRIDE_LAUNCH_PROCESS_OUTPUT envvar.')
-        parser.add_argument(
-            '--launch-prefix',
-            help='Prefix command, which should go before all executables. Command must be '
-                 "wrapped in quotes if it contains spaces (e.g. --launch-prefix 'xterm -e gdb "
-                 "-ex run --args').")
-        parser.add_argument(
-            '--launch-prefix-filter',
-            help='Regex pattern for filtering which executables the --launch-prefix is applied '
-                 'to by matching the executable name.')
-        argument = parser.add_argument(
-            'package_name', help='Name of the ROS package which contains the launch file')
-        argument.completer = package_name_completer
-        argument = parser.add_argument(
-            'launch_file_name', nargs='?', help='Name of the launch file')
-        argument.completer = LaunchFileNameCompleter()
-        argument = parser.add_argument(
-            'launch_arguments', nargs='*',
-            help="Arguments to the launch file; '<name>:=<value>' (for duplicates, last one "
-                 'wins)')
-        argument.completer = lambda **kwargs: ()
-        self._option_extensions = get_command_extensions('ros2launch.option')
-        for _, extension in sorted(self._option_extensions.items()):
-            extension.add_arguments(parser, cli_name)
+        add('-a', '--show-all-subprocesses-output', action='store_true',
+            help="Show all launched subprocesses' output, whatever the launch file says")
+        add('--launch-prefix', help='Words to put before all executables')
+        add('--launch-prefix-filter',
+            help='Regex of the names of those executables that --launch-prefix is for')
+        add('package_name', help='Name of the ROS package which contains the launch file')
+        add('launch_file_name', nargs='?', help='Name of the launch file')
+        add('launch_arguments', nargs='*',
+            help="Arguments '<name>:=<value>'; for duplicates, last one wins")
 
-    def main(self, *, parser: Any, args: Any) -> Union[int, str, None]:
-        arguments: List[str] = list(args.launch_arguments)
+    def main(self, *, parser: Any, args: Any) -> int | str | None:
+        words = list(args.launch_arguments)
         if os.path.isfile(args.package_name):
             path = args.package_name
-            if args.launch_file_name is not None:
-                arguments.insert(0, args.launch_file_name)
+            words[:0] = [args.launch_file_name] if args.launch_file_name else []
         else:
-            try:
-                path = get_share_file_path_from_package(
-                    package_name=args.package_name, file_name=args.launch_file_name)
-            except PackageNotFoundError as exc:
-                raise RuntimeError(f"Package '{args.package_name}' not found: {exc}") from exc
-            except (FileNotFoundError, MultipleLaunchFilesError) as exc:
-                raise RuntimeError(str(exc)) from exc
+            path = _find(args.package_name, args.launch_file_name)
         if args.launch_prefix is None and args.launch_prefix_filter is not None:
             raise RuntimeError(
                 '--launch-prefix must be specified if --launch-prefix-filter is provided')
         if args.show_all_subprocesses_output:
             os.environ['OVERRIDE_LAUNCH_PROCESS_OUTPUT'] = 'both'
+        for name in ('launch-prefix', 'launch-prefix-filter'):
+            if value := getattr(args, name.replace('-', '_')):
+                words.append(f'{name}:={value}')
+        import launch
+        from launch.actions import IncludeLaunchDescription
+        from launch.launch_description_sources import get_launch_description_from_any_launch_file
         if args.print:
-            print_a_launch_file(launch_file_path=path)
+            print(launch.LaunchIntrospector().format_launch_description(
+                get_launch_description_from_any_launch_file(path)))
             return None
         if args.show_args:
-            print_arguments_of_launch_file(launch_file_path=path)
+            _print_arguments(get_launch_description_from_any_launch_file(path))
             return None
-        return launch_a_launch_file(
-            launch_file_path=path, launch_file_arguments=arguments,
-            noninteractive=args.noninteractive, args=args, debug=args.debug,
-            option_extensions=self._option_extensions)
+        service = launch.LaunchService(
+            argv=words, noninteractive=args.noninteractive, debug=args.debug)
+        service.include_launch_description(launch.LaunchDescription([
+            IncludeLaunchDescription(path, launch_arguments=_parse(words).items())]))
+        return service.run()

@@ -1,24 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What verbs ask for the graph: always a node of this process, there is no daemon."""
 
-import argparse
+from typing import Any
 
 from ros2cli.node.direct import add_arguments as add_direct_node_arguments
-from ros2cli.node.direct import DirectNode
+from ros2cli.node.direct import DirectNode as NodeStrategy
+
+__all__ = ['add_arguments', 'NodeStrategy']
 
 
-class NodeStrategy(DirectNode):
-    """The node of this process."""
-
-    @property
-    def direct_node(self) -> DirectNode:
-        """Itself."""
-        return self
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Any) -> None:
     """Add the options of such a node."""
     add_direct_node_arguments(parser)
-    parser.add_argument(
-        '--no-daemon', action='store_true',
-        help='Do not spawn nor use an already running daemon')
+    parser.add_argument('--no-daemon', action='store_true', help='Changes nothing here')

@@ -2,9 +2,7 @@
 """Verbs of commands."""
 from __future__ import annotations
 
-from typing import Any, Dict, Optional
-
-from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION, satisfies_version
+from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 
 
 class VerbExtension:
@@ -14,16 +12,8 @@ class VerbExtension:
     :raises PluginException: if the extension is for another version.
     """
 
-    NAME: Optional[str] = None
+    NAME: str | None = None
     EXTENSION_POINT_VERSION = '0.1'
 
     def __init__(self) -> None:
         satisfies_version(PLUGIN_SYSTEM_VERSION, '^0.1')
-
-
-def get_verb_extensions(name: str) -> Dict[str, Any]:
-    """Return the group's verbs by name."""
-    extensions = instantiate_extensions(name)
-    for key, extension in extensions.items():
-        extension.NAME = key
-    return extensions

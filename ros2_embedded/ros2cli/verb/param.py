@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verbs of ``ros2 param``."""
+from __future__ import annotations
 
-import re
 import sys
+import time
 from typing import Any
 
 from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
-from ros2cli.verb.node import (
-    get_absolute_node_name,
-    get_node_names,
-    wait_for_node,
-)
+from ros2cli.verb.node import get_node_names
 
 _LABELS = {'BOOL': 'Boolean value is:', 'INTEGER': 'Integer value is:',
            'DOUBLE': 'Double value is:', 'STRING': 'String value is:',
@@ -19,22 +16,6 @@ _LABELS = {'BOOL': 'Boolean value is:', 'INTEGER': 'Integer value is:',
            'INTEGER_ARRAY': 'Integer values are:', 'DOUBLE_ARRAY': 'Double values are:',
            'STRING_ARRAY': 'String values are:', 'NOT_SET': 'Parameter not set.'}
 _WAIT = 5.0  # seconds for a node's parameter services
-
-
-def _add_node_arguments(parser: Any) -> None:
-    add_arguments(parser)
-    parser.add_argument('node_name', help='Name of the ROS node')
-    parser.add_argument('--include-hidden-nodes', action='store_true',
-                        help='Consider hidden nodes as well')
-    parser.add_argument(
-        '--timeout', metavar='N', type=int, default=1,
-        help='Wait for N seconds until node becomes available (default %(default)s sec)')
-
-
-def _type_text(number: int) -> str:
-    from rclpy.parameter import Parameter
-    name = Parameter.Type(number).name.lower().replace('_', ' ')
-    return name.replace('bool', 'boolean')
 
 
 def call(node: Any, node_name: str, method: str, *arguments: Any) -> Any:
@@ -58,98 +39,77 @@ def call(node: Any, node_name: str, method: str, *arguments: Any) -> Any:
     return future.result()
 
 
-class _OneNodeVerb(VerbExtension):
-    """A verb for one node's parameters."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
-
-    def main(self, *, args: Any) -> Any:
-        name = get_absolute_node_name(args.node_name)
-        with NodeStrategy(args) as node:
-            if not wait_for_node(node, name, args.include_hidden_nodes, args.timeout):
-                return 'Node not found'
-            return self.do(node.node, name, args)
-
-    def do(self, node: Any, name: str, args: Any) -> Any:
-        """Do it, now that the node is there."""
-        raise NotImplementedError()
-
-
 class ListVerb(VerbExtension):
     """Output a list of available parameters."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
         add_arguments(parser)
         parser.add_argument('node_name', nargs='?', help='Name of the ROS node')
-        parser.add_argument(
-            '--filter', nargs=1,
-            help='Only parameters matching the regex expression will be showed. Supports `re` '
-                 'regex syntax.')
         parser.add_argument('--include-hidden-nodes', action='store_true',
                             help='Consider hidden nodes as well')
-        parser.add_argument('--param-prefixes', nargs='+', default=[],
-                            help='Only list parameters with the provided prefixes')
-        parser.add_argument('--param-type', action='store_true',
-                            help='Print parameter types with parameter names')
 
     def main(self, *, args: Any) -> Any:
         with NodeStrategy(args) as strategy:
-            node = strategy.node
-            names = sorted({name.full_name for name in get_node_names(
-                node=node, include_hidden_nodes=args.include_hidden_nodes)})
+            names = get_node_names(strategy, args.include_hidden_nodes)
             if args.node_name:
-                wanted = get_absolute_node_name(args.node_name)
+                wanted = f"/{args.node_name.removeprefix('/')}"
                 if wanted not in names:
                     return 'Node not found'
                 names = [wanted]
-            for name in names:
+            for name in dict.fromkeys(names):
                 try:
-                    self._list(node, name, args)
+                    listed = call(strategy.node, name, 'list_parameters').result.names
                 except RuntimeError as error:
                     print(error, file=sys.stderr)
-
-    def _list(self, node: Any, name: str, args: Any) -> None:
-        listed = sorted(call(node, name, 'list_parameters', args.param_prefixes).result.names)
-        if args.filter is not None:
-            listed = [one for one in listed if re.match(args.filter[0], one)]
-        if not args.node_name and listed:
-            print(f'{name}:')
-        types = {}
-        if args.param_type:
-            types = {one.name: _type_text(one.type)
-                     for one in call(node, name, 'describe_parameters', listed).descriptors}
-        for one in listed:
-            print(f'  {one} (type: {types[one]})' if args.param_type else f'  {one}')
+                    continue
+                if listed and not args.node_name:
+                    print(f'{name}:')
+                for parameter in sorted(listed):
+                    print(f'  {parameter}')
 
 
-class GetVerb(_OneNodeVerb):
+class GetVerb(VerbExtension):
     """Get parameter."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
+        add_arguments(parser)
+        parser.add_argument('node_name', help='Name of the ROS node')
+        parser.add_argument('--include-hidden-nodes', action='store_true',
+                            help='Consider hidden nodes as well')
+        parser.add_argument('--timeout', metavar='N', type=int, default=1,
+                            help='Wait for N seconds until node becomes available')
         parser.add_argument('parameter_name', help='Name of the parameter')
+        self.add_more(parser)
+
+    def add_more(self, parser: Any) -> None:
+        """Add this verb's own arguments."""
         parser.add_argument('--hide-type', action='store_true', help='Hide the type information')
 
+    def main(self, *, args: Any) -> Any:
+        name = f"/{args.node_name.removeprefix('/')}"
+        limit = time.monotonic() + args.timeout
+        with NodeStrategy(args) as strategy:
+            while name not in get_node_names(strategy, args.include_hidden_nodes):
+                if time.monotonic() > limit:
+                    return 'Node not found'
+                time.sleep(0.02)
+            return self.do(strategy.node, name, args)
+
     def do(self, node: Any, name: str, args: Any) -> Any:
+        """Do it, now that the node is there."""
         from rclpy.parameter import Parameter, parameter_value_to_python
         values = call(node, name, 'get_parameters', [args.parameter_name]).values
         if not values:
             return 'Parameter not set'
         value = parameter_value_to_python(values[0])
         label = _LABELS[Parameter.Type(values[0].type).name]
-        if args.hide_type:
-            print(value)
-        else:
-            print(*([label] if value is None else [label, value]))
+        print(*([value] if args.hide_type else [label] if value is None else [label, value]))
 
 
-class SetVerb(_OneNodeVerb):
+class SetVerb(GetVerb):
     """Set parameter."""
 
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        _add_node_arguments(parser)
-        parser.add_argument('parameter_name', help='Name of the parameter')
+    def add_more(self, parser: Any) -> None:
         parser.add_argument('value', help='Value of the parameter')
 
     def do(self, node: Any, name: str, args: Any) -> Any:

@@ -1,34 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verbs of ``ros2 service``."""
+from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
 from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
-
-
-def get_service_names_and_types(
-        *, node: Any, include_hidden_services: bool = False) -> list[tuple[str, list[str]]]:
-    """List services with their types; hidden ones if asked for."""
-    from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
-    return [(name, types) for name, types in node.get_service_names_and_types()
-            if include_hidden_services or not topic_or_service_is_hidden(name)]
-
-
-def _add_list_arguments(parser: Any) -> None:
-    parser.add_argument('-c', '--count-services', action='store_true',
-                        help='Only display the number of services discovered')
-    parser.add_argument('--include-hidden-services', action='store_true',
-                        help='Consider hidden services as well')
-
-
-def _services(args: Any) -> list[tuple[str, list[str]]]:
-    with NodeStrategy(args) as node:
-        return get_service_names_and_types(
-            node=node, include_hidden_services=args.include_hidden_services)
 
 
 class ListVerb(VerbExtension):
@@ -38,10 +17,16 @@ class ListVerb(VerbExtension):
         add_arguments(parser)
         parser.add_argument('-t', '--show-types', action='store_true',
                             help='Additionally show the service type')
-        _add_list_arguments(parser)
+        parser.add_argument('-c', '--count-services', action='store_true',
+                            help='Only display the number of services discovered')
+        parser.add_argument('--include-hidden-services', action='store_true',
+                            help='Consider hidden services as well')
 
     def main(self, *, args: Any) -> Any:
-        services = _services(args)
+        from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
+        with NodeStrategy(args) as node:
+            services = [(name, types) for name, types in node.get_service_names_and_types()
+                        if args.include_hidden_services or not topic_or_service_is_hidden(name)]
         if args.count_services:
             print(len(services))
             return
@@ -49,43 +34,21 @@ class ListVerb(VerbExtension):
             print(f"{name} [{', '.join(types)}]" if args.show_types else name)
 
 
-class TypeVerb(VerbExtension):
-    """Output a service's type."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        parser.add_argument(
-            'service_name',
-            help="Name of the ROS service to get type (e.g. '/talker/list_parameters')")
-
-    def main(self, *, args: Any) -> Any:
-        types = dict(_services(args)).get(args.service_name)
-        for kind in types or []:
-            print(kind)
-        return 1 if types is None else 0
-
-
 class CallVerb(VerbExtension):
     """Call a service."""
 
     def add_arguments(self, parser: Any, cli_name: str) -> None:
-        parser.add_argument(
-            'service_name', help="Name of the ROS service to call to (e.g. '/add_two_ints')")
-        parser.add_argument(
-            'service_type', help="Type of the ROS service (e.g. 'std_srvs/srv/Empty')")
-        group = parser.add_mutually_exclusive_group()
-        group.add_argument(
-            'values', nargs='?', default='{}',
-            help="Values to fill the service request with in YAML format (e.g. '{a: 1, b: 2}'), "
-                 'otherwise the service request will be published with default values')
-        group.add_argument('--stdin', action='store_true',
-                           help='Read values from standard input')
-        parser.add_argument('-r', '--rate', metavar='N', type=float,
-                            help='Repeat the call at a specific rate in Hz')
+        add = parser.add_argument
+        add('service_name', help="Name of the ROS service to call to (e.g. '/add_two_ints')")
+        add('service_type', help="Type of the ROS service (e.g. 'std_srvs/srv/Empty')")
+        add('values', nargs='?', default='{}',
+            help="Values to fill the service request with in YAML format (e.g. '{a: 1, b: 2}')")
+        add('-r', '--rate', metavar='N', type=float,
+            help='Repeat the call at a specific rate in Hz')
 
     def main(self, *, args: Any) -> Any:
         import rclpy
         from rosidl_runtime_py.utilities import get_service
-        import yaml
         if args.rate is not None and args.rate <= 0:
             raise RuntimeError('rate must be greater than zero')
         try:
@@ -94,23 +57,23 @@ class CallVerb(VerbExtension):
             raise RuntimeError('The passed service type is invalid') from None
         except ValueError:
             raise RuntimeError('The passed type is not a service') from None
-        values = yaml.safe_load(sys.stdin.read() if args.stdin else args.values)
         rclpy.init(args=[])
         package, _, name = kind._service.split('/')
         node = rclpy.create_node(f'{NODE_NAME_PREFIX}_requester_{package}_{name}')
         try:
-            return self._call(node, kind, args, values)
+            return self._call(node, kind, args)
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
 
-    def _call(self, node: Any, kind: Any, args: Any, values: Any) -> str | None:
+    def _call(self, node: Any, kind: Any, args: Any) -> str | None:
         import rclpy
         from rosidl_runtime_py import set_message_fields
+        import yaml
         client = node.create_client(kind, args.service_name)
         request = kind.Request()
         try:
-            set_message_fields(request, values)
+            set_message_fields(request, yaml.safe_load(args.values))
         except (AssertionError, AttributeError, TypeError, ValueError) as error:
             return f'Failed to populate field: {error}'
         if not client.service_is_ready():

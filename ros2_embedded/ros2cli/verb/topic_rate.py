@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verbs of ``ros2 topic`` that measure: hz, bw, delay."""
+"""Verbs of ``ros2 topic`` that measure: hz and bw."""
+from __future__ import annotations
 
 from collections import deque
-import math
+import statistics
+import time
 from typing import Any
 
-from ros2cli.node.direct import add_arguments as add_direct_node_arguments
-from ros2cli.node.direct import DirectNode
+from ros2cli.node.direct import add_arguments, DirectNode
 from ros2cli.verb import VerbExtension
 from ros2cli.verb.topic import get_msg_class, positive_int
 
@@ -17,7 +18,7 @@ def _measure(args: Any, topic: str, callback: Any, report: Any, raw: bool) -> No
     from rclpy.qos import qos_profile_sensor_data
     with DirectNode(args) as direct:
         node = direct.node
-        kind = get_msg_class(node, topic, blocking=True, include_hidden_topics=True)
+        kind = get_msg_class(node, topic, blocking=True)
         if kind is None:
             return
         clock = node.get_clock()
@@ -27,20 +28,6 @@ def _measure(args: Any, topic: str, callback: Any, report: Any, raw: bool) -> No
         node.create_timer(1.0, lambda: report(clock.now().nanoseconds))
         while rclpy.ok():
             rclpy.spin_once(node)
-
-
-def _filter(expression: str | None) -> Any:
-    if expression is None:
-        return lambda message: True
-    code = compile(expression, '<filter>', 'eval')
-    return lambda message: eval(code, {'m': message})  # noqa: S307 - the user's own
-
-
-def _spread(values: 'deque[float]') -> tuple[float, float, float, float]:
-    """Give mean, least, greatest and standard deviation."""
-    mean = sum(values) / len(values)
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
-    return mean, min(values), max(values), deviation
 
 
 class HzVerb(VerbExtension):
@@ -56,38 +43,37 @@ class HzVerb(VerbExtension):
         parser.add_argument(
             '--filter', dest='filter_expr', default=None, metavar='EXPR',
             help='only measure messages matching the specified Python expression')
-        parser.add_argument(
-            '--wall-time', dest='use_wtime', default=False, action='store_true',
-            help='calculates rate using wall time which can be helpful when clock is not '
-                 'published during simulation')
-        add_direct_node_arguments(parser)
+        parser.add_argument('--wall-time', dest='use_wtime', action='store_true',
+                            help='calculates rate using wall time')
+        add_arguments(parser)
 
     def main(self, *, args: Any) -> Any:
-        import time
-        wanted = _filter(args.filter_expr)
+        wanted = compile(args.filter_expr or 'True', '<filter>', 'eval')
         gaps: deque[float] = deque(maxlen=args.window_size)
-        last: list[int] = []
-        fresh: list[bool] = []
+        last: int | None = None
+        reported: int | None = None
 
         def received(message: Any, now: int) -> None:
-            if not wanted(message):
+            nonlocal last
+            if not eval(wanted, {'m': message}):  # noqa: S307 - the user's own
                 return
             now = time.time_ns() if args.use_wtime else now
-            if last and now >= last[0]:
-                gaps.append((now - last[0]) / 1e9)
-                fresh[:] = [True]
-            elif last:
+            if last is not None and now >= last:
+                gaps.append((now - last) / 1e9)
+            elif last is not None:
                 print('time has reset, resetting counters')
                 gaps.clear()
-            last[:] = [now]
+            last = now
 
         def report(now: int) -> None:
-            if not gaps or not fresh:
+            nonlocal reported
+            if not gaps or reported == last:
                 return
-            fresh.clear()
-            mean, least, greatest, deviation = _spread(gaps)
-            print(f'average rate: {1.0 / mean if mean else 0:.3f}\n\tmin: {least:.3f}s '
-                  f'max: {greatest:.3f}s std dev: {deviation:.5f}s window: {len(gaps)}')
+            reported = last
+            mean = statistics.fmean(gaps)
+            print(f'average rate: {1.0 / mean if mean else 0:.3f}\n\tmin: {min(gaps):.3f}s '
+                  f'max: {max(gaps):.3f}s std dev: {statistics.pstdev(gaps, mean):.5f}s '
+                  f'window: {len(gaps)}')
 
         _measure(args, args.topic_name, received, report, raw=args.filter_expr is None)
 
@@ -100,7 +86,7 @@ class BwVerb(VerbExtension):
         parser.add_argument(
             '--window', '-w', type=positive_int, default=100, metavar='WINDOW',
             help='maximum window size, in # of messages, for calculating rate (default: 100)')
-        add_direct_node_arguments(parser)
+        add_arguments(parser)
 
     def main(self, *, args: Any) -> Any:
         received: deque[tuple[int, int]] = deque(maxlen=args.window)

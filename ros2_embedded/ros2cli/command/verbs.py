@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands ``ros2 node|param|pkg|service|topic``, all of whose work their verbs do."""
+from __future__ import annotations
+
+from typing import Any
+
+from ros2cli.command import VerbsCommand
+
+
+class NodeCommand(VerbsCommand):
+    """Various node related sub-commands."""
+
+    GROUP = 'ros2node.verb'
+
+
+class ParamCommand(VerbsCommand):
+    """Various param related sub-commands."""
+
+    GROUP = 'ros2param.verb'
+
+
+class PkgCommand(VerbsCommand):
+    """Various package related sub-commands."""
+
+    GROUP = 'ros2pkg.verb'
+
+
+class ServiceCommand(VerbsCommand):
+    """Various service related sub-commands."""
+
+    GROUP = 'ros2service.verb'
+
+    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
+        parser.add_argument('--include-hidden-services', action='store_true',
+                            help='Consider hidden services as well')
+        super().add_arguments(parser, cli_name, argv=argv)
+
+
+class TopicCommand(VerbsCommand):
+    """Various topic related sub-commands."""
+
+    GROUP = 'ros2topic.verb'
+
+    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
+        parser.add_argument('--include-hidden-topics', action='store_true',
+                            help='Consider hidden topics as well')
+        super().add_arguments(parser, cli_name, argv=argv)
