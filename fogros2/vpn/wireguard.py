@@ -35,7 +35,13 @@ PORTS_PER_DOMAIN = 250
 DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
 
-_ADDRESSES = 'ip -brief -4 address show up'
+#: Shell text that defines ``from``: for addresses, one a line, the ones of this computer that
+#: packets to them leave from.
+_FROM = """\
+from() { sed 's/^/route get /' | ip -force -batch - 2>/dev/null | \
+sed -n 's/.* src \\([^ ]*\\).*/\\1/p'; }"""
+#: Shell text that prints the hosts of ``wg show ... endpoints`` that are known.
+_HOSTS = r"sed -n 's/^[^[:space:]]*[[:space:]]*\[*\([^][]*\)\]*:[0-9]*$/\1/p'"
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
 _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
 
@@ -96,17 +102,20 @@ class WireGuard(Vpn):
         A TUN has a carrier as long as a program has it open; a WireGuard interface of the kernel
         always has. Without the interface, or where it is down, reading that fails.
 
-        On the robot it also fails when one of the computer's addresses is gone: ``wireguard-go``
-        goes on sending from it, 15 s long, and ``repair`` makes it look again. A machine
-        notes where its peers are, for ``repair``: behind its NAT the robot can't be dialled
-        elsewhere, and would itself notice the lost session after 15 s only.
+        On the robot it also fails when packets to a peer leave from another address than they
+        did: ``wireguard-go`` goes on sending from the former, 15 s long, and ``repair`` makes it
+        look again. Networks that lead to no peer may come and go. A machine notes where its peers
+        are, for ``repair``: behind its NAT the robot can't be dialled elsewhere, and would itself
+        notice the lost session after 15 s only.
         """
         name = _name(interface)
         lines = [
             f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
             '[ "$carrier" = 1 ]']
         if interface.guarded:
-            lines.append(f'! {_ADDRESSES} | grep -qFxvf - {_noted(interface)}')
+            noted = _noted(interface)
+            lines += [_FROM, f'[ ! -e {noted} ] || '
+                             f'{{ read -r before; [ "$(echo $(from))" = "$before" ]; }} <{noted}']
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
@@ -308,7 +317,13 @@ def _configure(
             lines.append(f'seen {shlex.quote(peer.public_key)}')
             config = []
     lines += [_print(config)] if config else []
-    return '\n'.join([*lines, f'}} | wg syncconf {_name(interface)} /dev/stdin'])
+    lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
+    if interface.guarded:
+        # for ``alive``, which isn't root
+        lines += [_FROM, f'hosts=$(wg show {_name(interface)} endpoints | {_HOSTS})',
+                  f"(umask 022; {{ echo $(echo \"$hosts\" | from); echo \"$hosts\"; }} "
+                  f'>{_noted(interface)})']
+    return '\n'.join(lines)
 
 
 def _check(peer: Peer) -> None:
@@ -342,8 +357,6 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
         f'address replace {interface.address}/{prefix} dev {name}{alone}',
         f'link set dev {name} mtu {interface.mtu} multicast on up']
     do = f'{_print(lines)} | ip -batch -'
-    if interface.guarded:
-        do += f"\n{_ADDRESSES} | grep -v '^fog' >{_noted(interface)} || :"
     own = [_free(interface, interface.address)] if interface.host_routes else []
     return _Step('\n'.join([*own, do, *_routes(interface, peers)]))
 

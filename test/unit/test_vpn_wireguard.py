@@ -105,6 +105,30 @@ def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
     assert "rm -f '/run/it'\"'\"'s/vpn.key' /run/foga1b2c3m0.noted" in down
 
 
+@pytest.mark.parametrize(('endpoint', 'host'), [
+    ('198.51.100.7:51820', '198.51.100.7'), ('[2001:db8::1]:51820', '2001:db8::1'),
+    ('[fe80::1%eth0]:1', 'fe80::1%eth0'), ('(none)', '')])
+def test_what_wg_prints_of_endpoints_is_understood(
+    tmp_path: Path, endpoint: str, host: str,
+) -> None:
+    """The robot notes from which of its addresses packets to a machine leave."""
+    for name, said in (('wg', f'{KEY}\t{endpoint}'), ('ip', 'local 1 dev x src 192.0.2.1 uid 0')):
+        program = tmp_path / name
+        program.write_text(f'#!/bin/sh\ncat >>{tmp_path}/{name}.in; echo "{said}"\n')
+        program.chmod(0o755)
+    wireguard = WireGuard()
+    noted = str(tmp_path / 'noted')
+    key = dataclasses.replace(ROBOT, key_file='/dev/null')
+    for command in (*wireguard.peers(key, []), wireguard.alive(key)):
+        text = command.argv[-1].replace('/run/foga1b2c3.noted', noted)
+        done = subprocess.run(
+            ['sh', '-c', text[text.index('from()'):]], capture_output=True, text=True,
+            env={'PATH': f'{tmp_path}:/usr/bin:/bin'})
+        assert done.returncode == 0, done
+    assert Path(noted).read_text() == f'192.0.2.1\n{host}\n'
+    assert (tmp_path / 'ip.in').read_text() == f'route get {host}\n' * 2
+
+
 @pytest.mark.parametrize('change', [
     {'public_key': f'{KEY}\nAllowedIPs = 0.0.0.0/0'}, {'public_key': ''},
     {'address': '0.0.0.0/0'}, {'address': '198.18.7.2\n'},

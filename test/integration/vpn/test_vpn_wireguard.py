@@ -170,6 +170,23 @@ def test_a_new_address_of_the_robot_is_taken_up(vpn: Lab) -> None:
     assert vpn.ping('robot', MACHINE, timeout=3.0)
 
 
+def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
+    space = vpn.spaces['robot']
+    vpn.ip('-n', space, 'link', 'add', 'br7', 'type', 'bridge')
+    vpn.ip('-n', space, 'address', 'add', '192.168.99.1/24', 'dev', 'br7')
+    vpn.ip('-n', space, 'link', 'set', 'br7', 'up')
+    assert vpn.alive('robot')
+    vpn.repair('robot')
+    vpn.ip('-n', space, 'link', 'delete', 'br7')
+    assert vpn.alive('robot')
+    # one that the packets to the machine leave by from now on
+    vpn.ip('-n', space, 'address', 'add', '198.51.100.7/24', 'dev', 'e0')
+    vpn.ip('-n', space, 'route', 'add', '198.51.100.1/32', 'dev', 'e0', 'src', '198.51.100.7')
+    assert not vpn.alive('robot')
+    vpn.repair('robot')
+    assert vpn.alive('robot') and vpn.ping('robot', MACHINE, timeout=3.0)
+
+
 def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
     vpn.lan()
     at_robot = [ROBOT, '192.168.77.1', '198.51.100.2']
