@@ -13,15 +13,26 @@ from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import json
 import os
-import queue
 import threading
 import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode
 
 from fogros2 import kubernetes_config
-from fogros2.errors import Cancelled, DeadlineExceeded, ProviderError
+from fogros2.errors import DeadlineExceeded, ProviderError
+from fogros2.kubernetes_answers import (
+    ApiError,
+    http_errors,
+    items,
+    parsed,
+    path,
+    refusal,
+    selector,
+    Unreachable,
+)
+from fogros2.kubernetes_cancel import cancellable
 from fogros2.kubernetes_config import configured, words
+from fogros2.kubernetes_watch import Watch
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
@@ -42,31 +53,6 @@ ANSWER = 30.0
 PATIENCE = 30.0
 #: Seconds after a restart in which an API server may not know yet what it allows whom.
 DOUBT = 15.0
-#: Seconds of silence after which a watch is begun anew: its connection may be gone.
-SILENCE = 240.0
-
-
-class ApiError(ProviderError):
-    """
-    The API server refused.
-
-    :param status: of HTTP: 403, 404, 409, 422, ...
-    :param reason: in one word: Forbidden, NotFound, AlreadyExists, Invalid, ...
-    :param details: what the answer's ``details`` hold, such as causes.
-    """
-
-    def __init__(
-        self, message: str, hint: str = '', *, status: int = 0, reason: str = '',
-        details: Optional[Mapping[str, Any]] = None,
-    ) -> None:
-        super().__init__(message, hint)
-        self.status = status
-        self.reason = reason
-        self.details = details or {}
-
-
-class Unreachable(ProviderError):
-    """The API server doesn't answer."""
 
 
 class Api:
@@ -110,13 +96,16 @@ class Api:
         :param doubt: seconds for which one that says that we may not is.
         :raises ApiError: it refused.
         :raises Unreachable: it doesn't answer.
+        :raises Cancelled: ``cancel`` was set, and no answer came soon after.
         """
         last: list[ProviderError] = []
         sure = time.monotonic() + doubt
+        answer = min(ANSWER, max(CONNECT, patience))
 
         def attempt() -> Optional[dict[str, Any]]:
             try:
-                return self._once(method, path, body, query)
+                return cancellable(lambda: self._once(method, path, body, query, answer), cancel,
+                                   what=f'asking the API server {self.server}')
             except Unreachable as error:
                 last[:] = [error]
             except ApiError as error:
@@ -143,23 +132,30 @@ class Api:
 
     def _once(
         self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
+        answer: float,
     ) -> dict[str, Any]:
-        response = self._send(method, path, body, query, ANSWER)
+        response = self.send(method, path, body, query, answer)
         try:
             data = response.read(decode_content=True)
-        except _http_errors() as error:
+        except http_errors() as error:
             raise self._unreachable(error) from error
         finally:
             response.release_conn()
-        found = _parsed(data)
+        found = parsed(data)
         if response.status >= 400:
-            raise _refusal(response.status, found, data)
+            raise refusal(response.status, found, data)
         return found
 
-    def _send(
+    def send(
         self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
         read: Optional[float],
     ) -> Any:
+        """
+        Make a request, and return urllib3's response with its body unread.
+
+        :param read: seconds of silence that are borne, None for any.
+        :raises Unreachable: no answer began.
+        """
         import urllib3
 
         headers = {'accept': 'application/json', **self.headers()}
@@ -172,7 +168,7 @@ class Api:
                 method, self._url(path, query), headers=headers, preload_content=False,
                 body=None if body is None else json.dumps(body).encode(), retries=False,
                 timeout=urllib3.Timeout(connect=CONNECT, read=read))
-        except _http_errors() as error:
+        except http_errors() as error:
             raise self._unreachable(error) from error
 
     def _url(self, path: str, query: Query) -> str:
@@ -206,7 +202,7 @@ class Api:
         :raises Cancelled: ``cancel`` was set.
         """
         with contextlib.ExitStack() as undo:
-            watch: Optional[_Watch] = None
+            watch: Optional[Watch] = None
             lost = False
 
             def probe() -> Optional[tuple[T]]:
@@ -214,7 +210,7 @@ class Api:
                 if watch is None:
                     if lost and again is not None and (found := again()) is not None:
                         return (found,)
-                    watch = undo.enter_context(_Watch(self, path, {'watch': 'true', **query}))
+                    watch = undo.enter_context(Watch(self, path, {'watch': 'true', **query}))
                 event = watch.get(0.1)
                 if event is not None and event[0] in ('CLOSED', 'ERROR'):
                     watch.__exit__()
@@ -258,7 +254,7 @@ class Api:
                 subprotocols=['v4.channel.k8s.io'], skip_utf8_validation=True, **options)
         except websocket.WebSocketBadStatusException as error:
             data = error.resp_body or b''
-            raise _refusal(error.status_code, _parsed(data), data) from error
+            raise refusal(error.status_code, parsed(data), data) from error
         except (websocket.WebSocketException, OSError) as error:
             raise self._unreachable(error) from error
 
@@ -280,69 +276,6 @@ class Api:
         with contextlib.suppress(websocket.WebSocketException, OSError):
             link.recv()
         link.close(timeout=0)
-
-
-class _Watch:
-    """One watch: a thread reads its lines, so that whoever waits can be cancelled."""
-
-    def __init__(self, api: Api, path: str, query: Query) -> None:
-        self._events: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
-        self._response = self._open(api, path, query)
-        self._thread = threading.Thread(
-            target=self._read, args=(api,), name='fog-watch', daemon=True)
-        if self._response is not None:
-            self._thread.start()
-
-    def _open(self, api: Api, path: str, query: Query) -> Any:
-        try:
-            response = api._send('GET', path, None, query, SILENCE)
-        except Unreachable:
-            self._events.put(('CLOSED', {}))
-            # an API server that restarts is asked ten times a second
-            threading.Event().wait(0.1)
-            return None
-        if response.status >= 400:
-            data = response.read(decode_content=True)
-            response.release_conn()
-            refusal = _refusal(response.status, _parsed(data), data)
-            if refusal.status != 410 and not api.passing(refusal):
-                raise refusal
-            self._events.put(('CLOSED', {}))
-            threading.Event().wait(0.1)
-            return None
-        return response
-
-    def _read(self, api: Api) -> None:
-        rest = b''
-        with contextlib.suppress(OSError, ValueError, AttributeError, *_http_errors()):
-            for data in self._response.stream(1 << 16):
-                *lines, rest = (rest + data).split(b'\n')
-                for line in lines:
-                    event = _parsed(line)
-                    if 'type' in event:
-                        self._events.put((event['type'], event.get('object') or {}))
-        if self._response is not None:
-            api.lost()  # or the API server has had enough of us, which does no harm
-        self._events.put(('CLOSED', {}))
-
-    def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:
-        """Return the next event, None if none came in time."""
-        try:
-            return self._events.get(timeout=timeout)
-        except queue.Empty:
-            return None
-
-    def __enter__(self) -> _Watch:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        response, self._response = self._response, None
-        if response is None:
-            return
-        with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
-            response.shutdown()  # wakes the reader
-        self._thread.join(2.0)
-        response.close()
 
 
 _apis: dict[tuple[str, str], Api] = {}
@@ -383,58 +316,3 @@ def _tls(configuration: Any) -> dict[str, Any]:
         if value := getattr(configuration, name, None):
             options[key] = value
     return options
-
-
-def _http_errors() -> tuple[type[BaseException], ...]:
-    import urllib3
-    return (urllib3.exceptions.HTTPError, OSError)
-
-
-def _parsed(data: bytes) -> dict[str, Any]:
-    try:
-        found = json.loads(data)
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def _refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
-    message = str(answer.get('message') or data[:300].decode(errors='replace')
-                  or f'HTTP status {status}')
-    hint = 'the kubeconfig holds credentials that the cluster does not take: log in again' \
-        if status == 401 else ''
-    return ApiError(' '.join(message.split()), hint, status=status,
-                    reason=str(answer.get('reason') or ''), details=answer.get('details'))
-
-
-def cancelled(cancel: Optional[threading.Event], what: str) -> None:
-    """
-    Say whether to go on.
-
-    :raises Cancelled: ``cancel`` is set.
-    """
-    if cancel is not None and cancel.is_set():
-        raise Cancelled(what)
-
-
-def selector(labels: Mapping[str, str]) -> str:
-    """Return labels as a query's ``labelSelector``."""
-    return ','.join(f'{key}={value}' if value else key for key, value in labels.items())
-
-
-def path(kind: str, namespace: str = '', name: str = '', *rest: str) -> str:
-    """
-    Return the path of objects of a kind, in all namespaces if none is named.
-
-    >>> path('jobs', 'robots', 'talker')
-    '/apis/batch/v1/namespaces/robots/jobs/talker'
-    """
-    group = '/apis/batch/v1' if kind == 'jobs' else '/api/v1'
-    parts = [group, *(['namespaces', namespace] if namespace else []), kind,
-             *([name] if name else []), *rest]
-    return '/'.join(parts)
-
-
-def items(found: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
-    """Return the objects of a list."""
-    return found.get('items') or []

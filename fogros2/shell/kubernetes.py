@@ -21,6 +21,7 @@ from fogros2.errors import (
     DeadlineExceeded,
     FogError,
 )
+from fogros2.kubernetes_cancel import cancellable
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
 from fogros2.shell.kubernetes_channel import Channel
@@ -32,7 +33,7 @@ from fogros2.waiting import wait_until
 _DRAIN = 2.0
 #: Input up to this size fits into a channel's window: no thread needed to feed it.
 _INLINE = 1 << 20
-#: Seconds that one attempt to connect may take: a cancel isn't seen sooner.
+#: Seconds that one attempt to connect may take.
 _ATTEMPT = 10.0
 
 
@@ -102,7 +103,9 @@ class KubernetesShell:
 
         def attempt() -> Optional[Link]:
             try:
-                return Link(self.endpoint, name=self.name, timeout=min(patience, _ATTEMPT))
+                return cancellable(
+                    lambda: Link(self.endpoint, name=self.name, timeout=min(patience, _ATTEMPT)),
+                    cancel, what=f"connecting to '{self.name}'", late=Link.close)
             except (ConnectError, DeadlineExceeded) as error:
                 last[:] = [error]
                 return None

@@ -20,8 +20,9 @@ LAYERS = [
     {'errors'},
     {'waiting', 'report', 'process', 'plugin_system'},
     {'store', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
-     'agent_client', 'agent', 'cloud_launch', 'kubernetes_api', 'kubernetes_config', 'workspace',
-     'wheels', 'bootstrap'},
+     'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',
+     'kubernetes_cancel', 'kubernetes_config', 'kubernetes_watch', 'workspace', 'wheels',
+     'bootstrap'},
     {'deploy', 'testing'},
     {'actions'},
 ]

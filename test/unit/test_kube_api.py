@@ -265,6 +265,41 @@ def test_something_else_can_end_a_watch(api, server):
     assert follow(api, lambda kind, thing: None, tick=tick) == 'late'
 
 
+@pytest.mark.parametrize('call', ['request', 'watch'])
+def test_a_server_that_takes_the_question_and_says_nothing_holds_up_no_ctrl_c(api, server, call):
+    asked = threading.Event()
+
+    def silent() -> Answer:
+        asked.set()
+        server.ended.wait(20.0)
+        return 200, {}
+
+    server.answers = [silent]
+    cancel = threading.Event()
+    interrupting = threading.Thread(target=lambda: (asked.wait(10.0), cancel.set()))
+    interrupting.start()
+    begin = time.monotonic()
+    if call == 'request':
+        raised(Cancelled, lambda: api.request('POST', '/api/v1/pods', {}, cancel=cancel))
+    else:
+        raised(Cancelled, lambda: follow(api, lambda kind, thing: None, cancel=cancel))
+    interrupting.join()
+    assert time.monotonic() - begin < 3.0
+
+
+def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):
+    """The request was under way: whoever undoes it has to know what it made."""
+    cancel = threading.Event()
+
+    def late() -> Answer:
+        cancel.set()
+        threading.Event().wait(0.2)
+        return 201, {'made': 'it'}
+
+    server.answers = [late]
+    assert api.request('POST', '/api/v1/pods', {}, cancel=cancel) == {'made': 'it'}
+
+
 def test_the_provider_is_there_without_the_client():
     """``ros2 fog list`` names it, and must not take the time that the client takes to load."""
     code = ('import sys; import fogros2.provider.kubernetes, fogros2.shell.kubernetes, '

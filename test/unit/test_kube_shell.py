@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -208,6 +209,24 @@ def test_a_cluster_that_does_not_answer_holds_up_no_ctrl_c(api, shell):
     cancel.set()
     thread.join(3.0)
     assert ended == ['cancelled']
+
+
+def test_an_exec_that_never_begins_holds_up_no_ctrl_c(api, shell, monkeypatch):
+    cancel, let_go, made = threading.Event(), threading.Event(), api.websocket
+
+    def slow(*words: object, **options: object) -> Pipe:
+        cancel.set()
+        let_go.wait(20.0)
+        return made(*words, **options)
+
+    monkeypatch.setattr(api, 'websocket', slow)
+    begin = time.monotonic()
+    raised(Cancelled, lambda: shell.run(Command(('true',)), timeout=30.0, cancel=cancel))
+    assert time.monotonic() - begin < 3.0
+    let_go.set()
+    # a connection that stands after all is nobody's: it is closed
+    wait_until(lambda: api.links and api.links[0].child.poll() is not None, timeout=10.0,
+               what='its exec to end')
 
 
 def test_a_pod_that_is_gone_is_told_at_once(api, shell):

@@ -127,7 +127,8 @@ class KubernetesProvider(Provider):
     ) -> Optional[dict[str, Any]]:
         """Return the Job that an earlier attempt with this token has made."""
         with contextlib.suppress(ApiError):
-            found = api.request('GET', path('jobs', namespace, names.job_name(spec.name)))
+            found = api.request('GET', path('jobs', namespace, names.job_name(spec.name)),
+                                cancel=request.cancel)
             if names.annotation(found, names.ATTEMPT) == request.token:
                 return found
         return None

@@ -66,9 +66,13 @@ def end(api: Api, where: MachineId) -> None:
 
 
 def _end_pods(api: Api, where: MachineId) -> None:
-    """End the pods of a Job that is being deleted, quicker than the cluster would."""
+    """
+    End the pods of a Job that is being deleted, quicker than the cluster would.
+
+    Not those of another Job that has the name by now: clusters label pods with their Job's uid.
+    """
     target = path('pods', where.namespace)
-    labels = selector({names.MACHINE: where.job})
+    labels = selector({names.MACHINE: where.job, names.JOB_UID: where.uid})
 
     def delete(grace: int) -> list[dict[str, Any]]:
         # without a say the pod has the time that it gets when the cluster takes it away

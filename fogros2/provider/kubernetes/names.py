@@ -15,6 +15,8 @@ from fogros2.errors import MachineNotFound
 MANAGED = {'app.kubernetes.io/managed-by': 'fogros2'}
 #: Label that leads from a machine to its pods and services.
 MACHINE = 'fogros2-machine'
+#: Label that the cluster gives each pod of a Job: its uid.
+JOB_UID = 'controller-uid'
 #: Annotations of the Job.
 ATTEMPT = 'fogros2-token'
 TAGS = 'fogros2-tags'

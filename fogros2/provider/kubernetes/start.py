@@ -41,6 +41,7 @@ class Start:
         self._since = 0.0
         self._scales_up = False
         self._next_events = time.monotonic() + QUIET
+        self._cancel: Optional[threading.Event] = None
 
     def wait(self, *, timeout: float, cancel: threading.Event) -> dict[str, Any]:
         """
@@ -49,6 +50,7 @@ class Start:
         :raises ProviderError: it can't, with the event's text.
         :raises DeadlineExceeded: it doesn't, with what is in the way.
         """
+        self._cancel = cancel
         try:
             return self._api.follow(
                 path('pods', self._where.namespace), self._look, tick=self._tick,
@@ -96,7 +98,8 @@ class Start:
     def _again(self) -> None:
         """Look whether the Job is there still, when a watch was lost."""
         try:
-            self._api.request('GET', path('jobs', self._where.namespace, self._where.job))
+            self._api.request('GET', path('jobs', self._where.namespace, self._where.job),
+                              cancel=self._cancel)
         except ApiError as error:
             if error.status == 404:
                 raise ProviderError(f"'{self._name}' was deleted while it was coming up") \
@@ -119,7 +122,7 @@ class Start:
         meta = (self._pod or self._job)['metadata']
         found = items(self._api.request(
             'GET', path('events', self._where.namespace),
-            fieldSelector=f"involvedObject.uid={meta['uid']}"))
+            fieldSelector=f"involvedObject.uid={meta['uid']}", cancel=self._cancel))
         self._scales_up = pods.scales_up(found)
         told = pods.trouble_in(found)
         if told is not None and (told.final or self._trouble is None):

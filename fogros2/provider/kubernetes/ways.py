@@ -5,18 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import contextlib
-import functools
 import threading
 import time
 from typing import Any, Optional
 
-from fogros2.errors import DeadlineExceeded, ProviderError
+from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError
 from fogros2.kubernetes_api import Api, ApiError, path
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.kubernetes import exposure, hints, manifests, names
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
+from fogros2.waiting import wait_until
+
+#: Seconds in which a cluster takes away what belonged to a Job that is gone.
+TAKEN = 20.0
 
 
 def make(
@@ -30,33 +33,81 @@ def make(
 
     :raises ProviderError: the cluster refused.
     """
-    kind = _service_kind(api, options.expose)
+    kind = _service_kind(api, options.expose, request.cancel)
     if not kind:
         return None
-    body = manifests.service(kind, spec, request, options, str(job['metadata']['uid']))
+    uid = str(job['metadata']['uid'])
+    body = manifests.service(kind, spec, request, options, uid)
+    target = path('services', namespace)
+
+    def attempt() -> Optional[dict[str, Any]]:
+        try:
+            return api.request('POST', target, body, cancel=request.cancel)
+        except ApiError as error:
+            if error.reason != 'AlreadyExists':
+                raise
+        there = _read(api, f"{target}/{body['metadata']['name']}", request.cancel)
+        # an earlier attempt's, or of a Job that had the name before: the cluster takes that one
+        # away with its Job, but not at once
+        return there if there is not None and owned(there, uid) else None
+
     try:
-        return api.request('POST', path('services', namespace), body, cancel=request.cancel)
+        return wait_until(attempt, timeout=TAKEN, cancel=request.cancel, interval=0.2,
+                          what=f"the Service of an earlier '{spec.name}' to be gone")
     except ApiError as error:
-        if error.reason == 'AlreadyExists' or options.expose == 'auto':
+        if options.expose == 'auto':
             return None
         raise ProviderError(
             f"the cluster refused the Service of '{spec.name}': {error.args[0]}",
             hints.of_refusal(str(error.args[0]), namespace)) from error
+    except DeadlineExceeded as error:
+        if options.expose == 'auto':
+            return None
+        raise NameTaken(
+            f"namespace '{namespace}' has a Service '{body['metadata']['name']}' that is not "
+            f"the machine's", 'give the machine another name=, or: kubectl delete service '
+            f"-n {namespace} {body['metadata']['name']}") from error
 
 
-def _service_kind(api: Api, expose: str) -> str:
+def owned(thing: Mapping[str, Any], uid: str) -> bool:
+    """Return whether an object belongs to the Job that has a uid, and stays."""
+    meta = thing['metadata']
+    return not meta.get('deletionTimestamp') and any(
+        owner.get('uid') == uid for owner in meta.get('ownerReferences') or ())
+
+
+def _read(
+    api: Api, target: str, cancel: Optional[threading.Event],
+) -> Optional[dict[str, Any]]:
+    """Return an object, None if there is none."""
+    try:
+        return api.request('GET', target, cancel=cancel)
+    except ApiError as error:
+        if error.status != 404:
+            raise
+        return None
+
+
+def _service_kind(api: Api, expose: str, cancel: Optional[threading.Event]) -> str:
     if expose == 'auto':
-        return 'LoadBalancer' if maker(api) else 'NodePort'
+        return 'LoadBalancer' if maker(api, cancel) else 'NodePort'
     return {'load_balancer': 'LoadBalancer', 'node_port': 'NodePort'}.get(expose, '')
 
 
-@functools.lru_cache(maxsize=8)
-def maker(api: Api) -> str:
-    """Return who makes load balancers in a cluster, '' if nobody is known to."""
-    if found := exposure.load_balancers(api.server):
-        return found
-    groups = api.request('GET', '/apis').get('groups') or ()
-    return exposure.load_balancers(api.server, [str(each['name']) for each in groups])
+#: Who makes load balancers, by API server.
+_makers: dict[str, str] = {}
+
+
+def maker(api: Api, cancel: Optional[threading.Event] = None) -> str:
+    """Return who makes load balancers in a cluster, '' if nobody is known to; asked once."""
+    if (known := _makers.get(api.server)) is not None:
+        return known
+    found = exposure.load_balancers(api.server)
+    if not found:
+        groups = api.request('GET', '/apis', cancel=cancel).get('groups') or ()
+        found = exposure.load_balancers(api.server, [str(each['name']) for each in groups])
+    _makers[api.server] = found
+    return found
 
 
 def known(job: Mapping[str, Any]) -> Optional[Exposure]:
@@ -132,13 +183,13 @@ class _Search:
 
     def service(self) -> Optional[dict[str, Any]]:
         """Return the Service, None if there is none."""
-        try:
-            return self._api.request('GET', self._path, cancel=self._cancel)
-        except ApiError as error:
-            if error.status != 404:
-                raise
+        found = _read(self._api, self._path, self._cancel)
+        if found is None:
             self._failed.append('the cluster allows no Service')
+        elif not owned(found, self._where.uid):
+            self._failed.append("the Service of that name is not the machine's")
             return None
+        return found
 
     def _load_balancer(self, patience: float) -> Optional[Exposure]:
         begin = time.monotonic()
@@ -187,5 +238,6 @@ class _Search:
         """Return the addresses of the pod's node; its own is known where nodes can't be read."""
         name = str(self._pod['spec'].get('nodeName') or '')
         with contextlib.suppress(ApiError):
-            return exposure.node_addresses(self._api.request('GET', path('nodes', '', name)))
+            return exposure.node_addresses(self._api.request(
+                'GET', path('nodes', '', name), cancel=self._cancel))
         return []

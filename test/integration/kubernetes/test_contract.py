@@ -10,12 +10,12 @@ import threading
 import pytest
 
 from fogros2 import kubernetes_api
-from fogros2.errors import PrerequisiteError, ProviderError, ShellError
+from fogros2.errors import NameTaken, PrerequisiteError, ProviderError, ShellError
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.shell.kubernetes import KubernetesShell
 from fogros2.testing import ProviderContract, request_for, ShellContract
-from fogros2.testing.cluster import BARE
+from fogros2.testing.cluster import BARE, Refused
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
 
@@ -228,3 +228,75 @@ def test_a_way_that_lets_nothing_through_is_told(place, monkeypatch):
     # and where the choice is ours the next way is taken
     assert machine.vpn_host == ''
     assert 'pod_dials_robot: port 9 of the node' in machine.note
+
+
+@pytest.fixture
+def in_the_way(place, client):
+    """Return what makes a Service of a machine's name that isn't the machine's, gone at the end."""
+    base = f'/api/v1/namespaces/{place.name}/services'
+    made = []
+
+    def make(name, **metadata):
+        service = client.create(base, 'v1 Service', f'fogros2-{name}', metadata=metadata,
+                                spec={'ports': [{'port': 9, 'protocol': 'UDP'}]})
+        made.append(f"{base}/{service['metadata']['name']}")
+        return made[-1]
+
+    yield make
+    for path in made:
+        with contextlib.suppress(Refused):
+            client.ask('DELETE', path)
+
+
+def test_a_service_of_somebody_else_is_not_taken_for_the_machine_s(
+        place, client, in_the_way, monkeypatch):
+    monkeypatch.setattr('fogros2.provider.kubernetes.ways.TAKEN', 0.5)
+    path = in_the_way('twin')
+    error = raised(NameTaken, lambda: run('twin', expose='node_port'))
+    assert "'fogros2-twin'" in str(error)
+    assert f'kubectl delete service -n {place.name} fogros2-twin' in error.hint
+    assert left(place, 'twin') == ['services fogros2-twin']
+    # where the way is ours to choose, it is another
+    provider, machine_id, machine = run('twin')
+    provider.destroy(machine_id)
+    assert machine.note == "UDP by pod_dials_robot: the Service of that name is not the machine's"
+    assert client.ask('GET', path)['spec']['ports'][0]['port'] == 9
+
+
+def test_the_service_of_a_job_that_is_gone_is_waited_for(place, client, in_the_way):
+    """The cluster takes it away with its Job, but some time later."""
+    path = in_the_way('heir', ownerReferences=[{
+        'apiVersion': 'batch/v1', 'kind': 'Job', 'name': 'fogros2-heir', 'uid': 'of-another'}],
+        finalizers=['fogros2.test/late'])
+
+    def collect():
+        wait_until(lambda: left(place, 'heir') != ['services fogros2-heir'], timeout=30.0,
+                   what='the Job')
+        client.ask('PATCH', path, {'metadata': {'finalizers': None}})
+
+    collector = threading.Thread(target=collect)
+    collector.start()
+    try:
+        provider, machine_id, machine = run('heir', expose='node_port')
+        provider.destroy(machine_id)
+    finally:
+        collector.join()
+    assert 'UDP by node_port' in machine.note
+
+
+def test_the_end_of_a_machine_is_no_other_s(place, client):
+    """Its pods are known by their Job: a new one may have the name by then."""
+    base = f'/api/v1/namespaces/{place.name}/pods'
+    other = client.create(
+        base, 'v1 Pod', 'fogros2-same-other', metadata={'labels': {
+            'fogros2-machine': 'fogros2-same', 'controller-uid': 'of-another'}},
+        spec={'restartPolicy': 'Never', 'containers': [
+            {'name': 'machine', 'image': BARE, 'command': ['sleep', '600']}]})
+    try:
+        provider, machine_id, _ = run('same')
+        provider.destroy(machine_id)
+        now, = (pod for pod in place.all('pods') if 'fogros2-same' in pod['metadata']['name'])
+        assert now['metadata']['uid'] == other['metadata']['uid']
+        assert 'deletionTimestamp' not in now['metadata']
+    finally:
+        client.ask('DELETE', f'{base}/fogros2-same-other', gracePeriodSeconds='0')

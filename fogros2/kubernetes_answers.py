@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an API server answers, and how it is asked for it: errors, paths, lists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import json
+from typing import Any, Optional
+
+from fogros2.errors import ProviderError
+
+
+class ApiError(ProviderError):
+    """
+    The API server refused.
+
+    :param status: of HTTP: 403, 404, 409, 422, ...
+    :param reason: in one word: Forbidden, NotFound, AlreadyExists, Invalid, ...
+    :param details: what the answer's ``details`` hold, such as causes.
+    """
+
+    def __init__(
+        self, message: str, hint: str = '', *, status: int = 0, reason: str = '',
+        details: Optional[Mapping[str, Any]] = None,
+    ) -> None:
+        super().__init__(message, hint)
+        self.status = status
+        self.reason = reason
+        self.details = details or {}
+
+
+class Unreachable(ProviderError):
+    """The API server doesn't answer."""
+
+
+def http_errors() -> tuple[type[BaseException], ...]:
+    """Return what a connection that breaks may raise."""
+    import urllib3
+    return (urllib3.exceptions.HTTPError, OSError)
+
+
+def parsed(data: bytes) -> dict[str, Any]:
+    """Return an answer's object, an empty one for what is none."""
+    try:
+        found = json.loads(data)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
+    """Return the error that an answer with a status of 400 and above tells of."""
+    message = str(answer.get('message') or data[:300].decode(errors='replace')
+                  or f'HTTP status {status}')
+    hint = 'the kubeconfig holds credentials that the cluster does not take: log in again' \
+        if status == 401 else ''
+    return ApiError(' '.join(message.split()), hint, status=status,
+                    reason=str(answer.get('reason') or ''), details=answer.get('details'))
+
+
+def selector(labels: Mapping[str, str]) -> str:
+    """Return labels as a query's ``labelSelector``."""
+    return ','.join(f'{key}={value}' if value else key for key, value in labels.items())
+
+
+def path(kind: str, namespace: str = '', name: str = '', *rest: str) -> str:
+    """
+    Return the path of objects of a kind, in all namespaces if none is named.
+
+    >>> path('jobs', 'robots', 'talker')
+    '/apis/batch/v1/namespaces/robots/jobs/talker'
+    """
+    group = '/apis/batch/v1' if kind == 'jobs' else '/api/v1'
+    parts = [group, *(['namespaces', namespace] if namespace else []), kind,
+             *([name] if name else []), *rest]
+    return '/'.join(parts)
+
+
+def items(found: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
+    """Return the objects of a list."""
+    return found.get('items') or []

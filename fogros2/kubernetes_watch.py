@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A watch of the API server's objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import contextlib
+import queue
+import threading
+from typing import Any, Optional, Protocol
+
+from fogros2.kubernetes_answers import ApiError, http_errors, parsed, refusal, Unreachable
+
+#: Seconds of silence after which a watch is begun anew: its connection may be gone.
+SILENCE = 240.0
+
+
+class Server(Protocol):
+    """The API server, as a watch needs it."""
+
+    def send(
+        self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Mapping[str, Any],
+        read: Optional[float], /,
+    ) -> Any:
+        """Make a request and return urllib3's response, its body unread."""
+
+    def passing(self, error: ApiError, /) -> bool:
+        """Return whether a refusal may be one of an API server that has just begun again."""
+
+    def lost(self) -> None:
+        """Note that a connection was lost."""
+
+
+class Watch:
+    """
+    One watch: a thread asks and reads its lines, so that whoever waits can be cancelled.
+
+    An API server that takes the connection and says nothing holds up that thread alone.
+    """
+
+    def __init__(self, api: Server, path: str, query: Mapping[str, Any]) -> None:
+        self._events: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
+        self._refusal: Optional[ApiError] = None
+        self._lock = threading.Lock()
+        self._ended = False
+        self._response: Any = None
+        self._thread = threading.Thread(
+            target=self._run, args=(api, path, query), name='fog-watch', daemon=True)
+        self._thread.start()
+
+    def _run(self, api: Server, path: str, query: Mapping[str, Any]) -> None:
+        response = self._open(api, path, query)
+        with self._lock:
+            self._response = response
+            ended = self._ended
+        if response is not None and ended:
+            response.close()
+        elif response is not None:
+            self._read(api, response)
+        else:
+            # an API server that restarts is asked ten times a second
+            threading.Event().wait(0.1)
+        self._events.put(('CLOSED', {}))
+
+    def _open(self, api: Server, path: str, query: Mapping[str, Any]) -> Any:
+        try:
+            response = api.send('GET', path, None, query, SILENCE)
+            if response.status < 400:
+                return response
+            data = response.read(decode_content=True)
+            response.release_conn()
+        except Unreachable:
+            return None
+        except http_errors():
+            return None
+        said = refusal(response.status, parsed(data), data)
+        if said.status != 410 and not api.passing(said):
+            self._refusal = said
+        return None
+
+    def _read(self, api: Server, response: Any) -> None:
+        rest = b''
+        with contextlib.suppress(OSError, ValueError, AttributeError, *http_errors()):
+            for data in response.stream(1 << 16):
+                *lines, rest = (rest + data).split(b'\n')
+                for line in lines:
+                    event = parsed(line)
+                    if 'type' in event:
+                        self._events.put((event['type'], event.get('object') or {}))
+        if not self._ended:
+            api.lost()  # or the API server has had enough of us, which does no harm
+
+    def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:
+        """
+        Return the next event, None if none came in time.
+
+        :raises ApiError: the watch was refused.
+        """
+        try:
+            event = self._events.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if event[0] == 'CLOSED' and self._refusal is not None:
+            raise self._refusal
+        return event
+
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._ended = True
+            response, self._response = self._response, None
+        if response is None:
+            return  # it has ended, or asks still, and whoever does closes it
+        with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
+            response.shutdown()  # wakes the reader
+        self._thread.join(2.0)
+        response.close()
