@@ -81,6 +81,7 @@ setup(
         ],
         'fogros2.dds': [
             'rmw_cyclonedds_cpp = fogros2.dds.cyclonedds:CycloneDds',
+            'rmw_fastrtps_cpp = fogros2.dds.fastdds:FastDds',
         ],
         'fogros2.image_transport': [
             'compressed = fogros2.image_transport.compressed:Compressed',

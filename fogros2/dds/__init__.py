@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import ClassVar, Optional
 
 from fogros2.model import Command, DdsInterface
@@ -46,12 +47,17 @@ class DdsVendor(abc.ABC):
         """Return the interfaces of a machine's nodes: the VPN and the machine itself."""
 
     @abc.abstractmethod
-    def render(self, interfaces: Sequence[DdsInterface], peers: Sequence[str]) -> str:
+    def render(
+        self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
+        user: Mapping[str, str] = MappingProxyType({}),
+    ) -> str:
         """
         Return the configuration file's text.
 
         :param interfaces: those the nodes use.
         :param peers: addresses asked for participants, ours (127.0.0.1) not among them.
+        :param user: the environment as the user has it, for middlewares that read one file alone:
+            what it configures goes into that.
         """
 
     @abc.abstractmethod
@@ -61,3 +67,8 @@ class DdsVendor(abc.ABC):
 
         :param user: the environment as the user has it; what it configures is kept, ours after it.
         """
+
+
+def static_peers(user: Mapping[str, str]) -> list[str]:
+    """Return the hosts of ROS_STATIC_PEERS, which has ``;`` between them."""
+    return [host.strip() for host in user.get('ROS_STATIC_PEERS', '').split(';') if host.strip()]

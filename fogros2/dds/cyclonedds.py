@@ -20,6 +20,7 @@ import ipaddress
 import json
 from pathlib import Path
 import re
+from types import MappingProxyType
 from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
@@ -138,9 +139,12 @@ class CycloneDds(DdsVendor):
         return [DdsInterface(vpn, 10, required=False, multicast=True),
                 DdsInterface('lo', multicast=True)]
 
-    def render(self, interfaces: Sequence[DdsInterface], peers: Sequence[str]) -> str:
+    def render(
+        self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
+        user: Mapping[str, str] = MappingProxyType({}),
+    ) -> str:
         """
-        Return the XML.
+        Return the XML; the user's own comes beside it, see :meth:`environment`.
 
         :param peers: left out where the preferred interface is a loopback, which can't ask them.
         :raises DdsError: no interface.

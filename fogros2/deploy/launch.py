@@ -193,7 +193,8 @@ class Launch:
                     robot.interface.name, lan, self.user_environment)
                 path = self.store.launch(self.id) / 'dds.xml'
                 # no peers: the machines announce themselves
-                write_private(path, vendor.render(interfaces, ()).encode())
+                write_private(
+                    path, vendor.render(interfaces, (), self.user_environment).encode())
                 robot.ensure()
                 self._robot_environment = dict(
                     vendor.environment(str(path), self.user_environment))

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fast DDS, ROS 2's ``rmw_fastrtps_cpp``: its profile for a robot with a VPN.
+
+Written for 2.14 (ROS 2 Jazzy). 2.9 reads it too, but knows interfaces by address alone, and no
+``netmask_filter``.
+
+A process announces every address it has, and others send to all of them. So the robot keeps what
+it has without us, every interface, and the VPN's is one of them: other computers on its LAN go on.
+A machine has the VPN's interface alone, and sends to addresses of that network alone: the robot's
+LAN is none of its business, and what is sent there would leave the machine in clear. Announcements
+cross the VPN by multicast (see ``vpn/wireguard.py``), and machines ask each other by unicast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import ipaddress
+from pathlib import Path
+import re
+from types import MappingProxyType
+from typing import ClassVar, Optional
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from fogros2.dds import DdsVendor, static_peers
+from fogros2.errors import DdsError
+from fogros2.model import Command, DdsInterface
+
+#: Where Fast DDS looks for its profiles.
+VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
+MAX_DOMAIN = 232
+#: Processes that a host is asked for: each has a port, which each participant asks in each
+#: interval. Who is asked answers, so only two that both come later don't find each other.
+ASKED = 10
+#: Of this computer it costs no network to ask more; ROS 2 asks as many.
+ASKED_HERE = 32
+#: RTPS 2.5, 9.6.2.3: participant i of a domain is asked at 7410 + 250 * domain + 2 * i.
+PORT_BASE = 7410
+PORTS_PER_DOMAIN = 250
+#: RTPS 2.5, 9.6.2.4.
+DISCOVERY_GROUP = '239.255.0.1'
+#: Seconds between a participant's announcements.
+ANNOUNCEMENT = 1
+#: Seconds a silent participant is kept: what a cut may last without being discovered anew.
+LEASE_DURATION = 60
+#: Bytes of receive buffer asked for; the kernel gives what its rmem_max allows.
+RECEIVE_BUFFER = 4 * 1024 * 1024
+LOOPBACK = '127.0.0.1'
+#: FASTDDS_BUILTIN_TRANSPORTS with which nodes reach those that have UDP alone.
+_REACHABLE = ('', 'DEFAULT', 'UDPV4')
+_PEER = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
+_UDP, _SHM = 'fogros2_udp', 'fogros2_shm'
+
+
+class FastDds(DdsVendor):
+    """
+    Renders a profile for every participant: what it has, or the VPN alone.
+
+    :param domain: ROS_DOMAIN_ID, in which peers are asked.
+    """
+
+    rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
+
+    def __init__(self, domain: int = 0) -> None:
+        if not 0 <= domain <= MAX_DOMAIN:
+            raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
+        self.domain = domain
+
+    def ask_lan(self) -> Command:
+        """Return a command that says nothing: every interface is used."""
+        return Command(('true',), what='look at the network interfaces')
+
+    def parse_lan(self, output: str) -> Optional[str]:
+        """Return None: there is no interface that Fast DDS prefers."""
+        return None
+
+    def robot_interfaces(
+        self, vpn: str, lan: Optional[str], user: Mapping[str, str],
+    ) -> list[DdsInterface]:
+        """
+        Return the interfaces of the robot's nodes; none stands for all that there are.
+
+        :raises DdsError: the user's environment keeps nodes from machines.
+        """
+        if user.get('ROS_DISCOVERY_SERVER'):
+            raise DdsError(
+                'ROS_DISCOVERY_SERVER has nodes ask a server alone, which no machine knows',
+                'unset ROS_DISCOVERY_SERVER, or use rmw_cyclonedds_cpp')
+        transports = user.get('FASTDDS_BUILTIN_TRANSPORTS', '')
+        if transports.upper() not in _REACHABLE:
+            raise DdsError(
+                f'FASTDDS_BUILTIN_TRANSPORTS={transports} has nodes that reach no machine',
+                'unset it: machines speak UDP over IPv4')
+        if _here_only(user):
+            return [DdsInterface(LOOPBACK, 10), DdsInterface(vpn, multicast=True)]
+        return []
+
+    def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
+        """Return the interface of a machine's nodes; beside it they share memory."""
+        return [DdsInterface(vpn, multicast=True)]
+
+    def render(
+        self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
+        user: Mapping[str, str] = MappingProxyType({}),
+    ) -> str:
+        """
+        Return the XML: the user's profiles, and in the default participant's what we add.
+
+        :param interfaces: none for all there are.
+        :param peers: hosts that are asked by unicast. Where an interface can multicast, that comes
+            beside it.
+        :param user: its FASTRTPS_DEFAULT_PROFILES_FILE is taken over, its ROS_STATIC_PEERS are
+            asked too.
+        :raises DdsError: the user's profiles can't be read, or have transports of their own.
+        """
+        multicast = not interfaces or any(one.multicast for one in interfaces)
+        root, profiles = _profiles(user.get(VARIABLE, ''))
+        participant = _default_participant(profiles)
+        rtps = _child(participant, 'rtps')
+        builtin = _child(rtps, 'builtin')
+        discovery = _child(builtin, 'discovery_config')
+        for name, seconds in (('leaseDuration', LEASE_DURATION),
+                              ('leaseAnnouncement', ANNOUNCEMENT)):
+            if discovery.find(name) is None:
+                _child(_child(discovery, name), 'sec').text = str(seconds)
+        asked = list(dict.fromkeys([*peers, *static_peers(user)]))
+        if multicast and (asked or interfaces):
+            # any peer at all takes the place of what is asked by default
+            asked.insert(0, DISCOVERY_GROUP)
+        if any(one.name == LOOPBACK for one in interfaces) or not multicast:
+            asked.append(LOOPBACK)
+        listed = builtin.find('initialPeersList')
+        if asked or listed is not None:
+            listed = _child(builtin, 'initialPeersList')
+            for host in asked:
+                listed.extend(self._locators(host))
+        if not multicast:
+            # an address of its own, whatever it is, keeps it off the default group
+            _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
+        if interfaces:
+            _own_transports(profiles, rtps, interfaces)
+        elif rtps.find('listenSocketBufferSize') is None:
+            _child(rtps, 'listenSocketBufferSize').text = str(RECEIVE_BUFFER)
+        _sort(rtps)
+        ElementTree.indent(root)
+        return ('<?xml version="1.0" encoding="UTF-8"?>\n'
+                + ElementTree.tostring(root, encoding='unicode') + '\n')
+
+    def _locators(self, host: str) -> list[Element]:
+        if not _PEER.fullmatch(host):
+            raise DdsError(f"'{host}' is no host that can be asked for nodes",
+                           'write addresses or names, with ; between them')
+        if host == DISCOVERY_GROUP:
+            # its port is the domain's first, which Fast DDS fills in
+            return [_locator(host, PORT_BASE - 10 + PORTS_PER_DOMAIN * self.domain)]
+        begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
+        count = ASKED_HERE if host == LOOPBACK else ASKED
+        return [_locator(host, begin + 2 * index) for index in range(count)]
+
+    def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
+        """
+        Return RMW_IMPLEMENTATION and the profile's place.
+
+        What ROS_AUTOMATIC_DISCOVERY_RANGE says is in the profile already. The middleware would
+        add transports of its own to it, which listen on every interface.
+
+        :raises DdsError: the user's environment turns discovery off.
+        """
+        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
+            raise DdsError(
+                'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
+                'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+        variables = {'RMW_IMPLEMENTATION': self.rmw, VARIABLE: path,
+                     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT'}
+        if user.get('ROS_LOCALHOST_ONLY') == '1':
+            variables['ROS_LOCALHOST_ONLY'] = '0'
+        return variables
+
+
+def _here_only(user: Mapping[str, str]) -> bool:
+    return (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
+            or user.get('ROS_LOCALHOST_ONLY') == '1')
+
+
+def _profiles(path: str) -> tuple[Element, Element]:
+    """Return the root of the user's profiles and the element that holds them; new ones for ''."""
+    if not path:
+        root = Element('dds', xmlns=NAMESPACE)
+        return root, _child(root, 'profiles')
+    try:
+        root = ElementTree.fromstring(Path(path).read_text())
+    except OSError as error:
+        raise DdsError(f"{VARIABLE} names {path}, which can't be read: {error.strerror}",
+                       f'correct or unset {VARIABLE}') from error
+    except ElementTree.ParseError as error:
+        raise DdsError(f'{path} of {VARIABLE} is no XML: {error}',
+                       f'correct it or unset {VARIABLE}') from error
+    for element in root.iter():
+        element.tag = re.sub('^{.*}', '', element.tag)
+    root.set('xmlns', NAMESPACE)
+    if root.tag == 'profiles':
+        return root, root
+    return root, _child(root, 'profiles')
+
+
+def _default_participant(profiles: Element) -> Element:
+    for participant in profiles.iter('participant'):
+        if participant.get('is_default_profile') == 'true':
+            rtps = participant.find('rtps')
+            if rtps is not None and (
+                    rtps.find('userTransports') is not None
+                    or rtps.findtext('useBuiltinTransports', 'true').strip() == 'false'):
+                raise DdsError(
+                    f'the default participant of {VARIABLE} has transports of its own, which leave'
+                    ' no place for the VPN', 'leave userTransports and useBuiltinTransports out')
+            return participant
+    return ElementTree.SubElement(
+        profiles, 'participant', profile_name='fogros2', is_default_profile='true')
+
+
+def _own_transports(
+    profiles: Element, rtps: Element, interfaces: Sequence[DdsInterface],
+) -> None:
+    """Let participants use these interfaces and no other, and send to their networks alone."""
+    descriptors = profiles.find('transport_descriptors')
+    if descriptors is None:
+        # transports come before the participants that name them
+        descriptors = Element('transport_descriptors')
+        profiles.insert(0, descriptors)
+    udp = ElementTree.SubElement(descriptors, 'transport_descriptor')
+    _text(udp, transport_id=_UDP, type='UDPv4', receiveBufferSize=str(RECEIVE_BUFFER),
+          netmask_filter='ON')
+    allowed = _child(udp, 'interfaceWhiteList')
+    for one in sorted(interfaces, key=lambda one: -one.priority):
+        kind = 'address' if _is_address(one.name) else 'interface'
+        ElementTree.SubElement(allowed, kind).text = one.name
+    _text(ElementTree.SubElement(descriptors, 'transport_descriptor'),
+          transport_id=_SHM, type='SHM')
+    used = _child(rtps, 'userTransports')
+    for name in (_SHM, _UDP):
+        ElementTree.SubElement(used, 'transport_id').text = name
+    _child(rtps, 'useBuiltinTransports').text = 'false'
+
+
+def _locator(address: str, port: int) -> Element:
+    locator = Element('locator')
+    _text(_child(locator, 'udpv4'), port=str(port), address=address)
+    return locator
+
+
+def _text(parent: Element, **values: str) -> None:
+    for name, value in values.items():
+        ElementTree.SubElement(parent, name).text = value
+
+
+def _child(parent: Element, name: str) -> Element:
+    found = parent.find(name)
+    return ElementTree.SubElement(parent, name) if found is None else found
+
+
+def _sort(rtps: Element) -> None:
+    """Put transports before what uses them, as the schema's examples have it."""
+    order = ('userTransports', 'useBuiltinTransports')
+    rtps[:] = sorted(rtps, key=lambda child: child.tag not in order)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True

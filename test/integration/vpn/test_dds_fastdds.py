@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fast DDS on a robot with a VPN: its own library reads the profiles and finds the other side.
+
+A small program against Debian's library (2.9) takes a node's place; ROS 2 Jazzy has 2.14.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shutil
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+from fogros2.dds.fastdds import FastDds
+from fogros2.model import DdsInterface
+
+if TYPE_CHECKING:
+    from conftest import Child, Lab
+
+SOURCE = Path(__file__).with_name('fastdds_node.cpp')
+
+
+@pytest.fixture(scope='module')
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the node's program, compiled."""
+    compiler = shutil.which('g++')
+    if compiler is None or not Path('/usr/include/fastdds').is_dir():
+        pytest.skip('this computer has no Fast DDS to compile with (libfastrtps-dev, g++)')
+    made = tmp_path_factory.mktemp('fastdds') / 'fastdds_node'
+    subprocess.run([compiler, '-std=c++17', str(SOURCE), '-o', str(made), '-lfastrtps',
+                    '-lfastcdr'], check=True)
+    return made
+
+
+class Nodes:
+    """Starts nodes on the lab's hosts, with a profile or without one."""
+
+    def __init__(self, lab: Lab, program: Path, folder: Path) -> None:
+        self.lab = lab
+        self.program = program
+        self.folder = folder
+        self.dds = FastDds()
+
+    def start(self, host: str, *words: str, profile: str = '') -> Child:
+        environment = {}
+        if profile:
+            path = self.folder / f'{host} {len(self.lab.children)}.xml'
+            path.write_text(profile)
+            environment = dict(self.dds.environment(str(path), {}))
+        child = self.lab.start(host, [str(self.program), *words], **environment)
+        child.wait('ready')
+        return child
+
+    def robot(self, *words: str) -> Child:
+        """Start a node as a launch on the robot does."""
+        return self.start('robot', *words, profile=self.dds.render(
+            self.dds.robot_interfaces(self.lab.interfaces['robot'].name, None, {}), ()))
+
+    def machine(self, *words: str, host: str = 'machine', peers: tuple[str, ...] = (),
+                multicast: bool = True) -> Child:
+        """Start a node as on a machine; its interface by address, as 2.9 knows no other way."""
+        interface = DdsInterface(self.lab.interfaces[host].address, multicast=multicast)
+        return self.start(host, *words, profile=self.dds.render([interface], peers))
+
+
+@pytest.fixture
+def nodes(vpn: Lab, program: Path, tmp_path: Path) -> Nodes:
+    return Nodes(vpn, program, tmp_path)
+
+
+def test_robot_and_machine_hear_each_other_and_the_lan_goes_on(nodes: Nodes) -> None:
+    nodes.lab.lan()
+    lan = nodes.start('lan', 'from:/to_lan', 'to:/from_lan')
+    machine = nodes.machine('from:/up', 'to:/down')
+    robot = nodes.robot('to:/up', 'from:/down', 'to:/to_lan', 'from:/from_lan', 'to:/local')
+    beside = nodes.robot('from:/local')
+    terminal = nodes.start('robot', 'from:/to_lan')
+    for child, topic in ((machine, '/up'), (robot, '/down'), (beside, '/local'),
+                         (lan, '/to_lan'), (robot, '/from_lan'), (terminal, '/to_lan')):
+        child.wait('topic', topic, count=3)
+
+
+def test_unicast_alone_finds_the_other_side(nodes: Nodes) -> None:
+    for host in ('robot', 'machine'):
+        nodes.lab.ip('-n', nodes.lab.spaces[host], 'link', 'set', nodes.lab.interfaces[host].name,
+                     'multicast', 'off')
+    robot = nodes.robot('to:/up', 'from:/down')
+    machine = nodes.machine('from:/up', 'to:/down', multicast=False, peers=(
+        nodes.lab.interfaces['robot'].address,))
+    machine.wait('topic', '/up', count=3)
+    robot.wait('topic', '/down', count=3)
+
+
+def test_machines_find_each_other(nodes: Nodes) -> None:
+    nodes.lab.second()
+    addresses = {host: one.address for host, one in nodes.lab.interfaces.items()}
+    first = nodes.machine('to:/over', peers=(addresses['second'],))
+    second = nodes.machine('from:/over', host='second', peers=(addresses['machine'],))
+    second.wait('topic', '/over', count=3)
+    del first
