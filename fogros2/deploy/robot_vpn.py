@@ -11,7 +11,7 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2 import plan, plugin_system, process
-from fogros2.errors import Cancelled, FogError
+from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import step, StepFailed
 from fogros2.vpn import addresses, Vpn
@@ -45,7 +45,8 @@ class RobotVpn:
         network = addresses.choose_subnet(
             used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))
         self.interface = plan.robot_interface(
-            launch.id, network, addresses.choose_port(), str(folder / 'vpn.key'))
+            launch.id, network, addresses.choose_port(launch.user_environment),
+            str(folder / 'vpn.key'))
 
     def ensure(self) -> Peer:
         """
@@ -64,11 +65,22 @@ class RobotVpn:
                     launch.undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
                     self.down = False
                     self._public_key = launch.robot([self.vpn.keys(self.interface)]).strip()
-                    launch.robot(self.vpn.up(self.interface, []))
+                    self._bring_up()
                     detail.append(f'{self.interface.name} {self.interface.address}')
                 self._up = True
                 threading.Thread(target=self._keep, name='fog-vpn', daemon=True).start()
             return Peer('robot', self._public_key, self.interface.address)
+
+    def _bring_up(self) -> None:
+        try:
+            self._launch.robot(self.vpn.up(self.interface, []))
+        except CommandError as error:
+            if 'Address already in use' in error.result.stderr:
+                raise VpnError(
+                    f'UDP port {self.interface.port} of this computer is in use already',
+                    f'ss -lunp shows by whom; {addresses.PORT_VARIABLE} names another, and '
+                    'without it each launch takes a free one') from error
+            raise
 
     def peers_of(self, member: VpnMember) -> list[Peer]:
         """Return the peers of a machine as they are now."""

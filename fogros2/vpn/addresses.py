@@ -18,6 +18,9 @@ from fogros2.model import Command
 POOL = '198.18.0.0/15'
 #: Names another pool in CIDR form, for those who use this one otherwise.
 POOL_VARIABLE = 'FOGROS2_VPN_POOL'
+#: Names the robot's own UDP port, for robots behind a router that forwards one: machines that have
+#: to dial the robot, such as pods that nobody outside can dial, find it there.
+PORT_VARIABLE = 'FOGROS2_VPN_PORT'
 #: Bits of a launch's subnet: one robot and up to 253 machines.
 PREFIX = 24
 #: Shorter prefixes are some VPN's way to write "everything" (two halves, four quarters) and
@@ -109,12 +112,20 @@ def parse_used(output: str) -> list[str]:
         raise VpnError(f"can't read the networks in use: {error}") from error
 
 
-def choose_port() -> int:
+def choose_port(environment: Mapping[str, str] = {}) -> int:
     """
-    Return a UDP port that is free on this computer now.
+    Return the robot's UDP port: the environment's, else one that is free on this computer now.
 
-    It comes out of the ephemeral range, which doesn't meet DDS's ports in ROS domains 0 to 101.
+    The latter comes out of the ephemeral range, which doesn't meet DDS's ports in ROS domains 0 to
+    101.
+
+    :raises ConfigurationError: the environment's is no port.
     """
+    text = environment.get(PORT_VARIABLE, '').strip()
+    if text:
+        if not text.isdecimal() or not 0 < int(text) < 65536:
+            raise ConfigurationError(f'{PORT_VARIABLE}={text} is no UDP port', 'use 1 to 65535')
+        return int(text)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(('', 0))
         port: int = probe.getsockname()[1]

@@ -321,7 +321,7 @@ def _configure(
     if interface.guarded:
         # for ``alive``, which isn't root
         lines += [_FROM, f'hosts=$(wg show {_name(interface)} endpoints | {_HOSTS})',
-                  f"(umask 022; {{ echo $(echo \"$hosts\" | from); echo \"$hosts\"; }} "
+                  f'(umask 022; {{ echo $(echo "$hosts" | from); echo "$hosts"; }} '
                   f'>{_noted(interface)})']
     return '\n'.join(lines)
 

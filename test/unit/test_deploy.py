@@ -28,6 +28,7 @@ from fogros2.deploy.robot_vpn import RobotVpn, VpnMember
 from fogros2.errors import (
     AgentError,
     Cancelled,
+    CommandError,
     ConfigurationError,
     ConnectError,
     DeadlineExceeded,
@@ -399,3 +400,15 @@ def test_a_watch_that_fails_says_so_and_is_a_fault_in_the_end(
     with pytest.raises(KeyError):
         watch.close()
     watch.close()
+
+
+def test_a_port_of_the_robot_that_is_taken_says_what_to_do(launch, monkeypatch):
+    def run(command, **arguments):
+        raise CommandError(
+            command, Result(1, '', 'UDP port 51820: Address already in use'), 'this computer')
+
+    robot = launch.robot_vpn()
+    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
+    monkeypatch.setattr(process, 'run', run)
+    with pytest.raises(VpnError, match='in use already.*FOGROS2_VPN_PORT names another'):
+        robot._bring_up()

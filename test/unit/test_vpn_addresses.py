@@ -91,6 +91,17 @@ def test_this_computers_own_are_read() -> None:
     assert '127.0.0.0/8' in addresses.parse_used(output)
 
 
+def test_a_port_can_be_fixed() -> None:
+    assert addresses.choose_port({'FOGROS2_VPN_PORT': '51820'}) == 51820
+    assert addresses.choose_port({'FOGROS2_VPN_PORT': ''}) > 1023
+
+
+@pytest.mark.parametrize('text', ['0', '65536', '-1', 'any', '5182 0'])
+def test_what_is_no_port_to_fix_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match=f'FOGROS2_VPN_PORT={text} is no'):
+        addresses.choose_port({'FOGROS2_VPN_PORT': text})
+
+
 def test_the_port_is_free() -> None:
     port = addresses.choose_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
