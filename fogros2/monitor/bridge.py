@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node that serves a machine's topics to Foxglove, and takes what is published there.
+
+A topic is subscribed to while a viewer looks at it, and its bytes are handed on as they came. A
+viewer that reads slowly loses messages, the oldest first, and nobody else does. An H.264 stream
+of ``image_transport_h264`` goes out as ``foxglove.CompressedVideo`` and is not decoded.
+
+Parameters: ``address``, ``port`` (0: any; the port taken is logged), ``topics`` (patterns of the
+topics shown), ``client_publish`` (whether viewers may publish) and ``backlog`` (messages kept for
+a viewer that reads slowly).
+
+Protocol: https://github.com/foxglove/ws-protocol, by way of ``foxglove-sdk``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import fnmatch
+import functools
+from typing import Any, Optional
+
+import foxglove
+from foxglove.messages import CompressedVideo, Timestamp
+from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from std_msgs.msg import Empty
+
+from fogros2.monitor.definitions import definition, message_class
+
+#: Seconds between two looks at which topics there are.
+LOOK = 0.5
+#: Messages held back for a viewer that doesn't keep up.
+BACKLOG = 64
+_COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+#: The topic beside an H.264 stream on which a picture that needs no other is asked for.
+_KEYFRAME = '/keyframe'
+
+
+class _Topic:
+    """A topic as viewers see it, and our subscription while any of them looks at it."""
+
+    def __init__(self, node: BridgeNode, name: str, kind: str, video: bool) -> None:
+        self.kind = kind
+        self.video = video
+        self.viewers: set[int] = set()
+        self._node = node
+        self._name = name
+        self._class = message_class(kind)
+        schema = CompressedVideo.get_schema() if video else foxglove.Schema(
+            name=kind, encoding='ros2msg', data=definition(kind).encode())
+        self._channel = foxglove.Channel(
+            name, schema=schema, message_encoding='protobuf' if video else 'cdr',
+            context=node.viewers)
+        self._subscription: Optional[Subscription] = None
+        self._latched = False
+        self._requests: Optional[Publisher] = None
+        if video:
+            self._requests = node.create_publisher(Empty, f'{name}{_KEYFRAME}', 1)
+
+    @property
+    def id(self) -> int:
+        """Return the id by which viewers know it."""
+        return self._channel.id()
+
+    def look(self, viewer: int) -> None:
+        """Have a viewer see it from now on, with what was said before where that is kept."""
+        self.viewers.add(viewer)
+        if self._requests is not None:
+            self._requests.publish(Empty())
+        if self._subscription is not None and self._latched:
+            # Only a new subscription is told again. The others hear it twice, which a topic of
+            # this kind doesn't mind.
+            self._unsubscribe()
+        if self._subscription is None:
+            self._subscribe()
+
+    def look_away(self, viewer: int) -> None:
+        """Unsubscribe with the last viewer."""
+        self.viewers.discard(viewer)
+        if not self.viewers:
+            self._unsubscribe()
+
+    def close(self) -> None:
+        """Take it out of the viewers' lists."""
+        self._unsubscribe()
+        if self._requests is not None:
+            self._node.destroy_publisher(self._requests)
+        self._channel.close()
+
+    def _subscribe(self) -> None:
+        qos = fitting(self._node, self._name)
+        self._latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        if self.video:
+            self._subscription = self._node.create_subscription(
+                self._class, self._name, self._show_video, qos)
+        else:
+            self._subscription = self._node.create_subscription(
+                self._class, self._name, self._channel.log, qos, raw=True)
+
+    def _unsubscribe(self) -> None:
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _show_video(self, message: Any) -> None:
+        stamp = message.header.stamp
+        self._channel.log(CompressedVideo(
+            timestamp=Timestamp(stamp.sec, stamp.nanosec), frame_id=message.header.frame_id,
+            data=bytes(message.data), format=message.format).encode())
+
+
+class BridgeNode(Node):
+    """
+    Serves what the graph has.
+
+    :param executor: where the work is done that viewers ask for, in the SDK's own threads.
+    """
+
+    def __init__(self, executor: SingleThreadedExecutor) -> None:
+        super().__init__('fogros2_bridge')
+        self.viewers = foxglove.Context()
+        self._work = executor
+        self._topics: dict[str, _Topic] = {}
+        self._published: dict[tuple[int, int], Publisher] = {}
+        self._unknown: set[str] = set()
+        address = str(self.declare_parameter('address', '127.0.0.1').value)
+        port = int(self.declare_parameter('port', 8765).value)
+        self._patterns = list(self.declare_parameter('topics', ['*']).value)
+        publish = bool(self.declare_parameter('client_publish', True).value)
+        backlog = int(self.declare_parameter('backlog', BACKLOG).value)
+        self._look()
+        self._server = foxglove.start_server(
+            name=self.get_name(), host=address, port=port, server_listener=_Listener(self),
+            capabilities=[Capability.ClientPublish] if publish else [],
+            supported_encodings=['cdr'], context=self.viewers, message_backlog_size=backlog)
+        self.create_timer(LOOK, self._look)
+        self.get_logger().info(f'serving ws://{address}:{self._server.port}')
+
+    def do(self, action: Callable[..., None], *words: Any) -> None:
+        """Have something done in the executor's thread; from any thread."""
+        self._work.create_task(functools.partial(action, *words))
+
+    def destroy_node(self) -> None:
+        """Send the viewers away, then end."""
+        self._server.stop()
+        super().destroy_node()
+
+    def look(self, channel: int, viewer: int) -> None:
+        """Show a topic to a viewer."""
+        topic = self._topic(channel)
+        if topic is not None:
+            topic.look(viewer)
+
+    def look_away(self, channel: int, viewer: int) -> None:
+        """Show a topic to a viewer no longer."""
+        topic = self._topic(channel)
+        if topic is not None:
+            topic.look_away(viewer)
+
+    def advertise(self, viewer: int, channel: int, topic: str, encoding: str, kind: str) -> None:
+        """Get ready to publish for a viewer; what can't be is said to all of them."""
+        if encoding != 'cdr':
+            self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
+            return
+        try:
+            publisher = self.create_publisher(message_class(kind), topic, 10)
+        except (LookupError, ValueError) as error:
+            self._refuse(f'{topic}: {error}')
+            return
+        self._published[viewer, channel] = publisher
+
+    def unadvertise(self, viewer: int, channel: int) -> None:
+        """Publish for a viewer no longer."""
+        publisher = self._published.pop((viewer, channel), None)
+        if publisher is not None:
+            self.destroy_publisher(publisher)
+
+    def publish(self, viewer: int, channel: int, data: bytes) -> None:
+        """Publish what a viewer sent."""
+        publisher = self._published.get((viewer, channel))
+        if publisher is not None:
+            publisher.publish(data)
+
+    def _refuse(self, why: str) -> None:
+        self.get_logger().warning(why)
+        self._server.publish_status(why, foxglove.StatusLevel.Warning)
+
+    def _topic(self, channel: int) -> Optional[_Topic]:
+        return next((topic for topic in self._topics.values() if topic.id == channel), None)
+
+    def _look(self) -> None:
+        """Tell viewers which topics came and went."""
+        found = {name: kinds[0] for name, kinds in self.get_topic_names_and_types()
+                 if '/_' not in name  # hidden, by ROS 2's rule
+                 and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
+        for name in self._topics.keys() - found.keys():
+            self._topics.pop(name).close()
+        for name, kind in found.items():
+            known = self._topics.get(name)
+            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in found
+            if known is not None and (known.kind, known.video) == (kind, video):
+                continue
+            if kind in self._unknown:
+                continue
+            if known is not None:
+                self._topics.pop(name).close()
+            try:
+                self._topics[name] = _Topic(self, name, kind, video)
+            except LookupError as error:
+                self._unknown.add(kind)
+                self.get_logger().warning(f'{name} is not shown: {error}')
+
+
+class _Listener(ServerListener):
+    """What viewers want, handed over from the SDK's threads to the executor's."""
+
+    def __init__(self, node: BridgeNode) -> None:
+        self._node = node
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        self._node.do(self._node.look, channel.id, client.id)
+
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
+        self._node.do(self._node.look_away, channel.id, client.id)
+
+    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
+        self._node.do(self._node.advertise, client.id, channel.id, channel.topic,
+                      channel.encoding, channel.schema_name)
+
+    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
+        self._node.do(self._node.unadvertise, client.id, client_channel_id)
+
+    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
+        self._node.do(self._node.publish, client.id, client_channel_id, data)
+
+
+def fitting(node: Node, topic: str) -> QoSProfile:
+    """Return the best profile that all present publishers of a topic can be heard with."""
+    offered = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    reliable = bool(offered) and all(
+        qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+    latched = bool(offered) and all(
+        qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+    depth = sum(qos.depth for qos in offered) if latched else 0
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=max(10, min(depth, 1000)),
+        reliability=(ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+
+
+def main() -> None:
+    """Run until interrupted."""
+    rclpy.init()
+    executor = SingleThreadedExecutor()
+    node = BridgeNode(executor)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+
+
+if __name__ == '__main__':
+    main()

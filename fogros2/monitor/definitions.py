@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Message definitions as text, in the form that ROS 2 bags and Foxglove call ``ros2msg``.
+
+Made from what the message classes themselves tell, so they are right for whichever interfaces
+are installed, and need no ``.msg`` file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any
+
+_RULE = '=' * 80
+#: IDL's words, as message classes have them, in those of message files.
+_BASIC = {
+    'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64',
+    **{name: name for name in (
+        'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
+        'uint32', 'int64', 'uint64', 'string', 'wstring')},
+}
+_SEQUENCE = re.compile(r'sequence<(?P<item>.+?)(?:, (?P<bound>\d+))?>$')
+_ARRAY = re.compile(r'(?P<item>.+)\[(?P<size>\d+)\]$')
+_BOUNDED = re.compile(r'(?P<kind>w?string)<(?P<bound>\d+)>$')
+
+
+def message_class(name: str) -> Any:
+    """
+    Import a message class.
+
+    :param name: such as ``std_msgs/msg/String`` or ``std_msgs/String``.
+    :raises LookupError: it isn't installed here, or isn't a message.
+    """
+    parts = name.split('/')
+    package, kind = parts[0], parts[-1]
+    if len(parts) not in (2, 3) or len(parts) == 3 and parts[1] != 'msg':
+        raise LookupError(f"'{name}' is no name of a message")
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), kind)
+    except (ImportError, AttributeError) as error:
+        raise LookupError(f"'{name}' isn't installed here: {error}") from error
+
+
+def definition(name: str) -> str:
+    """
+    Return a message's fields, followed by those of all messages in it.
+
+    Sections are as ``ros2msg`` wants them: each after the first begins with a line of 80 equals
+    signs and ``MSG: package/Name``.
+
+    :param name: such as ``std_msgs/msg/String``.
+    :raises LookupError: it, or a message in it, isn't installed here.
+    """
+    waiting = [name]
+    seen: dict[str, str] = {}
+    while waiting:
+        this = waiting.pop(0)
+        short = _short(this)
+        if short in seen:
+            continue
+        lines = []
+        for field, kind in message_class(this).get_fields_and_field_types().items():
+            written, inner = _written(kind)
+            if '/' in inner:
+                waiting.append(inner)
+            lines.append(f'{written} {field}\n')
+        seen[short] = ''.join(lines)
+    (_, first), *others = seen.items()
+    return first + ''.join(f'{_RULE}\nMSG: {short}\n{body}' for short, body in others)
+
+
+def _short(name: str) -> str:
+    return name.replace('/msg/', '/')
+
+
+def _written(kind: str) -> tuple[str, str]:
+    """Return a field's type as message files write it, and the type of its items."""
+    for pattern, brackets in ((_SEQUENCE, '[<={bound}]'), (_ARRAY, '[{size}]')):
+        found = pattern.match(kind)
+        if found:
+            item, inner = _written(found['item'])
+            bounds = found.groupdict()
+            unbounded = pattern is _SEQUENCE and bounds['bound'] is None
+            return item + ('[]' if unbounded else brackets.format(**bounds)), inner
+    bounded = _BOUNDED.match(kind)
+    if bounded:
+        return f'{bounded["kind"]}<={bounded["bound"]}', bounded['kind']
+    if '/' in kind:
+        return _short(kind), kind
+    return _BASIC[kind], kind
