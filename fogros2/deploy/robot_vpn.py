@@ -126,7 +126,7 @@ class RobotVpn:
                         member.name, 'VPN peers', 0.0,
                         f'not told of a new machine yet, will be again: {error}', fatal=False))
             self._stop.wait(pause)
-            pause = min(2 * pause, 15.0)
+            pause = min(2 * pause, 5.0)
 
     def remove(self, name: str) -> None:
         """Forget a machine; the robot's interface is told unless it goes as well."""
