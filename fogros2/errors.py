@@ -42,6 +42,8 @@ class FogError(RuntimeError):
 
     #: Set by who was asked to make something: nothing was made, and there is nothing to look for.
     refused: bool = False
+    #: What of its own whoever raises this could not take away again: to be told beside it.
+    undo_failures: tuple[FogError, ...] = ()
 
     def __init__(self, message: str, hint: str = '') -> None:
         super().__init__(message)

@@ -45,8 +45,7 @@ class Choices:
             return spec
         with step(self._report, spec.name, 'choices') as detail:
             chosen = provider.resolve(spec)
-            detail += [f'{key} {value}' for key, value in sorted(chosen.options.items())
-                       if spec.options.get(key) != value]
+            detail += provider.choices(spec, chosen)
             price = self.price(chosen)
             if price is not None:
                 detail.append(plan.price(price))

@@ -24,6 +24,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineState
 from fogros2.provider import (
+    Provider,
     TAG_DEPENDENCIES,
     TAG_EXPIRES,
     TAG_LAUNCH,
@@ -109,7 +110,8 @@ class Creation:
             raise NameTaken(
                 f"the machine '{job.name}' of an earlier launch has another {', '.join(other)}",
                 f'give the machine another name=, or: ros2 fog delete {job.name}')
-        if job.spec.on_exit == 'stop' and machine.tags.get(TAG_ON_EXIT, 'stop') != 'stop':
+        if job.spec.on_exit == 'stop' and type(job.provider).adopt is Provider.adopt \
+                and machine.tags.get(TAG_ON_EXIT, 'stop') != 'stop':
             raise ConfigurationError(
                 f"the machine '{job.name}' was not made to be stopped and started",
                 f"keep it with on_exit='keep', or: ros2 fog delete {job.name}")
@@ -119,6 +121,7 @@ class Creation:
         job.reused = True
         job.undoing('end', self._end)
         self._claim(job.record.token)
+        job.provider.adopt(machine.id, job.spec, self._tags())
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             job.provider.start(machine.id)
 
@@ -139,9 +142,7 @@ class Creation:
             config['boot_timeout'] = job.timeouts.boot + job.timeouts.ssh
         dependencies = self._dependencies()
         tags = {
-            TAG_NAME: job.name, TAG_ROBOT: robot_name(), TAG_LAUNCH: job.launch.id,
-            TAG_EXPIRES: str(int(time.time() + job.spec.lifetime)),
-            TAG_ON_EXIT: job.spec.on_exit,
+            TAG_NAME: job.name, TAG_ROBOT: robot_name(), **self._tags(),
             **({TAG_DEPENDENCIES: dependencies} if dependencies else {}),
         }
         key = self._login_key() if job.provider.owned and job.provider.shell_kind == 'ssh' else ''
@@ -156,8 +157,16 @@ class Creation:
             self._asked = not error.refused
             # where there was no answer there may be a machine: only a look tells
             self._refused = isinstance(error, (ConfigurationError, PrerequisiteError))
+            for failure in error.undo_failures:
+                job.launch.undo_failed(job.name, 'undo', failure)
             raise
         job.save(machine_id=machine_id)
+
+    def _tags(self) -> dict[str, str]:
+        """Return the tags that change with the launch that has the machine."""
+        spec = self._job.spec
+        return {TAG_LAUNCH: self._job.launch.id, TAG_ON_EXIT: spec.on_exit,
+                TAG_EXPIRES: str(int(time.time() + spec.lifetime))}
 
     def _dependencies(self) -> str:
         """Return the hash by which an image is found that has what the machine will need."""

@@ -128,6 +128,7 @@ class Launch:
         with self._lock:
             if name not in self._providers:
                 self._providers[name] = provider(name)
+                self._providers[name].cancel = self.cancel
             return self._providers[name]
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
@@ -332,9 +333,15 @@ class Launch:
         try:
             undo()
         except FogError as error:
-            self.report(StepFailed(machine, name, time.monotonic() - begin, str(error)))
-            with self._lock:
-                self._failures.append(error)
+            self.undo_failed(machine, name, error, time.monotonic() - begin)
+
+    def undo_failed(
+        self, machine: str, name: str, error: FogError, seconds: float = 0.0,
+    ) -> None:
+        """Report and remember what could not be taken away."""
+        self.report(StepFailed(machine, name, seconds, str(error)))
+        with self._lock:
+            self._failures.append(error)
 
     def robot(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
         """Run commands on the robot, one after the other; return what the last one printed."""

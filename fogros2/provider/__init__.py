@@ -50,6 +50,9 @@ class Provider(abc.ABC):
     #: Command line that an agent runs as root every few seconds; once it exits with 0 the machine
     #: is about to be taken away, and what it printed says why and when. Empty: no such notice.
     notice: ClassVar[tuple[str, ...]] = ()
+    #: Set when the launch that this provider works for is to end: whoever asks for something on
+    #: the way up, and takes long, gives up with Cancelled. What begins later is the way down.
+    cancel: Optional[threading.Event] = None
 
     @classmethod
     def configured(cls) -> bool:
@@ -90,6 +93,12 @@ class Provider(abc.ABC):
         """
         return spec
 
+    def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
+        """Return in words, for people, what ``resolve`` has made of a spec."""
+        return [f'{key} {" or ".join(map(str, value)) if _is_list(value) else value}'
+                for key, value in sorted(chosen.options.items())
+                if asked.options.get(key) != value]
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return what a machine of a resolved spec will cost (US dollars), None if unknown."""
         return None
@@ -103,6 +112,21 @@ class Provider(abc.ABC):
 
         :raises ProviderError: refused; nothing is left behind then.
         """
+
+    def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
+        """
+        Let a machine that an earlier launch kept or stopped be this launch's.
+
+        Called before it is started or connected to. A provider whose machines say by themselves
+        until when they live, and how they end, writes that anew.
+
+        :param spec: this launch's; ``on_exit`` says how the machine ends from now on.
+        :param tags: those of the core's that are others by now.
+        """
+
+    def notice_for(self, machine: Machine) -> tuple[str, ...]:
+        """Return ``notice`` for a machine that can be taken away, () for one that isn't."""
+        return self.notice
 
     @abc.abstractmethod
     def describe(self, machine_id: str) -> Machine:
@@ -232,3 +256,7 @@ class Provider(abc.ABC):
         :raises Unsupported: the provider keeps none.
         """
         raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+
+
+def _is_list(value: object) -> bool:
+    return isinstance(value, (list, tuple))

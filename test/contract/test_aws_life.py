@@ -13,6 +13,7 @@ import gzip
 import json
 import re
 import threading
+import time
 import uuid
 
 import boto3
@@ -35,6 +36,7 @@ from fogros2.provider.aws import AWSProvider, iam, images, instances, user_data
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.testing.provider_contract import PUBLIC_KEY
+from fogros2.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures('moto_aws')
 
@@ -478,10 +480,136 @@ def test_a_refusal_is_one_line_with_a_hint_and_leaves_nothing(aws, operation, co
 def test_what_could_not_be_told_apart_is_undone_as_far_as_it_goes(aws):
     aws.refuse('RunInstances', 'InvalidParameterValue')
     aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
-    with pytest.raises(AwsError, match='as AWS said'):
+    with pytest.raises(AwsError, match='as AWS said') as caught:
         aws.provider.create(*ask())
     assert left()['groups'] == []
     assert len(left()['keys']) == 1
+    failure, = caught.value.undo_failures
+    assert str(failure).startswith(
+        "the login key of 'planner' in eu-central-1 may be left: deleting the login key")
+    assert 'ec2:DeleteKeyPair' in str(failure) and 'ros2 fog gc' in str(failure)
+    assert caught.value.refused
+
+
+def test_an_instance_that_may_be_left_is_looked_for_again(aws):
+    aws.refuse('RunInstances', 'InvalidParameterValue')
+    aws.refuse('DescribeInstances', None, 'UnauthorizedOperation')
+    with pytest.raises(AwsError) as caught:
+        aws.provider.create(*ask())
+    assert [str(failure).partition(' of ')[0] for failure in caught.value.undo_failures] == [
+        'the instance']
+    assert not caught.value.refused
+    assert left() == NOTHING
+
+
+def test_what_is_left_in_a_region_without_room_is_said_when_the_machine_is_up(aws):
+    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
+    aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
+    machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
+    machine = aws.provider.reachable(
+        machine_id, name='planner', timeout=20.0, cancel=threading.Event())
+    assert machine.note.startswith("the login key of 'planner' in eu-central-1 may be left")
+
+
+# -- cancelled ----------------------------------------------------------------------------------
+
+
+def cancelled_in(seconds: float) -> threading.Event:
+    """Return an event that is set a little later, as by a Ctrl-C."""
+    cancel = threading.Event()
+    timer = threading.Timer(seconds, cancel.set)
+    timer.daemon = True
+    timer.start()
+    return cancel
+
+
+THROTTLED = ['RequestLimitExceeded'] * 40
+
+
+@pytest.mark.parametrize('operation', [
+    'DescribeInstanceTypes', 'ImportKeyPair', 'RunInstances'])
+def test_the_end_of_a_launch_gets_through_a_throttled_call(aws, operation):
+    aws.refuse(operation, *THROTTLED)
+    spec, request = ask()
+    begin = time.monotonic()
+    with pytest.raises(Cancelled) as caught:
+        aws.provider.create(spec, dataclasses.replace(request, cancel=cancelled_in(0.5)))
+    assert time.monotonic() - begin < 3.0
+    assert caught.value.refused and not caught.value.undo_failures
+    assert left() == NOTHING
+    # and what was left of it makes nothing
+    sent = len(aws.sent)
+    aws.refusals.clear()
+    assert not [thread for thread in threading.enumerate()
+                if thread.name == 'fog-aws-call' and not thread.daemon]
+    wait_until(lambda: 'fog-aws-call' not in {t.name for t in threading.enumerate()},
+               timeout=25.0, what='the pauses of botocore to be over')
+    assert len(aws.sent) == sent and left() == NOTHING
+
+
+def test_the_end_of_a_launch_gets_through_choices_and_looks(aws):
+    machine_id = aws.provider.create(*ask())
+    aws.refuse('DescribeInstances', *THROTTLED)
+    begin = time.monotonic()
+    with pytest.raises(Cancelled):
+        aws.provider.reachable(
+            machine_id, name='planner', timeout=60.0, cancel=cancelled_in(0.3))
+    aws.refuse('DescribeInstanceTypes', *THROTTLED)
+    aws.provider.cancel = cancelled_in(0.3)
+    with pytest.raises(Cancelled):
+        aws.provider.resolve(ask(ec2_instance_type='cheapest')[0])
+    assert time.monotonic() - begin < 4.0
+    # from then on everything is the way down, and has its time
+    aws.refusals.clear()
+    aws.refuse('TerminateInstances', 'RequestLimitExceeded')
+    aws.provider.allow(machine_id, 22, ['198.51.100.7/32'])
+    aws.provider.destroy(machine_id)
+    assert left() == NOTHING
+
+
+def test_an_instance_that_is_being_made_when_the_launch_ends_is_known(aws):
+    """Its request was on its way; an answer that comes soon is the better one."""
+    spec, request = ask()
+    cancel = threading.Event()
+
+    def sent(event_name, **words):
+        if event_name.endswith('.RunInstances'):
+            cancel.set()
+
+    # after what looks whether the launch has ended
+    aws.account.client('ec2', HOME).meta.events.register_last('before-send', sent)
+    machine_id = aws.provider.create(spec, dataclasses.replace(request, cancel=cancel))
+    assert left()['instances'] == [machine_id.split('/')[1]]
+
+
+# -- taken over ---------------------------------------------------------------------------------
+
+
+def test_a_kept_machine_lives_and_ends_as_the_launch_that_has_it_says(aws):
+    spec, request = ask(on_exit='stop')
+    machine_id = aws.provider.create(spec, request)
+    instance = machine_id.split('/')[1]
+
+    def behaviour():
+        return ec2().describe_instance_attribute(
+            InstanceId=instance, Attribute='instanceInitiatedShutdownBehavior')[
+                'InstanceInitiatedShutdownBehavior']['Value']
+
+    assert behaviour() == 'stop'
+    tags = {'fogros2-expires': '2000000000', 'fogros2-on-exit': 'delete'}
+    aws.provider.adopt(machine_id, dataclasses.replace(spec, on_exit='delete'), tags)
+    assert behaviour() == 'terminate'
+    assert tags.items() <= aws.provider.describe(machine_id).tags.items()
+    aws.provider.stop(machine_id)
+    aws.provider.adopt(machine_id, spec, {'fogros2-on-exit': 'stop'})
+    assert behaviour() == 'stop'
+
+
+def test_only_a_spot_machine_is_asked_for_its_notice(aws):
+    plain = aws.provider.describe(aws.provider.create(*ask()))
+    spot = aws.provider.describe(aws.provider.create(*ask('spot', spot=True)))
+    assert aws.provider.notice_for(plain) == ()
+    assert aws.provider.notice_for(spot) == AWSProvider.notice
 
 
 def test_requests_that_aws_throttles_are_made_again(aws):
@@ -535,7 +663,7 @@ def test_a_quota_leads_to_the_next_type_at_once(aws):
 
 def test_a_type_to_go_on_with_keeps_to_the_cap_and_has_its_own_price(aws, monkeypatch):
     prices = {'t3.medium': Decimal('0.04'), 't3.xlarge': Decimal('0.17')}
-    monkeypatch.setattr(aws.provider, '_price', lambda region, kind, spot: prices.get(kind))
+    monkeypatch.setattr(aws.provider, '_price', lambda region, kind, *more: prices.get(kind))
     aws.refuse('RunInstances', 'VcpuLimitExceeded', 'VcpuLimitExceeded')
     # the price of t3.large nobody knows, that of t3.xlarge is above the cap
     with pytest.raises(AwsError):
@@ -648,7 +776,7 @@ def test_an_attempt_that_was_cut_short_is_taken_up_where_it_was(aws):
     spec, request = ask()
     aws.refuse('RunInstances', 'InternalError')
     aws.refuse('DeleteKeyPair', 'InternalError')
-    aws.refuse('DescribeSecurityGroups', 'InternalError')
+    aws.refuse('DeleteSecurityGroup', 'InternalError')
     with pytest.raises(AwsError):
         aws.provider.create(spec, request)
     assert len(left()['groups']) == len(left()['keys']) == 1
@@ -690,6 +818,7 @@ def test_the_policy_has_every_call_and_every_action_of_it_is_used(aws):
     provider.allow(machine_id, 22, [])
     provider.pin(machine_id, KEY)
     provider.stop(machine_id)
+    provider.adopt(machine_id, ask()[0], {})
     provider.start(machine_id)
     image = provider.bake(machine_id, 'planner', 'abcd')
     list(provider.images())

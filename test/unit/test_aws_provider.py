@@ -8,6 +8,7 @@ import datetime
 from decimal import Decimal
 import gzip
 import http.server
+import ipaddress
 import json
 import os
 from pathlib import Path
@@ -271,6 +272,45 @@ def test_the_robots_address_is_what_aws_sees_and_asked_once_for_all_machines(ech
     address = network.RobotAddress()
     assert address() == address() == '198.51.100.7/32'
     assert not said
+
+
+def test_a_robot_with_ipv6_is_let_in_by_that_too(echo, monkeypatch):
+    _, said = echo
+    monkeypatch.setattr(network, 'own_ipv6', lambda: '2001:db8::7/128')
+    said += [(200, '198.51.100.7\n'), (503, '')]
+    address = network.RobotAddress()
+    assert address.with_ipv6([address()]) == ['198.51.100.7/32', '2001:db8::7/128']
+    # what somebody has named is that alone, and nobody is nobody
+    assert address.with_ipv6(['198.51.100.0/24']) == ['198.51.100.0/24']
+    assert address.with_ipv6([]) == []
+    # and one that has nothing else is known by that
+    assert network.RobotAddress()() == '2001:db8::7/128'
+
+
+@pytest.mark.parametrize('address, known', [
+    ('2606:4700::1', '2606:4700::1/128'), ('fd00::1', ''), ('2001:db8::1', '')])
+def test_only_an_ipv6_address_that_others_see_is_one(monkeypatch, address, known):
+    class Probe(socket.socket):
+        def connect(self, far):
+            assert ipaddress.ip_address(far[0]).is_global
+
+        def getsockname(self):
+            return address, 40000, 0, 0
+
+    monkeypatch.setattr(network.socket, 'socket', Probe)
+    assert network.own_ipv6() == known
+
+
+def test_what_was_chosen_is_said_in_words():
+    asked = spec(region='nearest', ec2_instance_type='cheapest')
+    chosen = spec(region='eu-central-1', ec2_instance_type='t3a.medium')
+    words = AWSProvider.choices
+    assert words(None, asked, chosen) == ['t3a.medium in eu-central-1']
+    chosen = spec(region='eu-central-1', ec2_instance_type='t3a.medium',
+                  instance_types=['t3.medium', 'm7a.large'], regions=('eu-west-3', 'eu-west-2'))
+    assert ', '.join(words(None, asked, chosen)) == (
+        't3a.medium in eu-central-1, without room there t3.medium or m7a.large, '
+        'in eu-west-3 or eu-west-2')
 
 
 @pytest.mark.parametrize('answer', [(200, '<html>log in to this hotel</html>'), (503, '')])

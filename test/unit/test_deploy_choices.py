@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from decimal import Decimal
 import threading
+import time
 
 import pytest
 
@@ -16,7 +17,7 @@ from fogros2.deploy.job import Job
 from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.errors import NameTaken, ProviderError
 from fogros2.model import MachineSpec, VpnInterface
-from fogros2.report import StepDone, StepStarted
+from fogros2.report import StepDone, StepFailed, StepStarted
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider
 
@@ -79,6 +80,30 @@ def test_a_choice_that_nothing_fits_ends_the_launch_before_anything_is_created(
     assert 'create' not in provider.calls
 
 
+def test_several_choices_are_told_in_words(provider):
+    chosen = dataclasses.replace(SPEC, options={'size': 'small', 'others': ['large', 'huge']})
+    assert provider.choices(SPEC, chosen) == ['others large or huge', 'size small']
+
+
+def test_what_a_creation_could_not_take_away_is_reported_beside_its_error(
+        launch, provider, events):
+    error = ProviderError('no room')
+    error.refused = True
+    error.undo_failures = (ProviderError('the key is left'),)
+    provider.failures['create'] = error
+    mine = Job(launch, SPEC)
+    with pytest.raises(ProviderError, match='no room'):
+        Creation(mine).run()
+    mine.undo.close()
+    assert [event.reason for event in events if isinstance(event, StepFailed)] == [
+        'the key is left', 'no room']
+    assert [str(failure) for failure in launch.down()] == ['the key is left']
+
+
+def test_who_asks_for_the_choices_knows_when_the_launch_ends(launch, provider):
+    assert launch.provider('fake').cancel is launch.cancel
+
+
 def keep(launch, spec):
     mine = create(launch, dataclasses.replace(spec, on_exit='keep'))
     mine.failed = False
@@ -107,6 +132,27 @@ def test_a_kept_machine_is_not_what_somebody_asks_for_by_its_chosen_value(
     again = Launch(store=Store(tmp_path), environment={})
     with pytest.raises(NameTaken, match='another size'):
         create(again, MachineSpec('planner', 'fake', {'size': 'small'}))
+
+
+def test_a_kept_machine_is_told_whose_it_is_before_it_is_started(
+        launch, provider, tmp_path, monkeypatch):
+    keep(launch, SPEC)
+    adopted = []
+    monkeypatch.setattr(
+        provider, 'adopt', lambda *words: adopted.append((list(provider.calls), *words)))
+    again = Launch(store=Store(tmp_path), environment={})
+    spec = dataclasses.replace(SPEC, on_exit='stop', lifetime=60.0)
+    provider.calls.clear()
+    # the kept one can be stopped, since who has it says so
+    monkeypatch.setattr(FakeProvider, 'adopt', provider.adopt)
+    mine = create(again, spec)
+    (calls, machine_id, told, tags), = adopted
+    assert calls == ['describe'] and machine_id == mine.machine_id
+    assert told.on_exit == tags['fogros2-on-exit'] == 'stop'
+    assert tags['fogros2-launch'] == again.id
+    assert 0 < int(tags['fogros2-expires']) - time.time() <= 60
+    mine.failed = False
+    mine.undo.close()
 
 
 def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch):

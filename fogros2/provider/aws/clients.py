@@ -3,21 +3,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
+import copy
 import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws.failures import NO_ROOM, translated
+from fogros2.provider.aws import patience
+from fogros2.provider.aws.failures import translated
+
+T = TypeVar('T')
 
 #: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
 ATTEMPTS = 8
-#: The same, where no answer comes at all.
-UNANSWERED = 2
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
 #: Seconds for which EC2 may not know an instance that it has just made.
 SETTLING = 60.0
@@ -55,24 +57,6 @@ def usual() -> Account:
         return _accounts[settings]
 
 
-def _retry_less(
-    response: Any, attempts: int, caught_exception: Optional[BaseException], **_: Any,
-) -> None:
-    """
-    Keep botocore from asking again where that doesn't help; called before its own decision.
-
-    Throttling takes patience; but without a way to AWS a user would wait for minutes to hear of
-    it. And EC2 says with status 500, which botocore takes for a fault that passes in a moment,
-    that it has no machine left: the next zone may have.
-    """
-    if caught_exception is not None and attempts >= UNANSWERED:
-        raise caught_exception
-    if response is not None:
-        http, parsed = response
-        if http.status_code >= 500 and parsed.get('Error', {}).get('Code') in NO_ROOM:
-            http.status_code = 400
-
-
 class Account:
     """
     An AWS account as boto3 finds it (variables, files, roles); thread-safe.
@@ -89,11 +73,30 @@ class Account:
         self._clients: dict[tuple[str, str, bool], Any] = {}
         # making clients of one session in several threads isn't safe; using them is
         self._lock = threading.RLock()
+        self._cancel: Optional[threading.Event] = None
+
+    def until(self, cancel: Optional[threading.Event]) -> Account:
+        """
+        Return this account for one who makes calls for as long as nobody cancels.
+
+        Its calls end with Cancelled then; nothing on a way down may be done by it.
+        """
+        self.session()
+        other = copy.copy(self)
+        other._cancel = cancel
+        return other
 
     def just_made(self, instance: str) -> bool:
         """Return whether EC2 may not know an instance yet that this process has made."""
         made = self.made.get(instance)
         return made is not None and time.monotonic() - made < SETTLING
+
+    def apart(self) -> Account:
+        """Return this account with clients of its own, which no other's throttling slows down."""
+        self.session()
+        other = copy.copy(self)
+        other._clients = {}
+        return other
 
     def session(self) -> Any:
         """
@@ -150,8 +153,7 @@ class Account:
                     user_agent_extra='fogros2', max_pool_connections=50)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
-                own = found.meta.service_model.service_id.hyphenize()
-                found.meta.events.register_first(f'needs-retry.{own}', _retry_less)
+                patience.teach(found)
                 self._clients[(service, region, hasty)] = found
             return found
 
@@ -166,22 +168,32 @@ class Account:
         :param what: completes '... in eu-central-1 failed'.
         :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
         """
-        client = self.client(service, region, hasty=hasty)
-        with translated(what, region, decode=lambda message: self._decode(region, message)):
+        def ask(client: Any) -> Mapping[str, Any]:
             answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
-        return answer
+            return answer
+
+        return self._ask(ask, service, region, what, hasty)
 
     def pages(
         self, service: str, region: str, operation: str, key: str, what: str,
         **parameters: Any,
     ) -> Iterator[Mapping[str, Any]]:
         """Yield what all pages of an answer have under ``key``."""
-        client = self.client(service, region)
-        with translated(what, region, decode=lambda message: self._decode(region, message)):
-            # all of it within the block: a page is asked for when the one before is used up
-            found = [entry for page in client.get_paginator(operation).paginate(**parameters)
-                     for entry in page[key]]
-        yield from found
+        def ask(client: Any) -> list[Mapping[str, Any]]:
+            return [entry for page in client.get_paginator(operation).paginate(**parameters)
+                    for entry in page[key]]
+
+        yield from self._ask(ask, service, region, what)
+
+    def _ask(
+        self, ask: Callable[[Any], T], service: str, region: str, what: str, hasty: bool = False,
+    ) -> T:
+        def asked() -> T:
+            client = self.client(service, region, hasty=hasty)
+            with translated(what, region, decode=lambda message: self._decode(region, message)):
+                return ask(client)
+
+        return patience.unless(self._cancel, asked, what)
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

@@ -15,7 +15,7 @@ from decimal import Decimal
 import time
 from typing import Any, Optional
 
-from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
+from fogros2.errors import ConfigurationError, FogError, NameTaken, ProviderError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws import ending, images, instances, network
@@ -43,9 +43,11 @@ class Creation:
 
     def __init__(
         self, account: Account, spec: MachineSpec, request: CreateRequest, options: Options, *,
-        robot_address: Callable[[], str], price: Price,
+        robot_address: Callable[[], list[str]], price: Price,
     ) -> None:
-        self.account = account
+        #: For the way back, whatever AWS throttles on the way there, which ends with the launch.
+        self._lasting = account.apart()
+        self.account = account.until(request.cancel)
         self.spec = spec
         self.request = request
         self.options = options
@@ -55,6 +57,8 @@ class Creation:
         self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
         #: Whether an instance may have been made that nobody has told us of.
         self._unsure = False
+        #: What could not be taken away again.
+        self.undo_failures: list[FogError] = []
         self._images: dict[tuple[str, str, bool], Mapping[str, Any]] = {}
 
     def run(self, regions: list[str], types: list[str]) -> MachineId:
@@ -68,6 +72,7 @@ class Creation:
             return self._in_regions(regions, types)
         except FogError as error:
             error.refused = not self._unsure
+            error.undo_failures = tuple(self.undo_failures)
             raise
 
     def _in_regions(self, regions: list[str], types: list[str]) -> MachineId:
@@ -125,7 +130,7 @@ class Creation:
         return self._prices[region, kind]
 
     def _sources(self) -> list[str]:
-        return list(self.options.ssh_from) or [self._robot_address()]
+        return list(self.options.ssh_from) or self._robot_address()
 
     def _image(self, region: str, kind: Kind) -> Mapping[str, Any]:
         """Return a kind's image, asked once for all kinds that take the same."""
@@ -145,25 +150,45 @@ class Creation:
             name=self.spec.name, user=self.options.user,
             authorized_key=self.request.authorized_key, host_key=host_key,
             agent_config=self.request.agent_config)
+        groups: list[str] = []
         with contextlib.ExitStack() as undo:
             # in this order: an undo of what was not made yet finds nothing, and that is fine
-            undo.callback(_attempt, lambda: ending.drop_groups(
-                self.account, region, self.attempt, timeout=PATIENCE))
-            undo.callback(_attempt, lambda: ending.drop_key(self.account, region, self.attempt))
+            undo.callback(self._undo, region, 'the security group', lambda: ending.drop_groups(
+                self._lasting, region, self.attempt, known=groups, timeout=PATIENCE))
+            undo.callback(self._undo, region, 'the login key', lambda: ending.drop_key(
+                self._lasting, region, self.attempt))
             # an answer that got lost may have been a yes
-            undo.callback(_attempt, lambda: ending.end_instances(
-                self.account, region, self.attempt))
+            undo.callback(self._undo, region, 'the instance', self._end_instances, region)
             with ThreadPoolExecutor(1, 'fog-aws') as pool:
                 made = {**tags, TAG_MADE: str(int(time.time()))}
                 importing = pool.submit(self._import_key, region, made)
-                group = network.create_group(
+                groups.append(network.create_group(
                     self.account, region, attempt=self.attempt, name=self.spec.name, vpc=vpc,
-                    tags=made, vpn_port=self.request.vpn_port, sources=sources)
+                    tags=made))
+                network.open_group(
+                    self.account, region, groups[0], name=self.spec.name,
+                    vpn_port=self.request.vpn_port, sources=sources)
                 importing.result()
-            instance = self._first_with_room(region, chosen, group, {
+            instance = self._first_with_room(region, chosen, groups[0], {
                 **tags, instances.TAG_HOST_KEY: host_key.public}, data)
             undo.pop_all()
             return MachineId(region, instance, self.attempt)
+
+    def _end_instances(self, region: str) -> None:
+        try:
+            ending.end_instances(self._lasting, region, self.attempt)
+        except FogError:
+            self._unsure = True  # who asked for the machine may find it, and end it
+            raise
+
+    def _undo(self, region: str, what: str, undo: Callable[..., None], *words: str) -> None:
+        """Undo, and go on undoing where that fails: the first error is the one to raise."""
+        try:
+            undo(*words)
+        except FogError as error:
+            self.undo_failures.append(ProviderError(
+                f"{what} of '{self.spec.name}' in {region} may be left: {error.args[0]}",
+                'ros2 fog gc deletes it, a quarter of an hour after it was made'))
 
     def _first_with_room(
         self, region: str, chosen: list[tuple[Kind, Mapping[str, Any]]], group: str,
@@ -175,8 +200,6 @@ class Creation:
         for place in self._places(region, list(image_of)):
             if place.kind in full:
                 continue
-            if self.request.cancel is not None and self.request.cancel.is_set():
-                raise Cancelled(f"creating '{self.spec.name}'")
             price = self._price(region, place.kind)
             if self._too_dear(price):
                 continue
@@ -233,12 +256,6 @@ class Creation:
         except AwsError as error:
             if error.code != 'InvalidKeyPair.Duplicate':
                 raise
-
-
-def _attempt(undo: Callable[[], None]) -> None:
-    """Undo, and go on undoing where that fails: the first error is the one to tell."""
-    with contextlib.suppress(FogError):
-        undo()
 
 
 def _done(future: Optional[Future[str]]) -> str:

@@ -105,11 +105,18 @@ def drop_key(account: Account, region: str, attempt: str) -> None:
                   KeyName=instances.own_name(attempt))
 
 
-def drop_groups(account: Account, region: str, attempt: str, *, timeout: float = PATIENCE) -> None:
-    """Delete the group of an attempt, as soon as nothing uses it; there may be none."""
-    found = network.find_groups(account, region, attempt)
-    network.delete_groups(account, region, [str(group['GroupId']) for group in found],
-                          timeout=timeout)
+def drop_groups(
+    account: Account, region: str, attempt: str, *, known: Iterable[str] = (),
+    timeout: float = PATIENCE,
+) -> None:
+    """
+    Delete the group of an attempt, as soon as nothing uses it; there may be none.
+
+    :param known: its id, which EC2 may not tell of yet where it was just made; () to look for it.
+    """
+    groups = list(known) or [
+        str(group['GroupId']) for group in network.find_groups(account, region, attempt)]
+    network.delete_groups(account, region, groups, timeout=timeout)
 
 
 def end_instances(account: Account, region: str, attempt: str) -> None:

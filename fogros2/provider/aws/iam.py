@@ -41,6 +41,7 @@ CHANGE = (
     'ec2:AuthorizeSecurityGroupIngress',
     'ec2:DeleteSecurityGroup',
     'ec2:DeleteVolume',
+    'ec2:ModifyInstanceAttribute',
     'ec2:ReleaseAddress',
     'ec2:RevokeSecurityGroupIngress',
     'ec2:StartInstances',

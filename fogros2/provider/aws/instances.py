@@ -41,6 +41,8 @@ STATES = {
 ALIVE = ('pending', 'running', 'stopping', 'stopped')
 #: How EC2 says when an instance was stopped.
 _STOPPED = re.compile(r'\((\d{4}-\d\d-\d\d \d\d:\d\d:\d\d) (?:GMT|UTC)\)')
+#: After the type of a spot instance, for people to read.
+_SPOT = ' spot'
 _ID = re.compile(r'aws:([a-z0-9-]+)/(i-[0-9a-f]+)/([0-9a-f]{16})')
 
 
@@ -149,7 +151,7 @@ def run_request(
         'KeyName': own_name(tags[TAG_ATTEMPT]),
         'UserData': user_data,
         # EC2's default is to keep a machine that shuts itself down, and to bill its disk
-        'InstanceInitiatedShutdownBehavior': 'stop' if spec.on_exit == 'stop' else 'terminate',
+        'InstanceInitiatedShutdownBehavior': at_shutdown(spec),
         'MetadataOptions': {'HttpTokens': 'required', 'HttpEndpoint': 'enabled',
                             'HttpPutResponseHopLimit': 1},
         'BlockDeviceMappings': [{'DeviceName': device, 'Ebs': {
@@ -174,6 +176,16 @@ def run_request(
             'SpotInstanceType': 'one-time', 'InstanceInterruptionBehavior': 'terminate',
             **({'MaxPrice': str(options.max_price)} if options.max_price is not None else {})}}
     return words
+
+
+def at_shutdown(spec: MachineSpec) -> str:
+    """Return what becomes of an instance that shuts itself down, in EC2's word."""
+    return 'stop' if spec.on_exit == 'stop' else 'terminate'
+
+
+def is_spot(machine: Machine) -> bool:
+    """Return whether AWS may take a machine back."""
+    return machine.kind.endswith(_SPOT)
 
 
 def _root_size(image: Mapping[str, Any], device: str) -> int:
@@ -206,7 +218,7 @@ def machine_of(region: str, instance: Mapping[str, Any]) -> Machine:
         vpn_host=public if state is MachineState.RUNNING else '',
         inner_network=f'aws:{instance["VpcId"]}' if instance.get('VpcId') else '',
         inner_host=str(instance.get('PrivateIpAddress') or ''), place=region,
-        kind=f'{kind} spot' if instance.get('InstanceLifecycle') == 'spot' else kind,
+        kind=f'{kind}{_SPOT}' if instance.get('InstanceLifecycle') == 'spot' else kind,
         tags={**tags, TAG_IMAGE: str(instance.get('ImageId', ''))}, end_command=END_COMMAND,
         cost_per_hour=_price(tags.get(TAG_PRICE, '')),
         stopped=_stopped(instance) if state is MachineState.STOPPED else None)

@@ -9,8 +9,10 @@ another's is still needed, and it can be deleted with its machine whatever the o
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+import contextlib
 import ipaddress
 import os
+import socket
 import threading
 import time
 from typing import Any
@@ -30,6 +32,8 @@ CHECKIP, CHECKIP_VARIABLE = 'https://checkip.amazonaws.com', 'FOGROS2_AWS_CHECKI
 #: Seconds for which an address is taken as it is, so that machines of one launch ask once.
 ADDRESS_AGE = 5.0
 SSH = 22
+#: An address of AWS's, and any port.
+FAR_IPV6 = ('2600:1f18::1', 22)
 #: Whom WireGuard's port is open to: robots roam, machines dial each other, and it answers nobody
 #: whose key it doesn't know.
 ANYONE = {'IpRanges': [{'CidrIp': '0.0.0.0/0'}], 'Ipv6Ranges': [{'CidrIpv6': '::/0'}]}
@@ -60,6 +64,12 @@ class RobotAddress:
                 self._known = (address, url, time.monotonic())
             return address
 
+    def with_ipv6(self, networks: Iterable[str]) -> list[str]:
+        """Return networks, and where this computer was found among them its IPv6 address too."""
+        named = list(networks)
+        own = own_ipv6() if self._known[0] in named else ''
+        return [*named, *([own] if own else [])]
+
     def _ask(self, url: str) -> str:
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
@@ -67,10 +77,23 @@ class RobotAddress:
                 said = answer.read(100).decode('ascii', 'replace').strip()
             return cidr(str(ipaddress.ip_address(said)))
         except OSError as error:
+            own = own_ipv6()
+            if own:
+                return own  # a computer without IPv4 reaches nobody who has that alone
             raise ProviderError(
                 f"{url} does not tell this robot's public address: {error}", hint) from error
         except ValueError as error:
             raise ProviderError(f"{url} told no address but '{said[:40]}'", hint) from error
+
+
+def own_ipv6() -> str:
+    """Return the address (CIDR) of this computer's IPv6 connections, '' without; sends nothing."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+        probe.connect(FAR_IPV6)  # the system chooses a way, and the address that goes with it
+        address = ipaddress.IPv6Address(probe.getsockname()[0])
+        if address.is_global:
+            return f'{address}/128'
+    return ''
 
 
 def rule(protocol: str, port: int, sources: Iterable[str]) -> dict[str, Any]:
@@ -94,17 +117,16 @@ def sources_of(group: Mapping[str, Any], port: int) -> set[str]:
 
 def create_group(
     account: Account, region: str, *, attempt: str, name: str, vpc: str,
-    tags: Mapping[str, str], vpn_port: int, sources: Sequence[str],
+    tags: Mapping[str, str],
 ) -> str:
     """
     Make a machine's security group and return its id; one of an earlier attempt is taken on.
 
     :param vpc: id; '' for the default VPC.
-    :param sources: networks that reach its SSH port.
     """
     place: dict[str, Any] = {'VpcId': vpc} if vpc else {}
     try:
-        group = str(account.call(
+        return str(account.call(
             'ec2', region, 'create_security_group', f"making the security group of '{name}'",
             GroupName=own_name(attempt), Description=f'FogROS2 machine {name}', **place,
             TagSpecifications=[{'ResourceType': 'security-group', 'Tags': tag_list(tags)}],
@@ -112,7 +134,18 @@ def create_group(
     except AwsError as error:
         if error.code != 'InvalidGroup.Duplicate':
             raise
-        group = str(find_groups(account, region, attempt)[0]['GroupId'])
+    return str(find_groups(account, region, attempt)[0]['GroupId'])
+
+
+def open_group(
+    account: Account, region: str, group: str, *, name: str, vpn_port: int,
+    sources: Sequence[str],
+) -> None:
+    """
+    Open the ports of a new group: the VPN's, and that of SSH for those who may log in.
+
+    :param sources: networks that reach its SSH port.
+    """
     vpn = {'IpProtocol': 'udp', 'FromPort': vpn_port, 'ToPort': vpn_port, **ANYONE}
     try:
         account.call(
@@ -121,9 +154,7 @@ def create_group(
             IpPermissions=[vpn, *([rule('tcp', SSH, sources)] if sources else [])])
     except AwsError as error:
         if error.code != 'InvalidPermission.Duplicate':
-            delete_groups(account, region, [group])
             raise
-    return group
 
 
 def find_groups(account: Account, region: str, attempt: str) -> list[Mapping[str, Any]]:

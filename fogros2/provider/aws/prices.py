@@ -16,6 +16,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import ProviderError, StoreError
+from fogros2.provider.aws import patience
 from fogros2.provider.aws.clients import usual
 from fogros2.provider.aws.failures import translated
 from fogros2.provider.aws.regions import distance_km, REGIONS
@@ -79,16 +80,19 @@ class Market:
     :param cache: folder of what AWS said before, None for the one below the state folder.
     :param clock: seconds since the epoch.
     :param refresh: ask anew, whatever the cache has.
+    :param cancel: nobody waits for an answer any more once it is set.
     """
 
     def __init__(
         self, clients: Optional[Clients] = None, *, cache: Optional[Path] = None,
         clock: Callable[[], float] = time.time, refresh: bool = False,
+        cancel: Optional[threading.Event] = None,
     ) -> None:
         self._clients = clients or usual().client
         self._cache = cache
         self._clock = clock
         self._refresh = refresh
+        self._cancel = cancel
         self._known: dict[str, Any] = {}
         self._locks: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -191,10 +195,13 @@ class Market:
                     prices.setdefault(name, {})[zone] = Decimal(entry['SpotPrice'])
         return prices
 
-    def _pages(self, service: str, region: str, operation: str, **arguments: Any) -> Iterator[Any]:
-        with translated(_WORDS[operation], region):
-            api = self._clients(service, region)
-            yield from api.get_paginator(operation).paginate(**arguments)
+    def _pages(self, service: str, region: str, operation: str, **arguments: Any) -> list[Any]:
+        def ask() -> list[Any]:
+            with translated(_WORDS[operation], region):
+                api = self._clients(service, region)
+                return list(api.get_paginator(operation).paginate(**arguments))
+
+        return patience.unless(self._cancel, ask, _WORDS[operation])
 
     # -- what is kept ---------------------------------------------------------------------
 

@@ -22,7 +22,15 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider
-from fogros2.provider.aws import clients, ending, images, instances, network, user_data
+from fogros2.provider.aws import (
+    clients,
+    ending,
+    images,
+    instances,
+    network,
+    patience,
+    user_data,
+)
 from fogros2.provider.aws import regions as places
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.creation import Creation
@@ -84,6 +92,8 @@ class AWSProvider(Provider):
         self._account = account or clients.usual()
         self._robot_address = _ROBOT_ADDRESS
         self._regions: tuple[str, ...] = ()
+        #: What people should know of an instance when it is up.
+        self._notes: dict[str, str] = {}
 
     # -- before anything is made ----------------------------------------------------------------
 
@@ -111,6 +121,9 @@ class AWSProvider(Provider):
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """Choose the region and the type, and refuse what costs more than ``max_price``."""
+        return self._resolved(spec, self.cancel)
+
+    def _resolved(self, spec: MachineSpec, cancel: Optional[threading.Event]) -> MachineSpec:
         from fogros2.provider.aws import choices
         from fogros2.provider.aws.prices import Market
         options = check_spec(spec)
@@ -121,7 +134,7 @@ class AWSProvider(Provider):
             if not options.regions and not options.ami_image:
                 chosen['regions'] = neighbours(region)
         kind = options.ec2_instance_type
-        market = Market(self._account.client)
+        market = Market(self._account.client, cancel=cancel)
         if options.chooses_type:
             wants = choices.wants(
                 arch=options.arch or None, min_cpu=int(options.min_cpu) or None,
@@ -144,20 +157,32 @@ class AWSProvider(Provider):
         return dataclasses.replace(spec, options={
             **spec.options, **chosen, 'region': region, 'ec2_instance_type': kind})
 
+    def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
+        """Return the type and the region, and where the launch goes on if there is no room."""
+        options = Options.parse(chosen.options)
+        kinds = [kind for kind in options.instance_types if kind != options.ec2_instance_type]
+        more = [' or '.join(kinds), *([f'in {" or ".join(options.regions)}']
+                                      if options.regions else [])]
+        return [f'{options.ec2_instance_type} in {options.region}',
+                *([f'without room there {", ".join(filter(None, more))}'] if any(more) else [])]
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine (US dollars an hour); its disk and traffic come on top."""
         options = Options.parse(spec.options)
         region = self._region(options)
         if region == NEAREST or options.chooses_type:
             return None
-        return self._price(region, options.ec2_instance_type or DEFAULT_TYPE, options.spot)
+        return self._price(region, options.ec2_instance_type or DEFAULT_TYPE, options.spot,
+                           self.cancel)
 
-    def _price(self, region: str, kind: str, spot: bool) -> Optional[Decimal]:
+    def _price(
+        self, region: str, kind: str, spot: bool, cancel: Optional[threading.Event] = None,
+    ) -> Optional[Decimal]:
         from fogros2.provider.aws import choices
         from fogros2.provider.aws.prices import Market
         with contextlib.suppress(FogError):
             return choices.price_of(
-                region, kind, spot=spot, market=Market(self._hasty))
+                region, kind, spot=spot, market=Market(self._hasty, cancel=cancel))
         return None
 
     def _hasty(self, service: str, region: str) -> Any:
@@ -167,23 +192,42 @@ class AWSProvider(Provider):
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Ask for an instance where there is room for one; nothing is left of a failure."""
-        spec = self._chosen(spec)
+        spec = self._chosen(spec, request.cancel)
         options = check_spec(spec)
         creation = Creation(
-            self._account, spec, request, options, robot_address=self._robot_address,
-            price=lambda region, kind: self._price(region, kind, options.spot))
+            self._account, spec, request, options,
+            robot_address=lambda: self._sources(request.cancel),
+            price=lambda region, kind: self._price(region, kind, options.spot, request.cancel))
         machine = creation.run(
             list(dict.fromkeys([self._region(options), *options.regions])),
             list(dict.fromkeys([options.ec2_instance_type or DEFAULT_TYPE,
                                 *options.instance_types])))
         self._account.made[machine.instance] = time.monotonic()
+        if creation.undo_failures:
+            self._notes[machine.instance] = '; '.join(map(str, creation.undo_failures))
         return str(machine)
 
-    def _chosen(self, spec: MachineSpec) -> MachineSpec:
+    def _chosen(self, spec: MachineSpec, cancel: Optional[threading.Event]) -> MachineSpec:
         """Return a spec with its choices made, as ``resolve`` has done for a launch."""
         options = check_spec(spec)
         unresolved = options.chooses_type or self._region(options) == NEAREST
-        return self.resolve(spec) if unresolved else spec
+        return self._resolved(spec, cancel) if unresolved else spec
+
+    def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
+        """Write tags anew, and whether the machine stops or ends when it shuts itself down."""
+        machine = MachineId.parse(machine_id)
+        account = self._rising()
+        account.call('ec2', machine.region, 'create_tags', f'taking {machine.instance} over',
+                     Resources=[machine.instance], Tags=instances.tag_list(tags))
+        account.call('ec2', machine.region, 'modify_instance_attribute',
+                     f'saying how {machine.instance} ends', InstanceId=machine.instance,
+                     Attribute='instanceInitiatedShutdownBehavior',
+                     Value=instances.at_shutdown(spec))
+
+    def _rising(self) -> Account:
+        """Return the account for a call on a launch's way up, which ends with the launch."""
+        ending = self.cancel is None or self.cancel.is_set()
+        return self._account if ending else self._account.until(self.cancel)
 
     def describe(self, machine_id: str) -> Machine:
         """Return what EC2 knows of an instance now."""
@@ -195,14 +239,16 @@ class AWSProvider(Provider):
             raise MachineNotFound(f'{machine.instance} in {machine.region} was terminated')
         return dataclasses.replace(instances.machine_of(machine.region, found), id=machine_id)
 
-    def _look(self, machine: MachineId) -> Optional[Mapping[str, Any]]:
+    def _look(
+        self, machine: MachineId, account: Optional[Account] = None,
+    ) -> Optional[Mapping[str, Any]]:
         """
         Return an instance as EC2 describes it, None for one so new that it isn't known yet.
 
         :raises MachineNotFound: it isn't known (any more).
         """
         try:
-            found = instances.instances_in(self._account.call(
+            found = instances.instances_in((account or self._account).call(
                 'ec2', machine.region, 'describe_instances', f'looking for {machine.instance}',
                 InstanceIds=[machine.instance])['Reservations'])
         except AwsError as error:
@@ -220,9 +266,10 @@ class AWSProvider(Provider):
     ) -> Machine:
         """Wait until an instance runs and has an address; EC2 is asked ever less often."""
         machine = MachineId.parse(machine_id)
+        account = self._account.until(cancel)
 
         def look() -> Optional[Machine]:
-            instance = self._look(machine)
+            instance = self._look(machine, account)
             if instance is None:
                 return None
             found = instances.machine_of(machine.region, instance)
@@ -232,7 +279,9 @@ class AWSProvider(Provider):
                     f"{instances.reason_of(instance) or 'EC2 does not say why'}",
                     'the EC2 console has its system log')
             ready = found.state is MachineState.RUNNING and found.shell is not None
-            return dataclasses.replace(found, id=machine_id) if ready else None
+            return dataclasses.replace(
+                found, id=machine_id, note=self._notes.get(machine.instance, ''),
+            ) if ready else None
 
         # it takes EC2 some ten seconds: few questions, but a fast one is seen soon
         return wait_until(
@@ -290,21 +339,35 @@ class AWSProvider(Provider):
             return [f"security group and key of '{name}' in {region}" for name in found.values()]
         return [words for found in self._in_regions(ask) for words in found]
 
+    def notice_for(self, machine: Machine) -> tuple[str, ...]:
+        """Return what asks for the notice of a spot instance; no other is taken away."""
+        return self.notice if instances.is_spot(machine) else ()
+
     # -- who reaches it, and who it is ----------------------------------------------------------
 
     def robot_address(self) -> str:
         """Return this computer's public address as AWS sees it, or as the user has named it."""
-        return self._robot_address()
+        ending = self.cancel is None or self.cancel.is_set()
+        return self._asked_address(None if ending else self.cancel)
+
+    def _asked_address(self, cancel: Optional[threading.Event]) -> str:
+        return patience.unless(cancel, self._robot_address, "asking for the robot's address")
+
+    def _sources(self, cancel: Optional[threading.Event]) -> list[str]:
+        return self._robot_address.with_ipv6([self._asked_address(cancel)])
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
         """Change the machine's own security group."""
         machine = MachineId.parse(machine_id)
-        network.allow(self._account, machine.region, machine.attempt, port, sources)
+        # a port that is to be closed is, whatever ends
+        account = self._rising() if sources else self._account
+        network.allow(account, machine.region, machine.attempt, port,
+                      self._robot_address.with_ipv6(sources))
 
     def pin(self, machine_id: str, host_key: str) -> None:
         """Keep the machine's new host key in a tag of the instance."""
         machine = MachineId.parse(machine_id)
-        self._account.call(
+        self._rising().call(
             'ec2', machine.region, 'create_tags', f'noting the host key of {machine.instance}',
             Resources=[machine.instance], Tags=instances.tag_list({
                 instances.TAG_HOST_KEY: ' '.join(host_key.split()[:2])}))
