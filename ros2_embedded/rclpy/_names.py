@@ -2,6 +2,15 @@
 """Names: what is valid, how they are expanded, and what DDS makes of them."""
 
 import re
+from typing import Literal
+
+from rclpy.exceptions import (
+    InvalidNamespaceException,
+    InvalidNodeNameException,
+    InvalidServiceNameException,
+    InvalidTopicNameException,
+    NameValidationException,
+)
 
 _ALPHANUMERIC = re.compile(r'[^A-Za-z0-9_/]')
 _SUBSTITUTION = re.compile(r'\{([^{}]*)\}')
@@ -99,6 +108,51 @@ def topic_name_fault(name: str) -> Fault | None:
     if (digit := _digit_after_slash(name)) is not None:
         return 'topic name token must not start with a number', digit
     return None
+
+
+def _checked(name: str, fault: Fault | None, error: type[NameValidationException],
+             ) -> Literal[True]:
+    if fault is not None:
+        raise error(name, *fault)  # type: ignore[call-arg, arg-type]
+    return True
+
+
+def validate_node_name(node_name: str) -> Literal[True]:
+    """
+    Check a name.
+
+    :raises InvalidNodeNameException: if it is invalid.
+    """
+    return _checked(node_name, node_name_fault(node_name), InvalidNodeNameException)
+
+
+def validate_namespace(namespace: str) -> Literal[True]:
+    """
+    Check a name.
+
+    :raises InvalidNamespaceException: if it is invalid.
+    """
+    return _checked(namespace, namespace_fault(namespace), InvalidNamespaceException)
+
+
+def validate_topic_name(name: str, *, is_service: bool = False) -> Literal[True]:
+    """
+    Check a name as a program gives it.
+
+    :raises InvalidTopicNameException: if it is invalid; for a service its own exception.
+    """
+    return _checked(name, topic_name_fault(name), InvalidServiceNameException if is_service
+                    else InvalidTopicNameException)
+
+
+def validate_full_topic_name(name: str, *, is_service: bool = False) -> Literal[True]:
+    """
+    Check an expanded name.
+
+    :raises InvalidTopicNameException: if it is invalid; for a service its own exception.
+    """
+    return _checked(name, full_topic_name_fault(name), InvalidServiceNameException if is_service
+                    else InvalidTopicNameException)
 
 
 def join(namespace: str, name: str) -> str:

@@ -6,12 +6,18 @@ from typing import Any
 
 from rclpy._dds import Endpoint
 from rclpy._graph import Graph, NodeInfo, user_data_value
-from rclpy._names import demangle_service, demangle_topic, expand, join, ros_type
+from rclpy._names import (
+    demangle_service,
+    demangle_topic,
+    expand,
+    join,
+    ros_type,
+    validate_full_topic_name,
+)
 from rclpy.exceptions import NodeNameNonExistentError
 from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 from rclpy.type_hash import TypeHash
-from rclpy.validate_full_topic_name import validate_full_topic_name
 
 NamesAndTypes = list[tuple[str, list[str]]]
 

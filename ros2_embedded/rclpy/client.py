@@ -8,11 +8,10 @@ from typing import Any
 
 from rclpy import _dds
 from rclpy._dds import Reader, Writer
-from rclpy._entity import Entity, Work
+from rclpy._entity import Work
 from rclpy._graph import user_data_value
 from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile
 from rclpy.service import REQUEST_HEADER
 from rclpy.service_introspection import Introspected
@@ -22,16 +21,16 @@ from rosidl_embedded import cdr
 _numbers = iter(range(1, 2 ** 63))
 
 
-class Client(Introspected, Entity):
+class Client(Introspected):
     """Calls a service; made by :meth:`.Node.create_client`."""
 
     def __init__(self, context: Context, client_impl: tuple[Reader, Writer], srv_type: Any,
                  srv_name: str, qos_profile: QoSProfile, callback_group: CallbackGroup,
                  logger_name: str) -> None:
         self.context = context
+        super().__init__(*client_impl)
         self._reader, self._writer = client_impl
         self._identity = _dds.instance_handle(self._writer.handle)
-        self._destroyed = False
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.qos_profile = qos_profile
@@ -91,8 +90,7 @@ class Client(Introspected, Entity):
         """
         if not isinstance(request, self.srv_type.Request):
             raise TypeError()
-        if self._destroyed:
-            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        self._check_alive()
         future = Future()
         with self._lock:
             number = next(_numbers)
@@ -126,8 +124,7 @@ class Client(Introspected, Entity):
 
     def service_is_ready(self) -> bool:
         """Say whether there is a server that hears and answers this client."""
-        if self._destroyed:
-            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        self._check_alive()
         servers = set()
         for handle in self._writer.matched():
             endpoint = self._writer.matched_endpoint(handle)
@@ -168,12 +165,3 @@ class Client(Introspected, Entity):
     def service_name(self) -> str:
         """The expanded and remapped name."""
         return '/' + self._writer.topic[len('rq/'):-len('Request')]
-
-    def destroy(self) -> None:
-        """Free it; a program calls :meth:`.Node.destroy_client`."""
-        if not self._destroyed:
-            self._destroyed = True
-            if self._events is not None:
-                self._events.close()
-            self._reader.close()
-            self._writer.close()

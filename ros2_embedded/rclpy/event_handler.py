@@ -6,12 +6,11 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from rclpy import _dds
-from rclpy._entity import Work
+from rclpy._entity import Entity, Work
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import UnsupportedEventTypeError
 from rclpy.logging import get_logger
 from rclpy.qos import qos_policy_name_from_kind, QoSPolicyKind
-from rclpy.waitable import Waitable
 
 
 class QoSPublisherEventType(IntEnum):
@@ -35,28 +34,15 @@ class QoSSubscriptionEventType(IntEnum):
     RCL_SUBSCRIPTION_MATCHED = 5
 
 
-class QoSRequestedDeadlineMissedInfo(NamedTuple):
-    """How often a deadline was missed."""
+class _Count(NamedTuple):
+    """How often it happened, and how often since the last time."""
 
     total_count: int
     total_count_change: int
 
 
-QoSOfferedDeadlineMissedInfo = QoSRequestedDeadlineMissedInfo
-
-
-class QoSLivelinessLostInfo(NamedTuple):
-    """How often a publisher didn't say in time that it is alive."""
-
-    total_count: int
-    total_count_change: int
-
-
-class QoSMessageLostInfo(NamedTuple):
-    """How many messages were lost."""
-
-    total_count: int
-    total_count_change: int
+QoSRequestedDeadlineMissedInfo = QoSOfferedDeadlineMissedInfo = _Count
+QoSLivelinessLostInfo = QoSMessageLostInfo = IncompatibleTypeInfo = _Count
 
 
 class QoSLivelinessChangedInfo(NamedTuple):
@@ -91,13 +77,6 @@ class QoSSubscriptionMatchedInfo(NamedTuple):
 QoSPublisherMatchedInfo = QoSSubscriptionMatchedInfo
 
 
-class IncompatibleTypeInfo(NamedTuple):
-    """How many others had another type."""
-
-    total_count: int
-    total_count_change: int
-
-
 # DDS's policy ids in ROS's terms
 _POLICIES = {2: QoSPolicyKind.DURABILITY, 4: QoSPolicyKind.DEADLINE, 8: QoSPolicyKind.LIVELINESS,
              11: QoSPolicyKind.RELIABILITY, 13: QoSPolicyKind.HISTORY, 21: QoSPolicyKind.LIFESPAN}
@@ -116,7 +95,7 @@ _SUBSCRIPTION: dict[int, tuple[str, int, Any]] = {
     5: ('subscription_matched', _dds.SUBSCRIPTION_MATCHED, QoSSubscriptionMatchedInfo)}
 
 
-class EventHandler(Waitable):
+class EventHandler(Entity):
     """
     Calls back for an event.
 
@@ -128,7 +107,9 @@ class EventHandler(Waitable):
         table = _PUBLISHER if isinstance(event_type, QoSPublisherEventType) else _SUBSCRIPTION
         if event_type not in table:
             raise UnsupportedEventTypeError(f'{event_type.name} is not supported')
-        super().__init__(callback_group)
+        super().__init__()
+        self.callback_group = callback_group
+        callback_group.add_entity(self)
         self.event_type = event_type
         self.callback = callback
         self._name, self._bit, self._info = table[event_type]
@@ -151,85 +132,67 @@ class EventHandler(Waitable):
             values[2] = _POLICIES.get(values[2], QoSPolicyKind.INVALID)
         return self.callback, (self._info(*values),), None
 
-    def destroy(self) -> None:
-        """Stop watching."""
-
 
 QoSEventHandler = EventHandler
 
 
-def _handlers(wanted: list[tuple[Any, IntEnum]], group: CallbackGroup,
-              parent: _dds.Reader | _dds.Writer) -> list[EventHandler]:
-    return [EventHandler(callback_group=group, callback=callback, event_type=kind,
-                         parent_impl=parent) for callback, kind in wanted if callback]
+class _Callbacks:
+    """Callbacks for events, given by name; a name that there isn't is a TypeError."""
+
+    _kinds: dict[str, IntEnum]  # an event's name, and its kind
+    _warning: str
+
+    def __init__(self, *, use_default_callbacks: bool = True,
+                 incompatible_type: Callable[[Any], None] | None = None,
+                 **callbacks: Callable[[Any], None] | None) -> None:
+        unknown = sorted(callbacks.keys() - self._kinds.keys())
+        if unknown:
+            raise TypeError(f"{type(self).__name__} got an unexpected keyword argument "
+                            f"'{unknown[0]}'")
+        self.use_default_callbacks = use_default_callbacks
+        self.incompatible_type = incompatible_type  # Cyclone DDS never reports it
+        for name in self._kinds:
+            setattr(self, name, callbacks.get(name))
+
+    def create_event_handlers(
+            self, callback_group: CallbackGroup, parent: _dds.Reader | _dds.Writer,
+            topic_name: str, logger_name: str) -> list[EventHandler]:
+        """Make the handlers; incompatible QoS is warned of by default."""
+        def warn(event: Any) -> None:
+            get_logger(logger_name).warning(self._warning.format(
+                topic_name, qos_policy_name_from_kind(event.last_policy_kind)))
+
+        handlers = []
+        for name, kind in self._kinds.items():
+            callback = getattr(self, name)
+            if callback is None and name == 'incompatible_qos' and self.use_default_callbacks:
+                callback = warn
+            if callback is not None:
+                handlers.append(EventHandler(callback_group=callback_group, callback=callback,
+                                             event_type=kind, parent_impl=parent))
+        return handlers
 
 
-class SubscriptionEventCallbacks:
+class SubscriptionEventCallbacks(_Callbacks):
     """A subscription's callbacks for events."""
 
-    def __init__(self, *, deadline: Callable[[Any], None] | None = None,
-                 incompatible_qos: Callable[[Any], None] | None = None,
-                 liveliness: Callable[[Any], None] | None = None,
-                 message_lost: Callable[[Any], None] | None = None,
-                 incompatible_type: Callable[[Any], None] | None = None,
-                 matched: Callable[[Any], None] | None = None,
-                 use_default_callbacks: bool = True) -> None:
-        self.deadline = deadline
-        self.incompatible_qos = incompatible_qos
-        self.liveliness = liveliness
-        self.message_lost = message_lost
-        self.incompatible_type = incompatible_type  # Cyclone DDS never reports it
-        self.matched = matched
-        self.use_default_callbacks = use_default_callbacks
-
-    def create_event_handlers(self, callback_group: CallbackGroup, subscription: _dds.Reader,
-                              topic_name: str, logger_name: str) -> list[EventHandler]:
-        """Make the handlers; incompatible QoS is warned of by default."""
-        def warn(event: Any) -> None:
-            get_logger(logger_name).warning(
-                f"New publisher discovered on topic '{topic_name}', offering incompatible QoS. "
-                'No messages will be received from it. Last incompatible policy: '
-                f'{qos_policy_name_from_kind(event.last_policy_kind)}')
-
-        kind = QoSSubscriptionEventType
-        fallback = warn if self.use_default_callbacks else None
-        return _handlers([
-            (self.deadline, kind.RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED),
-            (self.incompatible_qos or fallback, kind.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS),
-            (self.liveliness, kind.RCL_SUBSCRIPTION_LIVELINESS_CHANGED),
-            (self.message_lost, kind.RCL_SUBSCRIPTION_MESSAGE_LOST),
-            (self.matched, kind.RCL_SUBSCRIPTION_MATCHED)], callback_group, subscription)
+    _kinds = {
+        'deadline': QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED,
+        'incompatible_qos': QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS,
+        'liveliness': QoSSubscriptionEventType.RCL_SUBSCRIPTION_LIVELINESS_CHANGED,
+        'message_lost': QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST,
+        'matched': QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED}
+    _warning = ("New publisher discovered on topic '{}', offering incompatible QoS. No messages "
+                'will be received from it. Last incompatible policy: {}')
 
 
-class PublisherEventCallbacks:
+class PublisherEventCallbacks(_Callbacks):
     """A publisher's callbacks for events."""
 
-    def __init__(self, *, deadline: Callable[[Any], None] | None = None,
-                 liveliness: Callable[[Any], None] | None = None,
-                 incompatible_qos: Callable[[Any], None] | None = None,
-                 incompatible_type: Callable[[Any], None] | None = None,
-                 matched: Callable[[Any], None] | None = None,
-                 use_default_callbacks: bool = True) -> None:
-        self.deadline = deadline
-        self.liveliness = liveliness
-        self.incompatible_qos = incompatible_qos
-        self.incompatible_type = incompatible_type  # Cyclone DDS never reports it
-        self.matched = matched
-        self.use_default_callbacks = use_default_callbacks
-
-    def create_event_handlers(self, callback_group: CallbackGroup, publisher: _dds.Writer,
-                              topic_name: str, logger_name: str) -> list[EventHandler]:
-        """Make the handlers; incompatible QoS is warned of by default."""
-        def warn(event: Any) -> None:
-            get_logger(logger_name).warning(
-                f"New subscription discovered on topic '{topic_name}', requesting incompatible "
-                'QoS. No messages will be sent to it. Last incompatible policy: '
-                f'{qos_policy_name_from_kind(event.last_policy_kind)}')
-
-        kind = QoSPublisherEventType
-        fallback = warn if self.use_default_callbacks else None
-        return _handlers([
-            (self.deadline, kind.RCL_PUBLISHER_OFFERED_DEADLINE_MISSED),
-            (self.liveliness, kind.RCL_PUBLISHER_LIVELINESS_LOST),
-            (self.incompatible_qos or fallback, kind.RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS),
-            (self.matched, kind.RCL_PUBLISHER_MATCHED)], callback_group, publisher)
+    _kinds = {
+        'deadline': QoSPublisherEventType.RCL_PUBLISHER_OFFERED_DEADLINE_MISSED,
+        'liveliness': QoSPublisherEventType.RCL_PUBLISHER_LIVELINESS_LOST,
+        'incompatible_qos': QoSPublisherEventType.RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS,
+        'matched': QoSPublisherEventType.RCL_PUBLISHER_MATCHED}
+    _warning = ("New subscription discovered on topic '{}', requesting incompatible QoS. No "
+                'messages will be sent to it. Last incompatible policy: {}')

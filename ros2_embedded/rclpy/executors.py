@@ -164,14 +164,18 @@ class Executor(AbstractContextManager['Executor']):
             if limit is not None and time.monotonic() >= limit:
                 return
 
+    def _once(self, timeout_sec: float | None, condition: Callable[[], bool] | None) -> None:
+        raise NotImplementedError()
+
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for one callback and execute it; none or negative: without limit."""
-        raise NotImplementedError()
+        self._once(timeout_sec, None)
 
     def spin_once_until_future_complete(self, future: Future,
                                         timeout_sec: float | None = None) -> None:
         """Wait for one callback and execute it, or until a future is done."""
-        raise NotImplementedError()
+        future._wake_when_done(self.wake)
+        self._once(timeout_sec, future.done)
 
     # --- waiting ---
 
@@ -356,16 +360,6 @@ class SingleThreadedExecutor(Executor):
             return
         self._execute(found, work)
 
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Wait for one callback and execute it."""
-        self._once(timeout_sec, None)
-
-    def spin_once_until_future_complete(self, future: Future,
-                                        timeout_sec: float | None = None) -> None:
-        """Wait for one callback and execute it, or until a future is done."""
-        future._wake_when_done(self.wake)
-        self._once(timeout_sec, future.done)
-
 
 class MultiThreadedExecutor(Executor):
     """
@@ -411,16 +405,6 @@ class MultiThreadedExecutor(Executor):
         for future in [future for future in self._submitted if future.done()]:
             self._submitted.remove(future)
             future.result()
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Wait for one callback and give it to a thread."""
-        self._once(timeout_sec, None)
-
-    def spin_once_until_future_complete(self, future: Future,
-                                        timeout_sec: float | None = None) -> None:
-        """Wait for one callback and give it to a thread, or until a future is done."""
-        future._wake_when_done(self.wake)
-        self._once(timeout_sec, future.done)
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Execute no more callbacks, and wait for those that are running."""

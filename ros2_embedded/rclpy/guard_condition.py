@@ -8,7 +8,6 @@ from rclpy._dds import Guard
 from rclpy._entity import Entity, Work
 from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 
 
 class GuardCondition(Entity):
@@ -18,13 +17,14 @@ class GuardCondition(Entity):
                  context: Context | None = None) -> None:
         self.callback = callback
         self.callback_group = callback_group
-        self._guard: Guard | None = Guard()
+        self._guard = Guard()
+        super().__init__(self._guard)
 
     def _handle(self) -> int | None:
-        return self._guard.handle if self._guard else None
+        return None if self._destroyed else self._guard.handle
 
     def _take(self, executor: Any) -> Work | None:
-        if self._guard is None or not self._guard.take() or self.callback is None:
+        if self._destroyed or not self._guard.take() or self.callback is None:
             return None
         return self.callback, (), None
 
@@ -34,12 +34,5 @@ class GuardCondition(Entity):
 
         :raises InvalidHandle: if it was destroyed.
         """
-        if self._guard is None:
-            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        self._check_alive()
         self._guard.trigger()
-
-    def destroy(self) -> None:
-        """Free it; a program calls :meth:`.Node.destroy_guard_condition`."""
-        guard, self._guard = self._guard, None
-        if guard is not None:
-            guard.close()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from copy import copy
 import sys
 from typing import Any
 import weakref
@@ -11,7 +12,18 @@ from rclpy import _arguments, logging
 from rclpy._dds import Reader, Writer
 from rclpy._entity import Entity
 from rclpy._graph import Graph, type_hash_data
-from rclpy._names import dds_type, expand, join, REQUEST_PREFIX, RESPONSE_PREFIX, TOPIC_PREFIX
+from rclpy._names import (
+    dds_type,
+    expand,
+    join,
+    REQUEST_PREFIX,
+    RESPONSE_PREFIX,
+    TOPIC_PREFIX,
+    validate_full_topic_name,
+    validate_namespace,
+    validate_node_name,
+    validate_topic_name,
+)
 from rclpy._node_graph import NodeGraph
 from rclpy._node_parameters import NodeParameters
 from rclpy.callback_groups import (
@@ -23,8 +35,17 @@ from rclpy.client import Client
 from rclpy.clock import Clock, ROSClock
 from rclpy.constants import S_TO_NS
 from rclpy.context import Context
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import NodeNameNonExistentError, NotInitializedException
+from rclpy.duration import Duration
+from rclpy.event_handler import (
+    EventHandler,
+    PublisherEventCallbacks,
+    SubscriptionEventCallbacks,
+)
+from rclpy.exceptions import (
+    NodeNameNonExistentError,
+    NotEmbeddedError,
+    NotInitializedException,
+)
 from rclpy.executors import Executor
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -32,6 +53,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.publisher import Publisher
 from rclpy.qos import (
+    DeadlineBestAvailable,
     DurabilityPolicy,
     LivelinessPolicy,
     qos_profile_parameter_events,
@@ -40,22 +62,16 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
-from rclpy.qos_overriding_options import override, QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.time_source import TimeSource
 from rclpy.timer import Rate, Timer
 from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 from rclpy.utilities import get_default_context
-from rclpy.validate_namespace import validate_namespace
-from rclpy.validate_node_name import validate_node_name
-from rclpy.validate_topic_name import validate_topic_name
-from rclpy.waitable import Waitable
 
 __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 
 HIDDEN_NODE_PREFIX = '_'
-_TYPE_DESCRIPTION = 'start_type_description_service'
 
 
 class Node(NodeParameters, NodeGraph):
@@ -92,7 +108,7 @@ class Node(NodeParameters, NodeGraph):
         self._services: list[Service] = []
         self._timers: list[Timer] = []
         self._guards: list[GuardCondition] = []
-        self._waitables: list[Waitable] = []
+        self._waitables: list[EventHandler] = []
         self._default_callback_group: CallbackGroup = MutuallyExclusiveCallbackGroup()
         self._rate_group = ReentrantCallbackGroup()
         self._executor_reference: weakref.ReferenceType[Executor] | None = None
@@ -126,9 +142,6 @@ class Node(NodeParameters, NodeGraph):
             if enable_logger_service:
                 from rclpy.logging_service import LoggingService
                 self._logger_service = LoggingService(self)
-            if self.get_parameter(_TYPE_DESCRIPTION).value:
-                from rclpy.type_description_service import TypeDescriptionService
-                self._type_description_service = TypeDescriptionService(self)
 
     def _start_rosout(self) -> None:
         from rcl_interfaces.msg import Log
@@ -138,7 +151,7 @@ class Node(NodeParameters, NodeGraph):
         def publish(stamp: int, severity: int, name: str, message: str, file: str,
                     function: str, line: int) -> None:
             target = reference()
-            if target is None or not self_context.ok() or target._writer is None:
+            if target is None or not self_context.ok() or target._destroyed:
                 return
             log = Log(level=int(severity), name=name, msg=message, file=file,
                       function=function, line=line)
@@ -160,10 +173,6 @@ class Node(NodeParameters, NodeGraph):
                      for one in self._parameter_overrides.values()], ignore_override=True)
         self._time_source = TimeSource(node=self)
         self._time_source.attach_clock(self._clock)
-        if not self.has_parameter(_TYPE_DESCRIPTION):
-            self.declare_parameter(_TYPE_DESCRIPTION, True, ParameterDescriptor(
-                description='If enabled, start the ~/get_type_description service.',
-                read_only=True))
 
     def _publish_parameter_event(self, event: Any) -> None:
         if self._parameter_event_publisher is not None:
@@ -173,40 +182,13 @@ class Node(NodeParameters, NodeGraph):
 
     # --- what it has ---
 
-    @property
-    def publishers(self) -> Iterator[Publisher]:
-        """Its publishers."""
-        yield from self._publishers
-
-    @property
-    def subscriptions(self) -> Iterator[Subscription]:
-        """Its subscriptions."""
-        yield from self._subscriptions
-
-    @property
-    def clients(self) -> Iterator[Client]:
-        """Its clients."""
-        yield from self._clients
-
-    @property
-    def services(self) -> Iterator[Service]:
-        """Its services."""
-        yield from self._services
-
-    @property
-    def timers(self) -> Iterator[Timer]:
-        """Its timers."""
-        yield from self._timers
-
-    @property
-    def guards(self) -> Iterator[GuardCondition]:
-        """Its guard conditions."""
-        yield from self._guards
-
-    @property
-    def waitables(self) -> Iterator[Waitable]:
-        """Its waitables."""
-        yield from self._waitables
+    publishers = property(lambda self: iter(self._publishers), doc='Its publishers.')
+    subscriptions = property(lambda self: iter(self._subscriptions), doc='Its subscriptions.')
+    clients = property(lambda self: iter(self._clients), doc='Its clients.')
+    services = property(lambda self: iter(self._services), doc='Its services.')
+    timers = property(lambda self: iter(self._timers), doc='Its timers.')
+    guards = property(lambda self: iter(self._guards), doc='Its guard conditions.')
+    waitables = property(lambda self: iter(self._waitables), doc='Its handlers of events.')
 
     def _entities(self) -> list[Entity]:
         """All that an executor waits for, in the order it is executed in."""
@@ -279,7 +261,6 @@ class Node(NodeParameters, NodeGraph):
     def _resolve(self, name: str, only_expand: bool, is_service: bool) -> str:
         validate_topic_name(name, is_service=is_service)
         full = expand(name, self._name, self._namespace)
-        from rclpy.validate_full_topic_name import validate_full_topic_name
         if not only_expand:
             full = self._settings.remap(full, self._name, self._namespace,
                                         'rosservice' if is_service else 'rostopic')
@@ -321,32 +302,32 @@ class Node(NodeParameters, NodeGraph):
             return profile
         others = [one.policies for one in self._graph.endpoints(writers=not publisher)
                   if one.topic == topic]
-        chosen = QoSProfile(history=profile.history, depth=profile.depth)
-        reliable = publisher or all(one.reliable for one in others)
-        durable = publisher or all(one.transient_local for one in others)
-        manual = publisher and any(one.manual_liveliness for one in others) \
-            or not publisher and bool(others) and all(one.manual_liveliness for one in others)
-        for name, best, value in (
-                ('reliability', ReliabilityPolicy.BEST_AVAILABLE,
-                 ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
-                ('durability', DurabilityPolicy.BEST_AVAILABLE,
-                 DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE),
-                ('liveliness', LivelinessPolicy.BEST_AVAILABLE,
-                 LivelinessPolicy.MANUAL_BY_TOPIC if manual else LivelinessPolicy.AUTOMATIC)):
-            given = getattr(profile, name)
-            setattr(chosen, name, value if given == best else given)
+        chosen = copy(profile)
+        if profile.reliability == ReliabilityPolicy.BEST_AVAILABLE:
+            chosen.reliability = ReliabilityPolicy.RELIABLE \
+                if publisher or all(one.reliable for one in others) \
+                else ReliabilityPolicy.BEST_EFFORT
+        if profile.durability == DurabilityPolicy.BEST_AVAILABLE:
+            chosen.durability = DurabilityPolicy.TRANSIENT_LOCAL \
+                if publisher or all(one.transient_local for one in others) \
+                else DurabilityPolicy.VOLATILE
+        if profile.liveliness == LivelinessPolicy.BEST_AVAILABLE:
+            manual = [one.manual_liveliness for one in others]
+            chosen.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC \
+                if (any(manual) if publisher else manual and all(manual)) \
+                else LivelinessPolicy.AUTOMATIC
         for name in ('deadline', 'liveliness_lease_duration'):
-            if getattr(profile, name).nanoseconds != 2 ** 63 - 2:
-                setattr(chosen, name, getattr(profile, name))
+            if getattr(profile, name) == DeadlineBestAvailable:
+                setattr(chosen, name, Duration())
         return chosen
 
     def _topic_entity(self, kind: Any, msg_type: Any, topic: str, profile: QoSProfile,
-                      options: QoSOverridingOptions | None) -> tuple[Any, QoSProfile]:
+                      options: None) -> tuple[Any, QoSProfile]:
+        if options is not None:
+            raise NotEmbeddedError('qos_overriding_options')
         check_is_valid_msg_type(msg_type)
         publishes = kind is Writer
         full = self.resolve_topic_name(topic)
-        if options is not None:
-            override(self, 'publisher' if publishes else 'subscription', full, profile, options)
         name = topic if profile.avoid_ros_namespace_conventions else TOPIC_PREFIX + full
         profile = self._available(profile, name, publishes)
         type_name = msg_type._definition.name
@@ -359,7 +340,7 @@ class Node(NodeParameters, NodeGraph):
             self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, *,
             callback_group: CallbackGroup | None = None,
             event_callbacks: PublisherEventCallbacks | None = None,
-            qos_overriding_options: QoSOverridingOptions | None = None,
+            qos_overriding_options: None = None,
             publisher_class: type[Publisher] = Publisher) -> Publisher:
         """
         Create a publisher.
@@ -381,7 +362,7 @@ class Node(NodeParameters, NodeGraph):
             self, msg_type: Any, topic: str, callback: Callable[..., Any],
             qos_profile: QoSProfile | int, *, callback_group: CallbackGroup | None = None,
             event_callbacks: SubscriptionEventCallbacks | None = None,
-            qos_overriding_options: QoSOverridingOptions | None = None,
+            qos_overriding_options: None = None,
             raw: bool = False) -> Subscription:
         """
         Create a subscription.
@@ -501,16 +482,6 @@ class Node(NodeParameters, NodeGraph):
         timer = self.create_timer(1.0 / frequency, None, self._rate_group, clock)
         return Rate(timer, context=self._context)
 
-    def add_waitable(self, waitable: Waitable) -> None:
-        """Have executors wait for a waitable."""
-        self._waitables.append(waitable)
-        self._wake_executor()
-
-    def remove_waitable(self, waitable: Waitable) -> None:
-        """Have executors wait for a waitable no more."""
-        self._waitables.remove(waitable)
-        self._wake_executor()
-
     # --- destroying ---
 
     def __del__(self) -> None:
@@ -518,32 +489,33 @@ class Node(NodeParameters, NodeGraph):
                 and hasattr(self, '_record') and self._context.ok():
             self.destroy_node()
 
-    def _destroy(self, things: list[Any], thing: Any, *endpoints: Reader | Writer | None) -> bool:
+    def _destroy(self, things: list[Any], thing: Entity) -> bool:
         if thing not in things:
             return False
         things.remove(thing)
         for handler in getattr(thing, 'event_handlers', []):
             self._waitables.remove(handler)
-        self._graph.remove_endpoints(self._record, *[one for one in endpoints if one is not None])
+        self._graph.remove_endpoints(
+            self._record, *[end for end in thing._ends if isinstance(end, (Reader, Writer))])
         thing.destroy()
         self._wake_executor()
         return True
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
         """Destroy a publisher; False if it isn't the node's."""
-        return self._destroy(self._publishers, publisher, publisher._writer)
+        return self._destroy(self._publishers, publisher)
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """Destroy a subscription; False if it isn't the node's."""
-        return self._destroy(self._subscriptions, subscription, subscription._reader)
+        return self._destroy(self._subscriptions, subscription)
 
     def destroy_client(self, client: Client) -> bool:
         """Destroy a client; False if it isn't the node's."""
-        return self._destroy(self._clients, client, client._reader, client._writer)
+        return self._destroy(self._clients, client)
 
     def destroy_service(self, service: Service) -> bool:
         """Destroy a service; False if it isn't the node's."""
-        return self._destroy(self._services, service, service._reader, service._writer)
+        return self._destroy(self._services, service)
 
     def destroy_timer(self, timer: Timer) -> bool:
         """Destroy a timer; False if it isn't the node's."""

@@ -8,10 +8,10 @@ import time
 from typing import Any, NamedTuple
 
 from rclpy._dds import Reader, Writer
-from rclpy._entity import Entity, Work
+from rclpy._entity import Work
 from rclpy._graph import user_data_value
 from rclpy.callback_groups import CallbackGroup
-from rclpy.exceptions import InvalidHandle, RCLError
+from rclpy.exceptions import RCLError
 from rclpy.qos import QoSProfile
 from rclpy.service_introspection import Introspected
 from rosidl_embedded import cdr
@@ -41,14 +41,14 @@ class ServiceInfo(NamedTuple):
     request_id: RequestId
 
 
-class Service(Introspected, Entity):
+class Service(Introspected):
     """Answers requests; made by :meth:`.Node.create_service`."""
 
     def __init__(self, service_impl: tuple[Reader, Writer], srv_type: Any, srv_name: str,
                  callback: Callable[[Any, Any], Any], callback_group: CallbackGroup,
                  qos_profile: QoSProfile, logger_name: str) -> None:
+        super().__init__(*service_impl)
         self._reader, self._writer = service_impl
-        self._destroyed = False
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
@@ -98,8 +98,7 @@ class Service(Introspected, Entity):
         if not isinstance(response, self.srv_type.Response):
             raise TypeError(f"Service '{self.srv_name}': the callback gave "
                             f'{type(response)}, not {self.srv_type.Response}')
-        if self._destroyed:
-            raise InvalidHandle('cannot use Destroyable because destruction was requested')
+        self._check_alive()
         request = header.request_id if isinstance(header, ServiceInfo) else header
         data = cdr.serialize(response, cdr.HEADER + REQUEST_HEADER.pack(*request[:2]))
         limit = time.monotonic() + READER_WAIT
@@ -115,12 +114,3 @@ class Service(Introspected, Entity):
     def service_name(self) -> str:
         """The expanded and remapped name."""
         return '/' + self._reader.topic[len('rq/'):-len('Request')]
-
-    def destroy(self) -> None:
-        """Free it; a program calls :meth:`.Node.destroy_service`."""
-        if not self._destroyed:
-            self._destroyed = True
-            if self._events is not None:
-                self._events.close()
-            self._reader.close()
-            self._writer.close()

@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Any
 
 from rclpy._dds import Writer
+from rclpy._entity import Entity
 from rclpy.clock import Clock
 from rclpy.qos import QoSProfile
 from rosidl_embedded import cdr
@@ -19,7 +20,7 @@ class ServiceIntrospectionState(IntEnum):
     CONTENTS = 2
 
 
-class Introspected:
+class Introspected(Entity):
     """The base of services and clients: publishes what they send and receive."""
 
     srv_type: Any
@@ -32,10 +33,12 @@ class Introspected:
                                 introspection_state: ServiceIntrospectionState) -> None:
         """Say what is published, with times of this clock."""
         if self._events is not None:
+            self._ends.remove(self._events)
             self._events.close()
         self._events, self._clock, self._state = None, clock, introspection_state
         if introspection_state != ServiceIntrospectionState.OFF:
             self._events = self._make_event_writer(service_event_qos_profile)
+            self._ends.append(self._events)
 
     def _tell(self, kind: int, client: bytes, number: int, request: Any = None,
               response: Any = None) -> None:

@@ -12,7 +12,6 @@ from rclpy._entity import Entity, Work
 from rclpy._names import demangle_topic
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile
 from rosidl_embedded import cdr
 
@@ -30,7 +29,8 @@ class Subscription(Entity):
                  callback: Callable[..., Any], callback_group: CallbackGroup,
                  qos_profile: QoSProfile, raw: bool,
                  event_callbacks: SubscriptionEventCallbacks, logger_name: str) -> None:
-        self._reader: Reader | None = subscription_impl
+        super().__init__(subscription_impl)
+        self._reader = subscription_impl
         self.msg_type = msg_type
         self.topic = topic
         self.callback = callback
@@ -41,17 +41,12 @@ class Subscription(Entity):
         self.event_handlers: list[EventHandler] = event_callbacks.create_event_handlers(
             callback_group, subscription_impl, topic, logger_name)
 
-    def _use(self) -> Reader:
-        if self._reader is None:
-            raise InvalidHandle('cannot use Destroyable because destruction was requested')
-        return self._reader
-
     def _handle(self) -> int | None:
-        return self._reader.condition if self._reader else None
+        return None if self._destroyed else self._reader.condition
 
     def _next(self) -> tuple[Any, dict[str, Any]] | None:
         """Take the next message and what is known of it."""
-        if self._reader is None:
+        if self._destroyed:
             return None
         for sample in self._reader.take():
             try:
@@ -78,19 +73,14 @@ class Subscription(Entity):
 
     def get_publisher_count(self) -> int:
         """Count the publishers it receives from."""
-        return len(self._use().matched())
-
-    @property
-    def handle(self) -> 'Subscription':
-        """Itself."""
-        self._use()
-        return self
+        self._check_alive()
+        return len(self._reader.matched())
 
     @property
     def topic_name(self) -> str:
         """The expanded and remapped topic."""
-        name = self._use().topic
-        return demangle_topic(name) or name
+        self._check_alive()
+        return demangle_topic(self._reader.topic) or self._reader.topic
 
     @property
     def callback(self) -> Callable[..., Any]:
@@ -110,9 +100,3 @@ class Subscription(Entity):
         raise RuntimeError(
             'Subscription.__init__(): callback should be either be callable with one argument'
             '(to get only the message) or two (to get message and message info)')
-
-    def destroy(self) -> None:
-        """Free it; a program calls :meth:`.Node.destroy_subscription`."""
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            reader.close()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points in time."""
 
+from functools import total_ordering
 from typing import Any
 
 from rclpy.clock_type import ClockType
@@ -10,6 +11,7 @@ from rclpy.duration import Duration
 __all__ = ['ClockType', 'Time']
 
 
+@total_ordering
 class Time:
     """
     A point in time of one kind of clock; only times of the same kind can be compared.
@@ -84,18 +86,6 @@ class Time:
 
     def __lt__(self, other: 'Time') -> bool:
         return self._nanoseconds < self._other(other) if isinstance(other, Time) \
-            else NotImplemented
-
-    def __le__(self, other: 'Time') -> bool:
-        return self._nanoseconds <= self._other(other) if isinstance(other, Time) \
-            else NotImplemented
-
-    def __gt__(self, other: 'Time') -> bool:
-        return self._nanoseconds > self._other(other) if isinstance(other, Time) \
-            else NotImplemented
-
-    def __ge__(self, other: 'Time') -> bool:
-        return self._nanoseconds >= self._other(other) if isinstance(other, Time) \
             else NotImplemented
 
     __hash__ = None  # type: ignore[assignment]

@@ -22,6 +22,7 @@ class Timer(Entity):
                  autostart: bool = True, wake: Callable[[], None] | None = None) -> None:
         if timer_period_ns < 0:
             raise ValueError('timer period must be non-negative')
+        super().__init__()
         self.callback = callback
         self.callback_group = callback_group
         self._clock = clock
@@ -30,7 +31,6 @@ class Timer(Entity):
         self._cancelled = not autostart
         self._last = clock._now()
         self._next = self._last + self._period
-        self._destroyed = False
         self._jump = None
         if clock.clock_type is ClockType.ROS_TIME:
             self._jump = clock.create_jump_callback(

@@ -2,7 +2,6 @@
 """The default context, and small helpers."""
 
 from collections.abc import Sequence
-import os
 import sys
 import threading
 
@@ -52,16 +51,7 @@ def get_rmw_implementation_identifier() -> str:
 
 def get_available_rmw_implementations() -> set[str]:
     """Name the middlewares there are."""
-    chosen = os.environ.get('RMW_IMPLEMENTATIONS')
-    available = {'rmw_cyclonedds_cpp'}
-    if chosen:
-        wanted = set(chosen.split(os.pathsep))
-        if missing := wanted - available:
-            raise RuntimeError(
-                f"The RMW implementations {missing} specified in 'RMW_IMPLEMENTATIONS' are not "
-                f"available ({', '.join(sorted(available))})")
-        return wanted
-    return available
+    return {get_rmw_implementation_identifier()}
 
 
 def timeout_sec_to_nsec(timeout_sec: float | None) -> int:

@@ -2,336 +2,227 @@
 """
 Serialisation: XCDR1 as ROS 2's middlewares write it (OMG formal/02-06-51, little endian).
 
-For each message two functions are generated. Nested messages are inlined and neighbouring
-primitives share one ``struct``; what is known of the position modulo 8 says at generation time
-how much padding there is, else it is computed.
+A type's codec is two functions: one appends a value to a bytearray, the other reads one from a
+buffer. A message's is made of its fields'. Positions count from the encapsulation header's end,
+which is at 4.
 """
 
 import array
 from collections.abc import Callable
 from functools import lru_cache
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
-from rosidl_embedded.definition import Definition, Field, SIZES, TYPECODES
+from rosidl_embedded.definition import definition, Field, SIZES, TYPECODES
 
 HEADER = b'\x00\x01\x00\x00'  # encapsulation: CDR, little endian, no options
 PADDING = tuple(bytes(count) for count in range(8))
-
-_FORMATS = {**TYPECODES, 'bool': '?', 'byte': 'B'}
 
 
 class TruncatedError(ValueError):
     """The bytes end before the message does."""
 
 
-def _short() -> None:
-    raise TruncatedError('the serialized message is too short')
+class Codec(NamedTuple):
+    """How a type is written, and read: a value and the position after it."""
+
+    write: Callable[[bytearray, Any], None]
+    read: Callable[[Any, int], tuple[Any, int]]
 
 
-class _Generator:
-    """Lines of one function, with what is known of the position in the stream."""
-
-    def __init__(self, head: str) -> None:
-        self.lines = [head]
-        self.names: dict[str, Any] = {'PADDING': PADDING, 'array': array.array, 'short': _short}
-        self.depth = 1
-        self.modulus, self.offset = 8, 0
-        self.format, self.items = '', list[str]()
-        self.after = list[str]()
-        self.count = 0
-
-    def name(self, stem: str) -> str:
-        self.count += 1
-        return f'{stem}{self.count}'
-
-    def put(self, line: str) -> None:
-        self.lines.append('  ' * self.depth + line)
-
-    def forget(self, modulus: int = 1) -> None:
-        """From here on the position is known to be a multiple of modulus, and no more."""
-        self.modulus, self.offset = modulus, 0
-
-    def align(self, size: int) -> None:
-        if size > self.modulus:
-            self.flush()
-            self.pad(size)
-            self.forget(size)
-        elif missing := -self.offset % size:
-            self.format += f'{missing}x'
-            self.offset = (self.offset + missing) % self.modulus
-
-    def primitive(self, code: str, size: int, item: str) -> None:
-        self.align(size)
-        self.format += code
-        self.items.append(item)
-        self.offset = (self.offset + size) % self.modulus
-
-    def pad(self, size: int) -> None:
-        raise AssertionError
-
-    def flush(self) -> None:
-        raise AssertionError
-
-    def struct(self) -> str:
-        """Name the struct of the run so far and start a new run."""
-        name = self.name('s')
-        self.names[name] = struct.Struct('<' + self.format)
-        self.format, self.items = '', []
-        return name
-
-    def finish(self, name: str) -> Callable[..., Any]:
-        code = compile('\n'.join(self.lines), f'<cdr of {name}>', 'exec')
-        exec(code, self.names)  # noqa: S102 - generated above, from our own tables
-        function: Callable[..., Any] = self.names['function']
-        return function
+def _end(buffer: Any, start: int, size: int) -> int:
+    if size > len(buffer) - start:
+        raise TruncatedError('the serialized message is too short')
+    return start + size
 
 
-class _Writer(_Generator):
-    """Generates ``function(m, b)``, which appends message m to bytearray b."""
+def _primitives(code: str, size: int) -> Codec:
+    """Make the codec of neighbours of one size; of a single one if the code has one letter."""
+    layout = struct.Struct('<' + code)
+    pack, unpack, mask, total = layout.pack, layout.unpack_from, size - 1, layout.size
 
-    def pad(self, size: int) -> None:
-        self.put(f'b += PADDING[(4 - len(b)) & {size - 1}]')
+    def write(buffer: bytearray, value: Any) -> None:
+        buffer += PADDING[(4 - len(buffer)) & mask] + pack(value)
 
-    def flush(self) -> None:
-        if self.format:
-            items = ', '.join(self.items)
-            self.put(f'b += {self.struct()}.pack({items})')
+    def read(buffer: Any, place: int) -> tuple[Any, int]:
+        place += (4 - place) & mask
+        return unpack(buffer, place)[0], place + total
 
-    def message(self, definition: Definition, source: str) -> None:
-        from rosidl_embedded.definition import definition as find
-        if not definition.fields:
-            self.primitive('B', 1, '0')
-        for field in definition.fields:
-            value = f'{source}._{field.name}'
-            if field.kind:
-                self.many(field, value)
-            elif field.nested:
-                self.message(find(field.base), value)
-            else:
-                self.scalar(field, value)
+    def write_all(buffer: bytearray, values: Any) -> None:
+        buffer += PADDING[(4 - len(buffer)) & mask] + pack(*values)
 
-    def scalar(self, field: Field, value: str) -> None:
-        if field.base == 'string':
-            text = self.name('t')
-            self.put(f'{text} = {value}.encode()')
-            self.primitive('I', 4, f'len({text}) + 1')
-            self.flush()
-            self.put(f'b += {text}')
-            self.put('b.append(0)')
-            self.forget()
-        elif field.base == 'wstring':
-            text = self.name('t')
-            self.put(f"{text} = {value}.encode('utf-16-le')")
-            self.primitive('I', 4, f'len({text}) // 2')
-            self.flush()
-            self.put(f'b += {text}')
-            self.forget(2)
-        elif field.base == 'byte':
-            self.primitive('B', 1, f'{value}[0]')
-        else:
-            self.primitive(_FORMATS[field.base], SIZES[field.base], value)
+    def read_all(buffer: Any, place: int) -> tuple[Any, int]:
+        place += (4 - place) & mask
+        return unpack(buffer, place), place + total
 
-    def many(self, field: Field, value: str) -> None:
-        if field.kind == 'sequence':
-            self.primitive('I', 4, f'len({value})')
-        if field.base not in SIZES:
-            self.loop(field, value)
-            return
-        size = SIZES[field.base]
-        if field.kind == 'array':
-            self.align(size)
-            self.flush()
-        else:
-            self.flush()
-            if size > 4:
-                self.put(f'if {value}: b += PADDING[(4 - len(b)) & {size - 1}]')
-        if field.base == 'bool':
-            self.put(f'b += bytes({value})')
-        elif field.base == 'byte':
-            self.put(f"b += b''.join({value})")
-        elif field.kind == 'array':
-            self.put(f'b += {value}.tobytes()')
-        else:
-            self.put(f'b += {value}')
-        if field.kind == 'array':
-            self.offset = (self.offset + size * field.size) % self.modulus
-        else:
-            self.forget(min(size, 4))
-
-    def loop(self, field: Field, value: str) -> None:
-        self.flush()
-        item = self.name('x')
-        self.put(f'for {item} in {value}:')
-        self.depth += 1
-        self.forget()
-        if field.nested:
-            from rosidl_embedded.definition import definition as find
-            self.message(find(field.base), item)
-        else:
-            self.scalar(field, item)
-        self.flush()
-        self.depth -= 1
-        self.forget()
+    return Codec(write, read) if len(code) == 1 else Codec(write_all, read_all)
 
 
-class _Reader(_Generator):
-    """Generates ``function(b, p)``: a message from buffer b at p, and the position after it."""
+_CODES = {**TYPECODES, 'bool': '?', 'byte': 'c'}
+_COUNT = _primitives('I', 4)
 
-    def __init__(self, head: str, class_of: Callable[[str], type]) -> None:
-        super().__init__(head)
-        self.class_of = class_of
 
-    def pad(self, size: int) -> None:
-        self.put(f'p += (4 - p) & {size - 1}')
+def _write_string(buffer: bytearray, value: str) -> None:
+    text = value.encode()
+    _COUNT.write(buffer, len(text) + 1)
+    buffer += text
+    buffer.append(0)
 
-    def flush(self) -> None:
-        if self.format:
-            items, size = self.items, struct.calcsize('<' + self.format)
-            name = self.struct()
-            if items:
-                self.put(f"{', '.join(items)}, = {name}.unpack_from(b, p)")
-            self.put(f'p += {size}')
-        self.lines += ['  ' * self.depth + line for line in self.after]
-        self.after = []
 
-    def new(self, definition: Definition, target: str) -> None:
-        cls = self.class_of(definition.name)
-        name = f'C{cls.__name__}_{len(self.names)}'
-        self.names[name] = cls
-        self.put(f'{target} = {name}.__new__({name})')
-        self.put(f'{target}._check_fields = CHECK')
+def _read_string(buffer: Any, place: int) -> tuple[str, int]:
+    count, place = _COUNT.read(buffer, place)
+    end = _end(buffer, place, count)
+    return str(buffer[place:max(end - 1, place)], 'utf-8', 'replace'), end
 
-    def message(self, definition: Definition, target: str) -> None:
-        from rosidl_embedded.definition import definition as find
-        self.new(definition, target)
-        if not definition.fields:
-            self.primitive('B', 1, '_')
-        for field in definition.fields:
-            place = f'{target}._{field.name}'
-            if field.kind:
-                self.many(field, place)
-            elif field.nested:
-                inner = self.name('m')
-                self.message(find(field.base), inner)
-                self.put(f'{place} = {inner}')
-            else:
-                self.scalar(field, place)
 
-    def scalar(self, field: Field, place: str) -> None:
-        if field.base in ('string', 'wstring'):
-            count = self.name('n')
-            self.primitive('I', 4, count)
-            self.flush()
-            width = 1 if field.base == 'string' else 2
-            self.put(f'e = p + {count} * {width}')
-            self.put('if e > z: short()')
-            if width == 1:
-                self.put(f"{place} = str(b[p:e - 1], 'utf-8', 'replace') if {count} else ''")
-            else:
-                self.put(f"{place} = str(b[p:e], 'utf-16-le', 'replace')")
-            self.put('p = e')
-            self.forget(width)
-        elif field.base == 'byte':
-            item = self.name('t')
-            self.primitive('B', 1, item)
-            self.after.append(f'{place} = bytes(({item},))')
-        else:
-            self.primitive(_FORMATS[field.base], SIZES[field.base], place)
+def _write_wide(buffer: bytearray, value: str) -> None:
+    text = value.encode('utf-16-le')
+    _COUNT.write(buffer, len(text) // 2)
+    buffer += text
 
-    def many(self, field: Field, place: str) -> None:
-        if field.kind == 'sequence':
-            count = self.name('n')
-            self.primitive('I', 4, count)
-            self.flush()
-        else:
-            count = str(field.size)
-        if field.base not in SIZES:
-            self.flush()
-            self.loop(field, place, count)
-            return
-        size = SIZES[field.base]
-        if field.kind == 'array':
-            self.align(size)
-            self.flush()
-        elif size > 4:
-            self.put(f'if {count}: p += (4 - p) & {size - 1}')
-        self.put(f'e = p + {count} * {size}')
-        self.put('if e > z: short()')
-        if field.base == 'bool':
-            self.put(f'{place} = list(map(bool, b[p:e]))')
-        elif field.base == 'byte':
-            self.put(f'{place} = [bytes((x,)) for x in b[p:e]]')
-        elif field.kind == 'array':
-            import numpy
-            self.names['frombuffer'] = numpy.frombuffer
-            code = TYPECODES[field.base]
-            self.put(f"{place} = frombuffer(b[p:e], '<{code if size > 1 else code}').copy()")
-        else:
-            self.put(f"{place} = v = array('{TYPECODES[field.base]}')")
-            self.put('v.frombytes(b[p:e])')
-        self.put('p = e')
-        if field.kind == 'array':
-            self.offset = (self.offset + size * field.size) % self.modulus
-        else:
-            self.forget(min(size, 4))
 
-    def loop(self, field: Field, place: str, count: str) -> None:
-        items, item = self.name('l'), self.name('x')
-        self.put(f'if {count} > z - p: short()')
-        self.put(f'{place} = {items} = []')
-        self.put(f'for _ in range({count}):')
-        self.depth += 1
-        self.forget()
-        if field.nested:
-            from rosidl_embedded.definition import definition as find
-            self.message(find(field.base), item)
-        else:
-            self.scalar(field, item)
-        self.flush()
-        self.put(f'{items}.append({item})')
-        self.depth -= 1
-        self.forget()
+def _read_wide(buffer: Any, place: int) -> tuple[str, int]:
+    count, place = _COUNT.read(buffer, place)
+    end = _end(buffer, place, 2 * count)
+    return str(buffer[place:end], 'utf-16-le', 'replace'), end
+
+
+_SINGLE = {'string': Codec(_write_string, _read_string), 'wstring': Codec(_write_wide, _read_wide),
+           **{base: _primitives(code, SIZES[base]) for base, code in _CODES.items()}}
+
+
+def _to_octets(field: Field) -> Callable[[Any], Any]:
+    if field.base == 'bool':
+        return bytes
+    if field.base == 'byte':
+        return b''.join
+    if field.kind == 'sequence':
+        return lambda value: value  # array.array is a buffer
+    return lambda value: value.tobytes()
+
+
+def _from_octets(field: Field) -> Callable[[Any], Any]:
+    if field.base == 'bool':
+        return lambda data: list(map(bool, data))
+    if field.base == 'byte':
+        return lambda data: [bytes((octet,)) for octet in data]
+    code = TYPECODES[field.base]
+    if field.kind == 'array':
+        import numpy
+        return lambda data: numpy.frombuffer(data, '<' + code).copy()
+
+    def load(data: Any) -> Any:
+        values = array.array(code)
+        values.frombytes(data)
+        return values
+    return load
+
+
+def _many(field: Field, single: Codec) -> Codec:
+    """Make the codec of an array or a sequence."""
+    counted, size = field.kind == 'sequence', SIZES.get(field.base, 0)
+
+    def count_at(buffer: Any, place: int) -> tuple[int, int]:
+        return _COUNT.read(buffer, place) if counted else (field.size, place)
+
+    def write(buffer: bytearray, values: Any) -> None:
+        if counted:
+            _COUNT.write(buffer, len(values))
+        for value in values:
+            single.write(buffer, value)
+
+    def read(buffer: Any, place: int) -> tuple[Any, int]:
+        count, place = count_at(buffer, place)
+        _end(buffer, place, count)  # each takes a byte at the least
+        values = []
+        for _ in range(count):
+            value, place = single.read(buffer, place)
+            values.append(value)
+        return values, place
+
+    if not size:
+        return Codec(write, read)
+    to_octets, from_octets = _to_octets(field), _from_octets(field)
+
+    def write_octets(buffer: bytearray, values: Any) -> None:
+        if counted:
+            _COUNT.write(buffer, len(values))
+        if len(values):
+            buffer += PADDING[(4 - len(buffer)) & (size - 1)]
+            buffer += to_octets(values)
+
+    def read_octets(buffer: Any, place: int) -> tuple[Any, int]:
+        count, place = count_at(buffer, place)
+        if count:
+            place += (4 - place) & (size - 1)
+        end = _end(buffer, place, count * size)
+        return from_octets(buffer[place:end]), end
+
+    return Codec(write_octets, read_octets)
+
+
+def _field(field: Field) -> Codec:
+    single = message_codec(field.base) if field.nested else _SINGLE[field.base]
+    return _many(field, single) if field.kind else single
 
 
 @lru_cache(maxsize=None)
-def writer(definition_name: str) -> Callable[[Any, bytearray], None]:
-    """Give the function that appends a message to a bytearray (a multiple of 8, plus 4, long)."""
-    from rosidl_embedded.definition import definition as find
-    generator = _Writer('def function(m, b):')
-    generator.message(find(definition_name), 'm')
-    generator.flush()
-    return generator.finish(definition_name)
-
-
-@lru_cache(maxsize=None)
-def reader(definition_name: str) -> Callable[[Any, int], tuple[Any, int]]:
+def message_codec(name: str) -> Codec:
     """
-    Give the function that reads a message from a buffer at a position.
+    Give the codec of a message.
 
     It raises :class:`TruncatedError` or ``struct.error`` where the buffer ends too early.
     """
-    from rosidl_embedded.definition import definition as find
     from rosidl_embedded.message import CHECK_FIELDS, message_class
-    generator = _Reader('def function(b, p):', message_class)
-    generator.names['CHECK'] = CHECK_FIELDS
-    generator.put('z = len(b)')
-    generator.message(find(definition_name), 'm')
-    generator.flush()
-    generator.put('return m, p')
-    return generator.finish(definition_name)
+    fields = definition(name).fields
+    cls: Any = message_class(name)
+    slots = ['_' + field.name for field in fields]
+    sizes = {0 if field.kind else SIZES.get(field.base, 0) for field in fields}
+    if len(fields) > 1 and len(sizes) == 1 and 0 not in sizes:  # as a vector's: all at once
+        together = _primitives(''.join(_CODES[field.base] for field in fields), sizes.pop())
+
+        def write(buffer: bytearray, message: Any) -> None:
+            together.write(buffer, [getattr(message, slot) for slot in slots])
+
+        def read(buffer: Any, place: int) -> tuple[Any, int]:
+            message: Any = cls.__new__(cls)
+            message._check_fields = CHECK_FIELDS
+            values, place = together.read(buffer, place)
+            for slot, value in zip(slots, values):
+                setattr(message, slot, value)
+            return message, place
+
+        return Codec(write, read)
+    parts = [(slot, *_field(field)) for slot, field in zip(slots, fields)]
+
+    def write_parts(buffer: bytearray, message: Any) -> None:
+        for slot, write, _ in parts:
+            write(buffer, getattr(message, slot))
+        if not parts:
+            buffer.append(0)  # a structure needs at least one member
+
+    def read_parts(buffer: Any, place: int) -> tuple[Any, int]:
+        message: Any = cls.__new__(cls)
+        message._check_fields = CHECK_FIELDS
+        for slot, _, read in parts:
+            value, place = read(buffer, place)
+            setattr(message, slot, value)
+        return message, place + (not parts)
+
+    return Codec(write_parts, read_parts)
 
 
 def serialize(message: Any, prefix: bytes = HEADER) -> bytearray:
     """
     Serialize a message.
 
-    :param prefix: what precedes it: the encapsulation header, for a service also the request's.
+    :param prefix: what precedes it: the encapsulation header, for a service also the request's;
+        a multiple of 8 bytes, and 4.
     :raises AssertionError: in ROS 2's words, if a field holds what it mustn't.
     """
     buffer = bytearray(prefix)
     try:
-        writer(message._definition.name)(message, buffer)
+        message_codec(message._definition.name).write(buffer, message)
     except (struct.error, AttributeError, TypeError, ValueError, IndexError) as error:
         from rosidl_embedded.message import validate
         validate(message)
@@ -350,6 +241,6 @@ def deserialize(buffer: Any, cls: type, position: int = 4) -> Any:
         raise ValueError('not a little-endian CDR message')
     name = cls._definition.name  # type: ignore[attr-defined]
     try:
-        return reader(name)(buffer, position)[0]
+        return message_codec(name).read(buffer, position)[0]
     except struct.error as error:
         raise TruncatedError(f'the serialized {name} is too short') from error

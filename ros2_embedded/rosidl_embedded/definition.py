@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface definitions: what a ``.msg`` or ``.srv`` says, as data."""
 
-import ast
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -86,12 +85,7 @@ def parse_field(text: str, package: str) -> Field:
     size = match['size']
     shape = '' if size is None else 'array' if size.isdigit() else 'sequence'
     count = int(size.replace('<=', '') or 0) if size else 0
-    value: Any = None
-    if default.strip():
-        if shape:
-            value = [_value(base, str(item)) for item in ast.literal_eval(default.strip())]
-        else:
-            value = _value(base, default)
+    value = _value(base, default) if default.strip() else None
     return Field(name, base, shape, count, int(match['text'] or 0), value)
 
 

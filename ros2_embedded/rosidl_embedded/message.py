@@ -11,7 +11,7 @@ ROS 2 reads a wrong type's memory, here it would be a late error. ``check_fields
 import array
 from collections import UserList, UserString
 from collections.abc import Callable, Sequence, Set
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 import os
 import re
@@ -177,34 +177,29 @@ def _property(field: Field) -> property:
     return property(getter, setter, doc=f"Message field '{field.name}'.")
 
 
-def _default(field: Field, names: dict[str, Any]) -> str:
-    """Write the expression of a field's default value."""
-    if field.default is not None and not field.kind:
-        return repr(field.default)
+def _default(field: Field) -> Callable[[], Any]:
+    """Make what makes a field's default value."""
     if field.kind == 'sequence':
-        return f"array('{TYPECODES[field.base]}')" if field.base in TYPECODES else '[]'
-    if field.kind == 'array' and field.base in TYPECODES:
+        return partial(array.array, TYPECODES[field.base]) if field.base in TYPECODES else list
+    if field.kind and field.base in TYPECODES:
         import numpy
-        names['zeros'] = numpy.zeros
-        return f"zeros({field.size}, dtype='{field.base}')"
-    if field.nested:
-        names[f'new_{field.name}'] = message_class(field.base)
-        single = f'new_{field.name}()'
-    else:
-        single = {'bool': 'False', 'byte': "b'\\0'", 'string': "''", 'wstring': "''"}.get(
-            field.base, '0.0' if field.base in FLOATS else '0')
-    return f'[{single} for _ in range({field.size})]' if field.kind else single
+        zeros: Any = numpy.zeros
+        return partial(zeros, field.size, dtype=field.base)
+    plain = b'\0' if field.base == 'byte' else field.default
+    single: Callable[[], Any] = _python_type(field) if plain is None else (lambda: plain)
+    return (lambda: [single() for _ in range(field.size)]) if field.kind else single
 
 
 def _constructor(described: Definition) -> Callable[..., None]:
-    names: dict[str, Any] = {'array': array.array, 'assign': _assign, 'CHECK': CHECK_FIELDS}
-    lines = ['def __init__(self, **kwargs):',
-             "  self._check_fields = kwargs.pop('check_fields', CHECK) if kwargs else CHECK"]
-    lines += [f'  self._{field.name} = {_default(field, names)}' for field in described.fields]
-    lines.append('  if kwargs: assign(self, kwargs)')
-    exec('\n'.join(lines), names)  # noqa: S102 - generated above, from our own tables
-    function: Callable[..., None] = names['__init__']
-    return function
+    defaults = [('_' + field.name, _default(field)) for field in described.fields]
+
+    def __init__(self: Any, **kwargs: Any) -> None:
+        self._check_fields = kwargs.pop('check_fields', CHECK_FIELDS)
+        for slot, default in defaults:
+            setattr(self, slot, default())
+        if kwargs:
+            _assign(self, kwargs)
+    return __init__
 
 
 def _assign(message: Any, values: dict[str, Any]) -> None:

@@ -1,16 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What programs look for in ROS 2's extension module."""
+"""ROS 2's extension module, which the embedded default doesn't have."""
 
-from types import SimpleNamespace
+from rclpy.exceptions import NotEmbeddedError
 
-from rclpy import exceptions
-
-rclpy_implementation = SimpleNamespace(
-    RCLError=exceptions.RCLError,
-    RCLInvalidROSArgsError=exceptions.RCLInvalidROSArgsError,
-    UnknownROSArgsError=exceptions.UnknownROSArgsError,
-    InvalidHandle=exceptions.InvalidHandle,
-    NodeNameNonExistentError=exceptions.NodeNameNonExistentError,
-    UnsupportedEventTypeError=exceptions.UnsupportedEventTypeError,
-    rclpy_get_rmw_implementation_identifier=lambda: 'rmw_cyclonedds_cpp',
-)
+raise NotEmbeddedError('rclpy.impl.implementation_singleton')

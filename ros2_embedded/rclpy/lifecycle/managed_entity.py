@@ -19,28 +19,10 @@ class ManagedEntity:
     """Takes part in transitions; does nothing by default."""
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
-        """Configure."""
+        """Do nothing, with success; likewise in the other transitions."""
         return TransitionCallbackReturn.SUCCESS
 
-    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
-        """Clean up."""
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
-        """Shut down."""
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_activate(self, state: Any) -> TransitionCallbackReturn:
-        """Become active."""
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
-        """Become inactive."""
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_error(self, state: Any) -> TransitionCallbackReturn:
-        """Handle an error in a transition."""
-        return TransitionCallbackReturn.SUCCESS
+    on_cleanup = on_shutdown = on_activate = on_deactivate = on_error = on_configure
 
 
 class SimpleManagedEntity(ManagedEntity):

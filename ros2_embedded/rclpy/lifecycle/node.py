@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Managed nodes: the states and transitions of ROS 2's node lifecycle design."""
 
+from functools import partialmethod
 from typing import Any, NamedTuple
 
 from lifecycle_msgs import msg, srv
@@ -163,29 +164,13 @@ class LifecycleNodeMixin(ManagedEntity):
                 return result
         return TransitionCallbackReturn.SUCCESS
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure all entities."""
-        return self._all_entities('on_configure', state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Clean all entities up."""
-        return self._all_entities('on_cleanup', state)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Shut all entities down."""
-        return self._all_entities('on_shutdown', state)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Activate all entities."""
-        return self._all_entities('on_activate', state)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Deactivate all entities."""
-        return self._all_entities('on_deactivate', state)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let all entities handle an error."""
-        return self._all_entities('on_error', state)
+    # a node that overrides one of these calls it to have its entities take part
+    on_configure = partialmethod(_all_entities, 'on_configure')
+    on_cleanup = partialmethod(_all_entities, 'on_cleanup')
+    on_shutdown = partialmethod(_all_entities, 'on_shutdown')
+    on_activate = partialmethod(_all_entities, 'on_activate')
+    on_deactivate = partialmethod(_all_entities, 'on_deactivate')
+    on_error = partialmethod(_all_entities, 'on_error')
 
     def create_lifecycle_publisher(self, *args: Any, **kwargs: Any) -> LifecyclePublisher:
         """Create a publisher that publishes while the node is active."""
