@@ -54,7 +54,8 @@ setup(
         'bench': ['matplotlib'],
         'kubernetes': KUBERNETES,
         'test': [
-            'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy', 'pytest',
+            'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
+            'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
             *KUBERNETES, *VIDEO],
         'video': VIDEO,
@@ -66,6 +67,12 @@ setup(
             'container = fogros2.provider.container:ContainerProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',
+        ],
+        'fogros2.machine': [
+            'aws = fogros2.actions.machines_cloud:AWSCloudInstance',
+            'container = fogros2.actions.machines:ContainerInstance',
+            'kubernetes = fogros2.actions.machines_cloud:KubeInstance',
+            'ssh = fogros2.actions.machines:SSHInstance',
         ],
         'fogros2.configured': [
             'aws = fogros2.provider.aws.clients:configured',
@@ -91,6 +98,9 @@ setup(
             'republished_compressed = '
             'fogros2.image_transport.republish:RepublishedCompressed',
             'theora = fogros2.image_transport.republish:Theora',
+        ],
+        'launch.frontend.launch_extension': [
+            'fogros2 = fogros2.actions.frontend',
         ],
         'ros2cli.command': [
             'fog = ros2fog_cli.command.fog:FogCommand',
