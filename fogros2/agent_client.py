@@ -141,7 +141,10 @@ class AgentClient:
             self._thread.start()
             threading.Thread(target=self._watch, name='fogros2-agent-watch', daemon=True).start()
 
-    def request(self, command: str, *, timeout: float = 30.0, **arguments: Any) -> dict[str, Any]:
+    def request(
+        self, command: str, *, timeout: float = 30.0, silent: Optional[float] = None,
+        **arguments: Any,
+    ) -> dict[str, Any]:
         """
         Ask the agent for something and return its reply.
 
@@ -149,6 +152,8 @@ class AgentClient:
         ``signal``, which would count twice.
 
         :param timeout: seconds, lost connections included.
+        :param silent: seconds without a word from the machine after which it is given up before,
+            more than half of ``silence``: an agent that is busy with the request says something.
         :raises AgentError: refused, with the agent's hint; or there is no agent (any more).
         :raises DeadlineExceeded: no reply in time.
         :raises Cancelled: ``cancel`` was set.
@@ -166,7 +171,8 @@ class AgentClient:
             stream = self._stream
         if stream is not None:
             self._send(stream, line)
-        deadline = time.monotonic() + timeout
+        begin = time.monotonic()
+        deadline = begin + timeout
         try:
             while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
                 if self._cancel.is_set():
@@ -174,6 +180,10 @@ class AgentClient:
                 if time.monotonic() >= deadline:
                     raise DeadlineExceeded(
                         f"the agent didn't answer '{command}' within {timeout:g} s")
+                if silent is not None and min(
+                        self.silent_for, time.monotonic() - begin) > silent:
+                    raise DeadlineExceeded(
+                        f"the agent hasn't said a word for {silent:g} s, nor answered '{command}'")
         finally:
             with self._lock:
                 self._pending.pop(number, None)

@@ -12,7 +12,7 @@ from typing import Any, Optional
 
 from fogros2 import bootstrap, model, plan
 from fogros2.agent_client import agent_source, AgentClient, Heartbeat
-from fogros2.deploy.job import Job
+from fogros2.deploy.job import Job, SILENT
 from fogros2.errors import (
     AgentAbsent,
     AgentError,
@@ -217,14 +217,12 @@ class Guard:
         with contextlib.suppress(AgentAbsent):
             try:
                 # answers when the nodes are gone; out of reach, its watch gets there by itself
-                agent.request('release', timeout=job.patience(job.timeouts.command),
+                agent.request('release', timeout=job.patience(job.timeouts.command), silent=SILENT,
                               launch=job.launch.id, on_exit=job.spec.on_exit,
                               exit=not job.provider.agent_program)
-            except DeadlineExceeded as error:
+            except DeadlineExceeded:
                 job.hurry()
-                raise DeadlineExceeded(
-                    f"'{job.name}' does not answer: its agent ends the nodes by itself, "
-                    f'{job.spec.robot_timeout:g} s after it last heard of this launch') from error
+                raise
 
 
 class _Rearming:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 #: Seconds in which a machine that is to be tidied up has to answer, and those that each further
 #: part of it may take if it doesn't: a Ctrl-C shouldn't wait for a computer that is off.
 ANSWER, HURRIED = 4.0, 2.0
+#: Seconds that it may say nothing, having answered before, and one command may take then.
+SILENT = 15.0
 
 
 class Job:
@@ -39,6 +41,8 @@ class Job:
         self.folder: MachineDirectory = launch.store.machine(spec.name)
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
         self.undo = contextlib.ExitStack()
+        self.undo.callback(self._tell_left)
+        self._left: list[str] = []
         #: Whether an earlier launch made the machine, and the id of the one that had it last.
         self.reused = False
         self.former = ''
@@ -58,8 +62,40 @@ class Job:
         return step(self.launch.report, self.name, name)
 
     def undoing(self, name: str, undo: Callable[[], None]) -> None:
-        """Push an undo step; its failure is reported, and the others run all the same."""
-        self.undo.callback(self.launch.attempt, self.name, name, undo)
+        """
+        Push an undo step; its failure is reported, and the others run all the same.
+
+        What a machine that doesn't answer keeps is told together, in the end.
+        """
+        self.undo.callback(self.undone, name, undo)
+
+    def undone(self, name: str, undo: Callable[[], None]) -> None:
+        """Take an undo step now, in the same manner."""
+        def tried() -> None:
+            try:
+                undo()
+            except (ConnectError, DeadlineExceeded):
+                if not self._hurried:
+                    raise
+                self._left.append(name)
+
+        self.launch.attempt(self.name, name, tried)
+
+    def _tell_left(self) -> None:
+        """Say what is left on a machine that didn't answer, and how it ends."""
+        def tell() -> None:
+            if self.folder.exists():
+                ends = 'ends the nodes'
+                hint = f'the next launch may take the machine, or: ros2 fog delete {self.name}'
+            else:
+                ends, hint = 'ends all of that and leaves', 'nothing needs to be done'
+            raise ConnectError(
+                f"'{self.name}' does not answer, so what it has of this launch stays there "
+                f"({', '.join(dict.fromkeys(self._left))}): its agent {ends} by itself, "
+                f'{self.spec.robot_timeout:g} s after it last heard of the launch', hint)
+
+        if self._left:
+            self.launch.attempt(self.name, 'left there', tell)
 
     def save(self, **changes: Any) -> None:
         """Write changes of the record down."""
@@ -94,7 +130,7 @@ class Job:
         """Run commands on the machine on the way down."""
         for command in commands:
             try:
-                shell.run(command, timeout=self.patience(self.timeouts.vpn))
+                shell.run(command, timeout=self.patience(min(self.timeouts.vpn, SILENT)))
             except (ConnectError, DeadlineExceeded):
                 self.hurry()
                 raise

@@ -140,5 +140,5 @@ class Joining:
         job = self._job
         if job.survives:
             # or the agent would take the interface for a broken one
-            job.launch.attempt(job.name, 'nodes', lambda: self._guard.release(agent))
+            job.undone('nodes', lambda: self._guard.release(agent))
             job.tidy(shell, job.launch.robot_vpn().vpn.down(interface))

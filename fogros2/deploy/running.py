@@ -10,7 +10,7 @@ import threading
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.agent_client import AgentClient, Heartbeat
-from fogros2.deploy.job import Job
+from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
 from fogros2.model import Machine, NodeSpec, VpnInterface
 from fogros2.shell import Shell
@@ -69,12 +69,13 @@ class RunningMachine:
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
-        self.agent.request('stop', timeout=self._patience(),
+        self.agent.request('stop', timeout=self._patience(), silent=SILENT,
                            nodes=None if ids is None else list(ids))
 
     def signal(self, node: str, name: str) -> None:
         """Send a node a signal, by its name (``SIGUSR1``)."""
-        self.agent.request('signal', timeout=self._patience(), node=node, signal=name)
+        self.agent.request(
+            'signal', timeout=self._patience(), silent=SILENT, node=node, signal=name)
 
     def _patience(self) -> float:
         """Return how long a request may take: at the end nobody out of reach is waited for."""

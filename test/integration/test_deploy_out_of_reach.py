@@ -63,7 +63,9 @@ def test_the_end_does_not_wait_for_a_machine_that_is_out_of_reach(cloud_network)
     finally:
         assert again.down() == []
     assert seconds < 15, f'{seconds:.0f} s'
-    assert any(f'{spec.name}' in str(failure) for failure in failures)
+    told, = failures
+    assert f"'{spec.name}' does not answer" in str(told) and '(nodes, VPN)' in str(told)
+    assert f'ros2 fog delete {spec.name}' in told.hint
 
 
 def arm(start, machine, job):

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from fogros2 import plan, plugin_system, process
+from fogros2.agent_client import AgentClient
 from fogros2.bootstrap import RosInstall
 from fogros2.deploy import entering, Launch, robot_vpn, watching
 from fogros2.deploy import launch as launches
@@ -40,6 +41,7 @@ from fogros2.errors import (
     VpnError,
 )
 from fogros2.model import (
+    Command,
     Endpoint,
     Machine,
     MachineSpec,
@@ -412,3 +414,34 @@ def test_a_port_of_the_robot_that_is_taken_says_what_to_do(launch, monkeypatch):
     monkeypatch.setattr(process, 'run', run)
     with pytest.raises(VpnError, match='in use already.*FOGROS2_VPN_PORT names another'):
         robot._bring_up()
+
+
+@pytest.mark.parametrize(('on_exit', 'owned', 'hint'), [
+    ('keep', True, 'ros2 fog delete planner'), ('delete', False, 'nothing needs to be done')])
+def test_what_stays_on_a_machine_out_of_reach_is_told_once(
+        launch, provider, monkeypatch, on_exit, owned, hint):
+    monkeypatch.setattr(FakeProvider, 'owned', owned)
+    mine = Job(launch, dataclasses.replace(SPEC, on_exit=on_exit))
+    mine.reused = True
+
+    def silent(command):
+        raise ConnectError("'planner' has not answered for 2 s")
+
+    shell = mine.shell = FakeShell(handlers={'ip': silent, 'true': silent})
+    with mine.undo:
+        Creation(mine)._claim('token')
+        mine.undoing('end', Creation(mine)._end)
+        for name in ('agent', 'VPN', 'nodes'):
+            mine.undoing(name, lambda: mine.tidy(shell, [Command(('ip', 'link'))]))
+    told, = launch.down()
+    assert 'stays there (nodes, VPN, agent)' in str(told) and hint in told.hint
+
+
+def test_a_machine_that_vanishes_while_it_ends_its_nodes_is_given_up(launch):
+    said = FakeStream()
+    client = AgentClient(FakeShell(streams=[said]), '/run/x', agent_path='agent.py')
+    begin = time.monotonic()
+    with pytest.raises(DeadlineExceeded, match="hasn't said a word for 0.3 s"):
+        client.request('release', timeout=30.0, silent=0.3)
+    assert time.monotonic() - begin < 5
+    client.close()
