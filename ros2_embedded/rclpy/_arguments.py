@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands between ``--ros-args`` and ``--`` on a command line."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import re
 from typing import Any
@@ -118,8 +119,6 @@ def _option(found: Arguments, item: str, rest: list[str]) -> None:
     elif item in _SWITCHES:
         name, on = _SWITCHES[item]
         found.switches[name] = on
-    elif (rule := parse_rule(item)) is not None:  # 'from:=to' alone is an old form, refused
-        found.unknown.append(item)
     else:
         found.unknown.append(item)
 
@@ -184,20 +183,21 @@ def _nodes(content: dict[str, Any], prefix: str, found: list[tuple[str, str, Any
         if key == 'ros__parameters':
             if not prefix or not isinstance(value, dict):
                 raise ValueError('Cannot have a value before ros__parameters')
-            _flatten(prefix, value, '', found)
+            found += [(prefix, name, _checked(value, ''))
+                      for name, value in flatten(value)]
         elif isinstance(value, dict):
             _nodes(value, f"{prefix}/{str(key).lstrip('/')}" if prefix else str(key), found)
         elif value is not None:
             raise ValueError(f"Cannot have a value before ros__parameters: '{key}'")
 
 
-def _flatten(node: str, values: dict[str, Any], prefix: str,
-             found: list[tuple[str, str, Any]]) -> None:
+def flatten(values: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield names with dots and values of nested parameters."""
     for key, value in values.items():
         if isinstance(value, dict):
-            _flatten(node, value, f'{prefix}{key}.', found)
+            yield from flatten(value, f'{prefix}{key}.')
         else:
-            found.append((node, f'{prefix}{key}', _checked(value, '')))
+            yield f'{prefix}{key}', value
 
 
 class Settings:

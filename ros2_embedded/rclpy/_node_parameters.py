@@ -385,35 +385,6 @@ class NodeParameters:
         """Give parameters' descriptors."""
         return [self.describe_parameter(name) for name in names]
 
-    def set_descriptor(self, name: str, descriptor: Any, alternative_value: Any = None) -> Any:
-        """
-        Replace a parameter's descriptor.
-
-        :param alternative_value: what to set if the new descriptor doesn't allow the value.
-        :returns: the value now, ``rcl_interfaces.msg.ParameterValue``.
-        :raises ParameterNotDeclaredException: if it isn't declared, and has to be.
-        :raises ParameterImmutableException: if it is read-only.
-        :raises InvalidParameterValueException: if the descriptor allows neither value.
-        """
-        if name not in self._parameters:
-            if not self._allow_undeclared_parameters:
-                raise ParameterNotDeclaredException(name)
-            return self.get_parameter(name).get_parameter_value()
-        if self._descriptors[name].read_only:
-            raise ParameterImmutableException(name)
-        current = self.get_parameter(name)
-        choices = [current]
-        if alternative_value is not None:
-            from rclpy.parameter import parameter_value_to_python
-            choices.append(Parameter(name, value=parameter_value_to_python(alternative_value)))
-        for choice in choices:
-            result = self._check(choice, descriptor, False)
-            if result.successful:
-                self._parameters[name] = choice
-                self._descriptors[name] = descriptor
-                return choice.get_parameter_value()
-        raise InvalidParameterValueException(name, choices[-1].value, result.reason)
-
     # --- callbacks ---
 
     def add_pre_set_parameters_callback(self, callback: Callback) -> None:

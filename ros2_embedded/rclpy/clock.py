@@ -6,7 +6,7 @@ from enum import IntEnum
 import threading
 import time
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -44,23 +44,11 @@ class JumpThreshold:
         self.on_clock_change = on_clock_change
 
 
-class TimeJump:
-    """A jump of a clock."""
+class TimeJump(NamedTuple):
+    """A jump of a clock: what it did to the clock's source, and how far it was."""
 
-    def __init__(self, clock_change: ClockChange, delta: Duration) -> None:
-        if not isinstance(clock_change, ClockChange):
-            raise TypeError('clock_change must be an instance of rclpy.clock.ClockChange')
-        self._clock_change, self._delta = clock_change, delta
-
-    @property
-    def clock_change(self) -> ClockChange:
-        """What it did to the clock's source."""
-        return self._clock_change
-
-    @property
-    def delta(self) -> Duration:
-        """How far it was."""
-        return self._delta
+    clock_change: ClockChange
+    delta: Duration
 
 
 class JumpHandle:

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable
 import os
-from pathlib import Path
 import re
 import sys
 import threading
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from rclpy._arguments import Arguments
 
 __all__ = ['LoggingSeverity', 'RcutilsLogger', 'clear_config', 'get_logger',
-           'get_logger_effective_level', 'get_logger_level', 'get_logging_directory',
+           'get_logger_effective_level', 'get_logger_level',
            'get_logging_severity_from_string', 'initialize', 'set_logger_level', 'shutdown']
 
 _COLOURS = {LoggingSeverity.DEBUG: '\033[32m', LoggingSeverity.INFO: '\033[0m',
@@ -51,14 +50,7 @@ def initialize() -> None:
     _default_level = LoggingSeverity.INFO
 
 
-def shutdown() -> None:
-    """Forget all levels."""
-    initialize()
-
-
-def clear_config() -> None:
-    """Set levels to their defaults."""
-    initialize()
+shutdown = clear_config = initialize
 
 
 def _configure(arguments: 'Arguments') -> None:
@@ -107,13 +99,6 @@ def get_logging_severity_from_string(log_severity: str) -> LoggingSeverity:
         return LoggingSeverity[log_severity.upper()]
     except KeyError:
         raise RuntimeError(f"'{log_severity}' is no logging severity") from None
-
-
-def get_logging_directory() -> Path:
-    """Give the folder for log files: ROS_LOG_DIR, or ROS_HOME/log."""
-    if given := os.environ.get('ROS_LOG_DIR'):
-        return Path(given).expanduser()
-    return Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser() / 'log'
 
 
 def _coloured(stream: TextIO) -> bool:

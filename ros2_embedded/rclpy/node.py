@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from copy import copy
 import sys
-from typing import Any
+from typing import Any, TypeVar
 import weakref
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
@@ -72,6 +72,7 @@ from rclpy.utilities import get_default_context
 __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 
 HIDDEN_NODE_PREFIX = '_'
+_T = TypeVar('_T', bound=Entity)
 
 
 class Node(NodeParameters, NodeGraph):
@@ -285,6 +286,15 @@ class Node(NodeParameters, NodeGraph):
 
     # --- creating ---
 
+    def _add(self, things: list[_T], thing: _T) -> _T:
+        """Have executors look after something new."""
+        if thing.callback_group is not None:
+            thing.callback_group.add_entity(thing)
+        things.append(thing)
+        self._waitables += getattr(thing, 'event_handlers', ())
+        self._wake_executor()
+        return thing
+
     def _profile(self, qos_or_depth: QoSProfile | int) -> QoSProfile:
         if isinstance(qos_or_depth, QoSProfile):
             return qos_or_depth
@@ -353,10 +363,7 @@ class Node(NodeParameters, NodeGraph):
         publisher = publisher_class(
             writer, msg_type, topic, profile, event_callbacks or PublisherEventCallbacks(),
             callback_group or self._default_callback_group, self._context, self._logger_name)
-        self._publishers.append(publisher)
-        self._waitables += publisher.event_handlers
-        self._wake_executor()
-        return publisher
+        return self._add(self._publishers, publisher)
 
     def create_subscription(
             self, msg_type: Any, topic: str, callback: Callable[..., Any],
@@ -379,13 +386,10 @@ class Node(NodeParameters, NodeGraph):
                 reader, msg_type, topic, callback, group, profile, raw,
                 event_callbacks or SubscriptionEventCallbacks(), self._logger_name)
         except RuntimeError:
+            self._graph.remove_endpoints(self._record, reader)
             reader.close()
             raise
-        group.add_entity(subscription)
-        self._subscriptions.append(subscription)
-        self._waitables += subscription.event_handlers
-        self._wake_executor()
-        return subscription
+        return self._add(self._subscriptions, subscription)
 
     def _service_entity(self, srv_type: Any, name: str, profile: QoSProfile,
                         serves: bool) -> tuple[Reader, Writer]:
@@ -419,10 +423,7 @@ class Node(NodeParameters, NodeGraph):
             self._context, self._service_entity(srv_type, srv_name, qos_profile, False),
             srv_type, srv_name, qos_profile, group, self._logger_name)
         client._make_event_writer = self._event_writer(srv_type, srv_name)
-        group.add_entity(client)
-        self._clients.append(client)
-        self._wake_executor()
-        return client
+        return self._add(self._clients, client)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any],
                        *, qos_profile: QoSProfile = qos_profile_services_default,
@@ -437,10 +438,7 @@ class Node(NodeParameters, NodeGraph):
             self._service_entity(srv_type, srv_name, qos_profile, True), srv_type, srv_name,
             callback, group, qos_profile, self._logger_name)
         service._make_event_writer = self._event_writer(srv_type, srv_name)
-        group.add_entity(service)
-        self._services.append(service)
-        self._wake_executor()
-        return service
+        return self._add(self._services, service)
 
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any] | None,
                      callback_group: CallbackGroup | None = None, clock: Clock | None = None,
@@ -456,20 +454,14 @@ class Node(NodeParameters, NodeGraph):
         timer = Timer(callback, group, int(float(timer_period_sec) * S_TO_NS),
                       clock or self._clock, context=self._context, autostart=autostart,
                       wake=self._wake_executor)
-        group.add_entity(timer)
-        self._timers.append(timer)
-        self._wake_executor()
-        return timer
+        return self._add(self._timers, timer)
 
     def create_guard_condition(self, callback: Callable[..., Any],
                                callback_group: CallbackGroup | None = None) -> GuardCondition:
         """Create a guard condition."""
         group = callback_group or self._default_callback_group
         guard = GuardCondition(callback, group, context=self._context)
-        group.add_entity(guard)
-        self._guards.append(guard)
-        self._wake_executor()
-        return guard
+        return self._add(self._guards, guard)
 
     def create_rate(self, frequency: float, clock: Clock | None = None) -> Rate:
         """

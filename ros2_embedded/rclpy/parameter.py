@@ -7,6 +7,7 @@ from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.msg import ParameterType, ParameterValue
+from rclpy._arguments import flatten
 
 PARAMETER_SEPARATOR_STRING = '.'
 
@@ -179,15 +180,5 @@ def parameter_dict_from_yaml_file(
         if not isinstance(content[key], dict) or 'ros__parameters' not in content[key]:
             raise RuntimeError(f'YAML file is not a valid ROS parameter file for node {key}')
         values.update(content[key]['ros__parameters'])
-    return _flatten(namespace, values)
-
-
-def _flatten(namespace: str, values: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        full = namespace + name
-        if isinstance(value, dict):
-            found.update(_flatten(full + PARAMETER_SEPARATOR_STRING, value))
-        else:
-            found[full] = ParameterMsg(name=full, value=get_parameter_value(str(value)))
-    return found
+    return {name: ParameterMsg(name=name, value=get_parameter_value(str(value)))
+            for name, value in flatten(values, namespace)}

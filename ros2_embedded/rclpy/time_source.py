@@ -58,11 +58,6 @@ class TimeSource:
 
     def attach_node(self, node: 'Node') -> None:
         """Follow this node's parameter."""
-        from rclpy.node import Node
-        if not isinstance(node, Node):
-            raise TypeError('Node must be of type rclpy.node.Node')
-        if self._reference is not None:
-            self.detach_node()
         self._reference = weakref.ref(node)
         if not node.has_parameter(USE_SIM_TIME_NAME):
             node.declare_parameter(USE_SIM_TIME_NAME, False)
@@ -73,14 +68,6 @@ class TimeSource:
             node.get_logger().error(f"Invalid type for parameter '{USE_SIM_TIME_NAME}' "
                                     f'{parameter.type_!r} should be bool')
         node.add_on_set_parameters_callback(self._on_parameters)
-
-    def detach_node(self) -> None:
-        """Follow no node."""
-        node = self._node()
-        if self._clock_sub is not None and node is not None:
-            node.destroy_subscription(self._clock_sub)
-        self._clock_sub = None
-        self._reference = None
 
     def attach_clock(self, clock: ROSClock) -> None:
         """

@@ -1,21 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interfaces by name, and messages as text and dictionaries."""
 
-from rosidl_runtime_py.convert import (
-    get_message_slot_types,
-    message_to_csv,
-    message_to_ordereddict,
-    message_to_yaml,
-)
-from rosidl_runtime_py.get_interfaces import (
-    get_interface_packages,
-    get_interfaces,
-    get_message_interfaces,
-    get_service_interfaces,
-)
+from rosidl_runtime_py.convert import message_to_csv, message_to_ordereddict, message_to_yaml
 from rosidl_runtime_py.set_message import set_message_fields
 
-__all__ = [
-    'get_interface_packages', 'get_interfaces', 'get_message_interfaces',
-    'get_message_slot_types', 'get_service_interfaces', 'message_to_csv',
-    'message_to_ordereddict', 'message_to_yaml', 'set_message_fields']
+__all__ = ['message_to_csv', 'message_to_ordereddict', 'message_to_yaml', 'set_message_fields']

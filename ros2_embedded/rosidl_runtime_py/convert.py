@@ -95,8 +95,3 @@ def message_to_ordereddict(msg: Any, *, truncate_length: int | None = None, no_a
 
     return OrderedDict((field.name, convert(getattr(msg, field.name), field))
                        for field in msg._definition.fields)
-
-
-def get_message_slot_types(msg: Any) -> 'OrderedDict[str, Field]':
-    """Give the fields of a message by their names."""
-    return OrderedDict((field.name, field) for field in msg._definition.fields)
