@@ -35,8 +35,10 @@ def data_files():
 KUBERNETES = ['kubernetes']
 #: What machines at AWS take; `import fogros2` and `ros2 fog` work without.
 AWS = ['boto3', 'requests']
+#: What serves topics to a viewer in the browser, on the machine.
+MONITOR = ['foxglove-sdk>=0.30']
 #: What nodes that handle images need; a robot that streams none doesn't.
-VIDEO = ['av', 'numpy', 'opencv-python-headless']
+VIDEO = ['av>=15', 'numpy', 'opencv-python-headless']
 
 setup(
     name='fogros2',
@@ -53,11 +55,12 @@ setup(
         'aws': AWS,
         'bench': ['matplotlib'],
         'kubernetes': KUBERNETES,
+        'monitor': MONITOR,
         'test': [
             'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
-            *KUBERNETES, *VIDEO],
+            *KUBERNETES, *MONITOR, *VIDEO],
         'video': VIDEO,
     },
     zip_safe=False,

@@ -24,6 +24,7 @@ import foxglove
 from foxglove.messages import CompressedVideo, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 import rclpy
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -170,7 +171,7 @@ class BridgeNode(Node):
             return
         try:
             publisher = self.create_publisher(message_class(kind), topic, 10)
-        except (LookupError, ValueError) as error:
+        except (LookupError, NameValidationException) as error:
             self._refuse(f'{topic}: {error}')
             return
         self._published[viewer, channel] = publisher

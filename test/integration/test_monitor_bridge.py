@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bridge as a process of its own, judged by Foxglove's own client."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator
+import itertools
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import threading
+from typing import Any
+
+import pytest
+
+pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
+pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+from geometry_msgs.msg import Twist
+import numpy
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image, Imu
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
+
+from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.model import DdsInterface
+from fogros2.testing import viewer as viewers
+from fogros2.waiting import wait_until
+
+ROOT = Path(__file__).parents[2]
+CACHE = ROOT / '.cache/node'
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_domains = itertools.count(os.getpid())
+
+
+class Bench:
+    """A bridge, a node in this process whose topics it serves, and viewers."""
+
+    def __init__(self) -> None:
+        self.processes: list[subprocess.Popen[str]] = []
+        self.viewers: list[viewers.Viewer] = []
+        self.lines: list[str] = []
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+        self.node = Node('bench', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self._spinning = threading.Thread(target=self.executor.spin)
+        self._spinning.start()
+        self.bridge = self.run('-m', 'fogros2.monitor.bridge', '--ros-args', '-p', 'port:=0')
+        self.url = self.until(
+            lambda: re.search(r'serving (ws://\S+)', ''.join(self.lines)), 'a bridge')[1]
+
+    def run(self, *words: str) -> subprocess.Popen[str]:
+        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
+        process = subprocess.Popen(
+            [sys.executable, *words], env={**os.environ, 'PYTHONPATH': path},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        assert process.stdout is not None
+        threading.Thread(
+            target=lambda: self.lines.extend(process.stdout or ()), daemon=True).start()
+        self.processes.append(process)
+        return process
+
+    def viewer(self) -> viewers.Viewer:
+        made = viewers.Viewer(CACHE, self.url)
+        self.viewers.append(made)
+        made.until('open')
+        return made
+
+    def until(self, probe: Callable[[], Any], what: str) -> Any:
+        return wait_until(lambda: probe() or None, timeout=20, what=what)
+
+    def listeners(self, topic: str, count: int) -> None:
+        self.until(lambda: self.node.count_subscribers(topic) == count,
+                   f'{count} subscriptions of {topic}')
+
+    def close(self) -> None:
+        for viewer in self.viewers:
+            viewer.close()
+        for process in self.processes:
+            process.send_signal(signal.SIGINT)
+        codes = [process.wait(20) for process in self.processes]
+        self.executor.shutdown()
+        self._spinning.join(10)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        assert set(codes) == {0}, ''.join(self.lines)
+
+
+@pytest.fixture(scope='module')
+def client() -> None:
+    why_not = viewers.install(ROOT / 'test/node', CACHE)
+    if why_not:
+        pytest.skip(why_not)
+
+
+@pytest.fixture
+def bench(client: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    vendor = CycloneDds()
+    path = tmp_path / 'dds.xml'
+    path.write_text(vendor.render([DdsInterface('lo')], []))
+    for key, value in vendor.environment(str(path), {}).items():
+        monkeypatch.setenv(key, value)
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(20 + next(_domains) % 80))
+    made = Bench()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_messages_arrive_as_they_were_published(bench):
+    words = bench.node.create_publisher(String, '/words', 10)
+    imus = bench.node.create_publisher(Imu, '/imu', 10)
+    arrays = bench.node.create_publisher(Float64MultiArray, '/numbers', 10)
+    images = bench.node.create_publisher(Image, '/image', 10)
+    viewer = bench.viewer()
+    for topic, schema in (('/words', 'std_msgs/msg/String'), ('/imu', 'sensor_msgs/msg/Imu'),
+                          ('/numbers', 'std_msgs/msg/Float64MultiArray'),
+                          ('/image', 'sensor_msgs/msg/Image')):
+        channel = viewer.look(topic)
+        assert (channel['encoding'], channel['schema']) == ('cdr', schema)
+        bench.listeners(topic, 1)
+
+    words.publish(String(data='Grüße, 世界'))
+    assert viewer.message('/words') == {'data': 'Grüße, 世界'}
+
+    imu = Imu()
+    imu.header.stamp.sec, imu.header.stamp.nanosec = 1234567890, 987654321
+    imu.header.frame_id = 'imu_link'
+    imu.orientation.w, imu.angular_velocity.z = 0.5, -1e-300
+    imu.linear_acceleration_covariance = numpy.arange(9, dtype=float)
+    imus.publish(imu)
+    seen = viewer.message('/imu')
+    assert seen['header'] == {
+        'stamp': {'sec': 1234567890, 'nanosec': 987654321}, 'frame_id': 'imu_link'}
+    assert seen['orientation']['w'] == 0.5
+    assert seen['angular_velocity']['z'] == -1e-300
+    assert seen['linear_acceleration_covariance'] == list(range(9))
+
+    numbers = Float64MultiArray(data=[1.5, -2.0])
+    numbers.layout.dim = [MultiArrayDimension(label='x', size=2, stride=2)]
+    arrays.publish(numbers)
+    assert viewer.message('/numbers') == {
+        'layout': {'dim': [{'label': 'x', 'size': 2, 'stride': 2}], 'data_offset': 0},
+        'data': [1.5, -2.0]}
+
+    pixels = numpy.random.default_rng(1).integers(0, 256, 7 * 5 * 3, numpy.uint8)
+    images.publish(Image(height=5, width=7, encoding='rgb8', step=21, data=pixels.tobytes()))
+    assert viewer.message('/image')['data'] == pixels.tolist()
+
+
+def test_a_topic_is_subscribed_to_while_somebody_looks(bench):
+    bench.node.create_publisher(String, '/words', 10)
+    first, second = bench.viewer(), bench.viewer()
+    first.until('channel', '/words')
+    bench.listeners('/words', 0)
+    first.wish(subscribe='/words')
+    second.look('/words')
+    bench.listeners('/words', 1)
+    first.wish(unsubscribe='/words')
+    second.close()
+    bench.listeners('/words', 0)
+
+
+def test_topics_come_and_go(bench):
+    viewer = bench.viewer()
+    publisher = bench.node.create_publisher(String, '/late', 10)
+    viewer.until('channel', '/late')
+    bench.node.destroy_publisher(publisher)
+    viewer.until('gone', '/late')
+
+
+def test_who_comes_late_sees_what_is_latched(bench):
+    maps = bench.node.create_publisher(String, '/map', LATCHED)
+    maps.publish(String(data='here'))
+    for _ in range(2):
+        viewer = bench.viewer()
+        viewer.look('/map')
+        assert viewer.message('/map') == {'data': 'here'}
+
+
+def test_viewers_publish(bench):
+    heard: list[Any] = []
+    bench.node.create_subscription(Twist, '/cmd_vel', heard.append, 10)
+    viewer = bench.viewer()
+    vector = 'float64 x\nfloat64 y\nfloat64 z\n'
+    definition = ('geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n'
+                  f'{"=" * 80}\nMSG: geometry_msgs/Vector3\n{vector}')
+
+    def publish() -> bool:
+        viewer.wish(publish='/cmd_vel', schemaName='geometry_msgs/msg/Twist',
+                    definition=definition, message={
+                        'linear': {'x': 0.25, 'y': 0, 'z': 0},
+                        'angular': {'x': 0, 'y': 0, 'z': -1}})
+        return bool(heard)
+
+    bench.until(publish, 'what a viewer published')
+    assert (heard[0].linear.x, heard[0].angular.z) == (0.25, -1.0)
+
+
+def test_what_can_not_be_published_is_said(bench):
+    viewer = bench.viewer()
+    viewer.wish(publish='/x', schemaName='no_such_msgs/msg/Thing', definition='string data',
+                message={'data': ''})
+    assert 'no_such_msgs' in viewer.until('status')['status']
+    viewer.wish(publish='/a b', schemaName='std_msgs/msg/String', definition='string data',
+                message={'data': ''})
+    assert '/a b' in viewer.until('status')['status']
+
+
+def protobuf(data: bytes) -> dict[int, bytes]:
+    """Return the fields of a message that has only such with a length."""
+    fields = {}
+    while data:
+        number, data = data[0] >> 3, data[1:]
+        length = shift = 0
+        while True:
+            byte, data = data[0], data[1:]
+            length |= (byte & 0x7f) << shift
+            shift += 7
+            if byte < 0x80:
+                break
+        fields[number], data = data[:length], data[length:]
+    return fields
+
+
+def test_a_stream_goes_out_as_video(bench):
+    av = pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+    images = bench.node.create_publisher(Image, '/camera', 2)
+    shades = itertools.cycle(range(0, 250, 10))
+    header = Header(frame_id='camera_link')
+    bench.node.create_timer(1 / 30, lambda: images.publish(Image(
+        header=header, height=48, width=64, encoding='mono8', step=64,
+        data=bytes([next(shades)]) * (48 * 64))))
+    bench.run(str(ROOT / 'image_transport_h264/scripts/encoder'), '--ros-args',
+              '-r', 'image:=/camera', '-p', 'stream:=/camera/h264', '-p', 'gop:=1000')
+    # the second comes in the midst of a stream, and needs a picture that stands alone
+    for _ in range(2):
+        viewer = bench.viewer()
+        viewer.until('schema', 'foxglove.CompressedVideo')
+        viewer.wish(subscribe='/camera/h264')
+        decoder = av.CodecContext.create('h264', 'r')
+        frames: list[Any] = []
+        while not frames:
+            fields = protobuf(base64.b64decode(viewer.message('/camera/h264')))
+            assert (fields[2], fields[4]) == (b'camera_link', b'h264')
+            frames += decoder.decode(av.Packet(fields[3]))
+        assert (frames[0].width, frames[0].height) == (64, 48)

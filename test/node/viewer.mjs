@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: Apache-2.0
+// A viewer: Foxglove's own client, driven by lines of JSON on its input, which tells what it sees
+// in lines of JSON on its output.
+//
+//   node viewer.mjs URL
+//
+// Takes {subscribe: TOPIC}, {unsubscribe: TOPIC}, {publish: TOPIC, schemaName, definition, message}
+// and {pause: true}, after which it reads nothing more. Tells {open}, {channel}, {gone}, {message},
+// {status} and {error}.
+import protocol from '@foxglove/ws-protocol';
+import rosmsg from '@foxglove/rosmsg';
+import serialization from '@foxglove/rosmsg2-serialization';
+import readline from 'node:readline';
+import WebSocket from 'ws';
+
+const { FoxgloveClient } = protocol;
+const tell = (what) => process.stdout.write(
+  JSON.stringify(what, (_, value) => typeof value === 'bigint' ? Number(value)
+    : ArrayBuffer.isView(value) ? Array.from(value) : value) + '\n');
+
+const socket = new WebSocket(
+  process.argv[2], [FoxgloveClient.SUPPORTED_SUBPROTOCOL, 'foxglove.sdk.v1'],
+  { rejectUnauthorized: false });
+socket.on('unexpected-response', (_, response) => tell({ error: `status ${response.statusCode}` }));
+const client = new FoxgloveClient({ ws: socket });
+const channels = new Map(), subscriptions = new Map(), advertised = new Map();
+
+client.on('open', () => tell({ open: true }));
+client.on('error', (error) => tell({ error: String(error?.message ?? error) }));
+client.on('close', () => { tell({ closed: true }); process.exit(0); });
+client.on('status', (status) => tell({ status: status.message }));
+client.on('advertise', (list) => {
+  for (const channel of list) {
+    channels.set(channel.topic, channel);
+    tell({ channel: channel.topic, encoding: channel.encoding, schema: channel.schemaName });
+  }
+});
+client.on('unadvertise', (ids) => {
+  for (const [topic, channel] of channels) {
+    if (ids.includes(channel.id)) { channels.delete(topic); tell({ gone: topic }); }
+  }
+});
+client.on('message', ({ subscriptionId, data }) => {
+  const { topic, reader } = subscriptions.get(subscriptionId);
+  tell({ topic, size: data.byteLength, at: Date.now(),
+    message: reader ? reader.readMessage(data) : Buffer.from(
+      data.buffer, data.byteOffset, data.byteLength).toString('base64') });
+});
+
+readline.createInterface({ input: process.stdin }).on('line', (line) => {
+  const wish = JSON.parse(line);
+  if (wish.subscribe) {
+    const channel = channels.get(wish.subscribe);
+    const reader = channel.encoding === 'cdr' && !wish.raw
+      ? new serialization.MessageReader(rosmsg.parse(channel.schema, { ros2: true })) : undefined;
+    subscriptions.set(client.subscribe(channel.id), { topic: wish.subscribe, reader });
+  } else if (wish.unsubscribe) {
+    for (const [id, { topic }] of subscriptions) {
+      if (topic === wish.unsubscribe) { client.unsubscribe(id); subscriptions.delete(id); }
+    }
+  } else if (wish.publish) {
+    if (!advertised.has(wish.publish)) {
+      advertised.set(wish.publish, client.advertise({
+        topic: wish.publish, encoding: wish.encoding ?? 'cdr', schemaName: wish.schemaName }));
+    }
+    const writer = new serialization.MessageWriter(rosmsg.parse(wish.definition, { ros2: true }));
+    client.sendMessage(advertised.get(wish.publish), writer.writeMessage(wish.message));
+  } else if (wish.pause) {
+    socket._socket.pause();
+  }
+}).on('close', () => process.exit(0));
