@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 #: What a group's plugins are called in messages.
 GROUPS = {
     'fogros2.provider': 'provider',
+    'fogros2.machine': 'provider',
     'fogros2.shell': 'shell',
     'fogros2.vpn': 'VPN',
     'fogros2.dds': 'DDS vendor',

@@ -9,7 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING, Union
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.actions import streaming
+from fogros2.actions import streaming, words
 from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
@@ -18,6 +18,8 @@ from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
     from fogros2.image_transport.streams import Entry
 
 
@@ -36,11 +38,11 @@ class CloudGroup(GroupAction):
     """
 
     def __init__(
-        self, machine: Union[CloudInstance, str],
+        self, machine: Union[CloudInstance, SomeSubstitutionsType],
         actions: Iterable[Action], *, stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(list(actions), **kwargs)
-        if not isinstance(machine, (CloudInstance, str)):
+        if not isinstance(machine, CloudInstance) and not words.is_text(machine):
             raise ConfigurationError(
                 f'machine={machine!r} is no machine',
                 'pass one such as ContainerInstance(), or the name of one')
@@ -52,7 +54,9 @@ class CloudGroup(GroupAction):
         """Execute the action: yields the content, its processes turned into remote ones."""
         if context.is_shutdown:
             return None
-        Coordinator.of(context).know(self.machine)
+        coordinator = Coordinator.of(context)
+        coordinator.know(self.machine)
+        self._resolved = coordinator.resolve(self.machine)
         self._streams = streaming.resolve(
             context, self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
         streaming.check(self._streams)
@@ -62,8 +66,12 @@ class CloudGroup(GroupAction):
         if isinstance(entity, ExecuteLocal) and not isinstance(
                 entity, (RemoteProcess, RobotCarrier)):
             # before the action's own execution, which may make a ROS node in this process
-            Coordinator.of(context).engage()
-            send(entity, self.machine, self._streams)
+            coordinator = Coordinator.of(context)
+            if not coordinator.on_robot(self._resolved):
+                coordinator.engage()
+            send(entity, self._resolved, self._streams)
         elif any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__):
             # by name: importing it takes longer than most launches have use for
-            Coordinator.of(context).session(self.machine).loads_components()
+            coordinator = Coordinator.of(context)
+            if not coordinator.on_robot(self._resolved):
+                coordinator.session(self._resolved).loads_components()

@@ -9,12 +9,14 @@ from typing import Any, TYPE_CHECKING, Union
 from launch import LaunchContext
 from launch_ros.actions import Node
 
-from fogros2.actions import streaming
+from fogros2.actions import streaming, words
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote import RemoteProcess
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
     from fogros2.image_transport.streams import Entry
 
 
@@ -31,11 +33,11 @@ class CloudNode(Node, RemoteProcess):
     """
 
     def __init__(
-        self, machine: Union[CloudInstance, str],
+        self, machine: Union[CloudInstance, SomeSubstitutionsType],
         stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        if not isinstance(machine, (CloudInstance, str)):
+        if not isinstance(machine, CloudInstance) and not words.is_text(machine):
             raise ConfigurationError(
                 f'machine={machine!r} is no machine',
                 'pass one such as ContainerInstance(), or the name of one')

@@ -26,18 +26,26 @@ from launch.actions import (
 )
 from launch.event_handlers import OnShutdown
 import launch.logging
+from launch.substitutions import SubstitutionFailure
 
-from fogros2.actions import census, cost, interruption, private, signals, streaming
+from fogros2.actions import census, cost, interruption, private, signals, streaming, words
 from fogros2.actions.console import Console
 from fogros2.actions.interruption import MachineInterrupted
+from fogros2.actions.keywords import ROBOT
+from fogros2.actions.machines import CloudInstance
 from fogros2.actions.session import Session
 from fogros2.errors import Cancelled, ConfigurationError, FogError
 
 if TYPE_CHECKING:
-    from fogros2.actions.machines import CloudInstance
+    from launch import SomeSubstitutionsType
+
+    from fogros2.actions.override import Overrides
     from fogros2.deploy import Launch
     from fogros2.image_transport.streams import Entry
-    from fogros2.model import NodeSpec
+    from fogros2.model import MachineSpec, NodeSpec
+
+    #: What launch files have for a machine; a name may be of one that is mentioned elsewhere.
+    SomeMachine = Union[CloudInstance, SomeSubstitutionsType]
 
 #: Name under which ``context.locals`` has the coordinator.
 _LOCAL = 'fogros2'
@@ -86,6 +94,7 @@ class Coordinator:
         self._cancel = threading.Event()
         self._console: Optional[Console] = None
         self._instances: dict[str, CloudInstance] = {}
+        self._overrides: Optional[Overrides] = None
         self._sessions: dict[str, Session] = {}
         self._new: list[Session] = []
         self._begun = True
@@ -143,21 +152,76 @@ class Coordinator:
         self._restore_signals = signals.take_over(context)
         self._set_dds_environment()
 
-    def know(self, machine: Union[CloudInstance, str]) -> None:
+    def know(self, machine: Optional[SomeMachine]) -> None:
         """Remember a machine that the launch mentions, so that its name may stand for it."""
-        if not isinstance(machine, str):
+        if isinstance(machine, CloudInstance):
             self._instances[machine.name] = machine
 
-    def session(self, machine: Union[CloudInstance, str]) -> Session:
+    def override(self, overrides: Overrides) -> None:
+        """Have machines made elsewhere than the launch file says."""
+        self._overrides = overrides
+        # what there is no machine for is refused in any case
+        self.begin()
+
+    def resolve(self, machine: SomeMachine) -> Union[CloudInstance, str]:
+        """Return a machine, or its name resolved."""
+        if isinstance(machine, CloudInstance):
+            return machine
+        return str(words.resolve(self._context, machine))
+
+    def on_robot(self, machine: SomeMachine) -> bool:
+        """
+        Return whether what is for a machine runs on the robot, where none is to be made.
+
+        :raises ConfigurationError: a wrong value, or an unknown name.
+        """
+        if self._overrides is None and all(
+                known.provider != ROBOT for known in self._instances.values()):
+            return False
+        machine = self.resolve(machine)
+        if isinstance(machine, str):
+            machine = self._by_name(machine)
+        return self._spec(machine).provider == ROBOT
+
+    def engage_for(self, machines: Iterable[Optional[SomeMachine]]) -> None:
+        """Engage if one of the machines may have to be made; their names may not be known yet."""
+        if any(self._may_be_made(machine) for machine in machines):
+            self.engage()
+
+    def _may_be_made(self, machine: Optional[SomeMachine]) -> bool:
+        name = machine.own_name if isinstance(machine, CloudInstance) else machine
+        name = self._resolved(name) or ''
+        override = self._overrides.of(name) if self._overrides is not None else None
+        if override is not None:
+            return not override.on_robot
+        if not isinstance(machine, CloudInstance):
+            machine = next((known for known in self._instances.values()
+                            if self._resolved(known.own_name) == name), None)
+        return machine is None or machine.provider != ROBOT
+
+    def _resolved(self, name: Optional[SomeSubstitutionsType]) -> Optional[str]:
+        """Return a name, None while it isn't known."""
+        try:
+            resolved: Optional[str] = words.resolve(self._context, name)
+        except SubstitutionFailure:
+            return None
+        return resolved
+
+    def _spec(self, machine: CloudInstance) -> MachineSpec:
+        spec = machine.spec(self._context)
+        return spec if self._overrides is None else self._overrides.apply(spec, self._context)
+
+    def session(self, machine: SomeMachine) -> Session:
         """
         Return the session of a machine, which comes up soon if this is the first to ask for it.
 
         :raises ConfigurationError: a wrong value, an unknown name, or a name used twice.
         """
         self.engage()
+        machine = self.resolve(machine)
         if isinstance(machine, str):
             machine = self._by_name(machine)
-        spec = machine.spec(self._context)
+        spec = self._spec(machine)
         self._instances[spec.name] = machine
         session = self._sessions.get(spec.name)
         if session is None:
@@ -261,6 +325,9 @@ class Coordinator:
         self._begun = True
         if context.is_shutdown:
             return
+        if self._overrides is not None:
+            names = [self._resolved(known.own_name) for known in self._instances.values()]
+            self._overrides.check([name for name in names if name is not None])
         new, self._new = self._new, []
         if new:
             task = context.asyncio_loop.create_task(self._bring_up(new))

@@ -25,12 +25,14 @@ from launch.actions import (
 from fogros2.actions import private, streaming
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.fog_machine import FogMachine
 from fogros2.actions.remote import RemoteProcess
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 from fogros2.model import RobotNodes
 
 if TYPE_CHECKING:
+    from fogros2.actions.coordinator import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 #: What only sets something for what comes after it.
@@ -71,18 +73,23 @@ class FogROSLaunchDescription(LaunchDescription):
         coordinator = Coordinator.of(context)
         coordinator.stream_everywhere(
             self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
-        cloudy = False
+        cloudy: list[SomeMachine] = []
         for entity, certain in cloud_entities(self.entities):
+            if isinstance(entity, FogMachine):
+                # of several with one name, the one whose condition holds makes itself known
+                coordinator.know(entity.machine if certain else None)
+                continue
             coordinator.know(entity.machine)
             # what comes late, from a timer, is refused before a machine is made all the same
             streaming.check(getattr(entity, 'stream_topics', ()))
-            cloudy = cloudy or certain
+            if certain:
+                cloudy.append(entity.machine)
         if cloudy:
             # the first cloud process may come late, from a timer; the nodes here, launch's own
             # among them, need the DDS settings before they begin. What is set first counts.
             first = next((number for number, entity in enumerate(entities)
                           if not isinstance(entity, _SETTINGS)), len(entities))
-            engage = OpaqueFunction(function=lambda context: coordinator.engage())
+            engage = OpaqueFunction(function=lambda context: coordinator.engage_for(cloudy))
             entities = [*entities[:first], engage, *entities[first:]]
         if self.robot_nodes == 'immediately':
             return entities
@@ -92,7 +99,7 @@ class FogROSLaunchDescription(LaunchDescription):
 
 def cloud_entities(
     entities: Iterable[LaunchDescriptionEntity], certain: bool = True,
-) -> Iterator[tuple[Union[RemoteProcess, CloudGroup], bool]]:
+) -> Iterator[tuple[Union[RemoteProcess, CloudGroup, FogMachine], bool]]:
     """
     Yield what of these entities, at any depth, is for a machine; no file is read for it.
 
@@ -100,7 +107,7 @@ def cloud_entities(
     """
     for entity in entities:
         sure = certain and getattr(entity, 'condition', None) is None
-        if isinstance(entity, (RemoteProcess, CloudGroup)):
+        if isinstance(entity, (RemoteProcess, CloudGroup, FogMachine)):
             yield entity, sure
         if not isinstance(entity, IncludeLaunchDescription):
             below = [entity.describe_sub_entities(), *(

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
 import difflib
 import inspect
 import os
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from fogros2.deploy import RunningMachine
 
     Value = Union[SomeSubstitutionsType, int, float]
+    Truth = Union[bool, SomeSubstitutionsType]
 
 _UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
 _DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
@@ -68,7 +70,8 @@ class CloudInstance:
 
     def __init__(
         self, ros_workspace: Optional[SomeSubstitutionsType] = None,
-        working_dir_base: Optional[str] = None, launch_foxglove: bool = False, *,
+        working_dir_base: Optional[SomeSubstitutionsType] = None,
+        launch_foxglove: Truth = False, *,
         name: Optional[SomeSubstitutionsType] = None,
         on_exit: SomeSubstitutionsType = 'delete',
         lifetime: Value = DEFAULT_LIFETIME,
@@ -96,10 +99,13 @@ class CloudInstance:
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
         self._foxglove = launch_foxglove
-        self._containers: list[str] = []
+        self._containers: list[SomeSubstitutionsType] = []
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # what is plain is checked where it is written
+        for key, value in self._options.items():
+            with _named(key):
+                words.check_plain(value)
         if isinstance(self._name, str):
             check_name(self._name)
         for key, value in self._values.items():
@@ -132,6 +138,11 @@ class CloudInstance:
         return words.describe(self._name)
 
     @property
+    def own_name(self) -> SomeSubstitutionsType:
+        """The name as the launch file has it."""
+        return self._name
+
+    @property
     def ip(self) -> Optional[str]:
         """The address the robot reaches the machine at, None while it isn't up."""
         return self._running.machine.vpn_host if self._running else None
@@ -155,16 +166,17 @@ class CloudInstance:
         shell = self._running.machine.shell if self._running else None
         return {
             'name': self.name,
-            'cloud_service_provider': self.provider,
+            'cloud_service_provider':
+                self._running.spec.provider if self._running else self.provider,
             'ros_workspace': self._spec.workspace if self._spec else words.describe(
                 self._workspace),
-            'working_dir': self._working_dir_base,
+            'working_dir': self._working_dir_base and words.describe(self._working_dir_base),
             'ssh_key_path': shell.key_file if shell else None,
             'public_ip': self.ip,
             'vpn_ip': self.vpn_ip,
         }
 
-    def add_docker_container(self, cmd: str) -> None:
+    def add_docker_container(self, cmd: SomeSubstitutionsType) -> None:
         """Have a ``docker run`` command line executed on the machine before its nodes start."""
         self._containers.append(cmd)
 
@@ -193,16 +205,21 @@ class CloudInstance:
                 name=check_name(name),
                 provider=self.provider,
                 options={
-                    key: words.resolve_later(context, value)
+                    key: self._resolved(context, key, value)
                     for key, value in self._options.items()},
                 workspace=workspace or None,
                 environment={
                     key: words.resolve(context, value)
                     for key, value in self._environment.items()},
-                containers=tuple(self._containers),
-                launch_foxglove=self._foxglove,
+                containers=tuple(words.resolve(context, line) for line in self._containers),
+                launch_foxglove=self._resolved(
+                    context, 'launch_foxglove', words.Truth(self._foxglove)),
                 **values)
         return self._spec
+
+    def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
+        with _named(keyword):
+            return words.resolve_later(context, value)
 
     def _option(self, name: str) -> Any:
         """Return an option: as it was resolved, or what is to be read of it until then."""
@@ -300,6 +317,15 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
         raise ConfigurationError(
             f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
     return seconds
+
+
+@contextlib.contextmanager
+def _named(keyword: str) -> Iterator[None]:
+    """Have an error in the value of a keyword say which it is."""
+    try:
+        yield
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{keyword}: {error.args[0]}', error.hint) from error
 
 
 def _choice(kind: Any) -> Any:

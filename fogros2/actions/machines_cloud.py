@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Any, Optional, TYPE_CHECKING, TypedDict, Union
 
 from fogros2.actions import words
 from fogros2.actions.machines import CloudInstance
@@ -13,9 +13,17 @@ from fogros2.actions.machines import CloudInstance
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-    from fogros2.actions.machines import Value
+    from fogros2.actions.machines import Truth, Value
 
-    Truth = Union[bool, SomeSubstitutionsType]
+
+class Toleration(TypedDict, total=False):
+    """Lets a pod onto nodes that keep others off, as in its specification."""
+
+    key: str
+    operator: str
+    value: str
+    effect: str
+    tolerationSeconds: int
 
 
 class AWSCloudInstance(CloudInstance):
@@ -136,7 +144,7 @@ class KubeInstance(CloudInstance):
         gpus: Optional[Value] = None,
         gpu_resource: Optional[SomeSubstitutionsType] = None,
         node_selector: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        tolerations: Optional[Sequence[Mapping[str, Any]]] = None,
+        tolerations: Optional[Sequence[Toleration]] = None,
         runtime_class: Optional[SomeSubstitutionsType] = None,
         image_pull_secrets: Optional[Sequence[SomeSubstitutionsType]] = None,
         service_account: Optional[SomeSubstitutionsType] = None,

@@ -4,20 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Optional, TYPE_CHECKING, Union
+from typing import Optional, TYPE_CHECKING
 
 from launch import LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 from launch.event_handlers import OnProcessIO
 
-from fogros2.actions import carriers, node_spec, private
+from fogros2.actions import carriers, node_spec, private, streaming
 from fogros2.actions.coordinator import Coordinator
-from fogros2.actions.machines import CloudInstance
 from fogros2.actions.remote_run import RemoteRun
 from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
 
 if TYPE_CHECKING:
+    from fogros2.actions.coordinator import SomeMachine
     from fogros2.actions.session import Session
     from fogros2.image_transport.streams import Entry
 
@@ -31,7 +31,7 @@ class RemoteProcess(ExecuteLocal):
     but for the start of the process.
     """
 
-    _fogros2_machine: Union[CloudInstance, str]
+    _fogros2_machine: SomeMachine
     _fogros2_streams: Sequence[Entry] = ()
     _fogros2_session: Session
     _fogros2_node: NodeSpec
@@ -41,13 +41,17 @@ class RemoteProcess(ExecuteLocal):
     _fogros2_here = False
 
     @property
-    def machine(self) -> Union[CloudInstance, str]:
+    def machine(self) -> SomeMachine:
         """The machine that the process runs on, or its name."""
         return self._fogros2_machine
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action as ExecuteLocal does, and what will travel."""
         coordinator = Coordinator.of(context)
+        if coordinator.on_robot(self._fogros2_machine):
+            self._fogros2_here = True
+            super().prepare(context)
+            return
         self._fogros2_session = session = coordinator.session(self._fogros2_machine)
         node_spec.use_names_of_programs(self)
         super().prepare(context)
@@ -62,6 +66,8 @@ class RemoteProcess(ExecuteLocal):
         if context.is_shutdown:
             return None
         entities = super().execute(context)
+        if self._fogros2_here:
+            return [*(entities or ()), *self._carriers_here(context)]
         future = private.completed(self)
         assert future is not None
         run = RemoteRun(self, context, self._fogros2_session, self._fogros2_node, future)
@@ -75,14 +81,29 @@ class RemoteProcess(ExecuteLocal):
         session = self._fogros2_session
         if isinstance(self, carriers.Carrier) or session.interrupted:
             return []
+        return self._carry(context, self._fogros2_streams, session)
+
+    def _carriers_here(self, context: LaunchContext) -> list[ExecuteLocal]:
+        """Return those that bring what a machine publishes for this process to the robot."""
+        coordinator = Coordinator.of(context)
         found: list[ExecuteLocal] = []
-        for machine, spec in Coordinator.of(context).stream(self._fogros2_streams, session):
+        for entry in self._fogros2_streams:
+            if isinstance(entry, tuple) or entry.source is None:
+                continue
+            found += self._carry(
+                context, [streaming.to_robot(entry)], coordinator.session(entry.source))
+        return found
+
+    def _carry(
+        self, context: LaunchContext, streams: Sequence[Entry], session: Session,
+    ) -> list[ExecuteLocal]:
+        found: list[ExecuteLocal] = []
+        for machine, spec in Coordinator.of(context).stream(streams, session):
             if machine is None:
                 found.append(carriers.RobotCarrier(spec, session.came_up))
             else:
                 found.append(carriers.Carrier(spec))
-                own = machine == session.spec.name
-                send(found[-1], self._fogros2_machine if own else machine)
+                send(found[-1], machine)
         return found
 
     @property
@@ -119,7 +140,7 @@ class RemoteProcess(ExecuteLocal):
 
 
 def send(
-    action: ExecuteLocal, machine: Union[CloudInstance, str], streams: Sequence[Entry] = (),
+    action: ExecuteLocal, machine: SomeMachine, streams: Sequence[Entry] = (),
 ) -> None:
     """
     Turn an action that hasn't been executed yet into one whose process is on ``machine``.

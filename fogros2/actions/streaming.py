@@ -31,7 +31,8 @@ def check(entries: Iterable[Entry]) -> None:
     """
     for entry in entries:
         from fogros2.image_transport.streams import stream, StreamTopic
-        parts = (entry.topic, entry.transport) if isinstance(entry, StreamTopic) else entry
+        parts = (entry.topic, entry.transport, entry.direction) \
+            if isinstance(entry, StreamTopic) else entry
         if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
             # a name that no machine has, so that it can't be the source
             stream(_named(entry, '/'), '')
@@ -51,7 +52,7 @@ def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) ->
         elif isinstance(entry, StreamTopic):
             entry = StreamTopic(
                 words.resolve(context, entry.topic), words.resolve(context, entry.transport),
-                entry.direction, source=_source(context, entry.source), **{
+                words.resolve(context, entry.direction), source=_source(context, entry.source), **{
                     key: _parameter(context, value) for key, value in entry.parameters.items()})
         found.append(_named(entry, namespace))
     return found
@@ -188,13 +189,22 @@ def _with_topic(entry: StreamTopic, topic: str) -> StreamTopic:
 
 def _source(context: LaunchContext, source: Any) -> Any:
     """Return the name of the machine that publishes, None for the robot."""
-    from fogros2.actions.machines import CloudInstance
-    if not isinstance(source, CloudInstance):
-        return words.resolve(context, source)
     from fogros2.actions.coordinator import Coordinator
+    from fogros2.actions.machines import CloudInstance
+    if source is None:
+        return None
+    coordinator = Coordinator.of(context)
     # it may be that nothing else of the launch runs there
-    Coordinator.of(context).know(source)
-    return source.spec(context).name
+    coordinator.know(source)
+    name = source.spec(context).name if isinstance(source, CloudInstance) \
+        else words.resolve(context, source)
+    return None if coordinator.on_robot(name) else name
+
+
+def to_robot(entry: StreamTopic) -> StreamTopic:
+    """Return a stream from another machine for one that turned out to be the robot."""
+    from fogros2.image_transport.streams import StreamTopic
+    return StreamTopic(entry.topic, entry.transport, 'to_robot', **entry.parameters)
 
 
 def _parameter(context: LaunchContext, value: Any) -> Any:

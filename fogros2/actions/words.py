@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from decimal import Decimal
 import os
-from typing import Any, Optional, Protocol, TYPE_CHECKING
+from typing import Any, Optional, Protocol, TYPE_CHECKING, Union
 
 from fogros2.errors import ConfigurationError
 
@@ -20,9 +20,42 @@ class Items(tuple[Any, ...]):
     """Several values, each resolved alone; launch would read a plain list as one text."""
 
 
-def items(values: Optional[Iterable[SomeSubstitutionsType]]) -> Optional[Items]:
+class Listed:
+    """A text that is several values once it is resolved, as :func:`split` takes it apart."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+def items(
+    values: Union[Iterable[SomeSubstitutionsType], Listed, None],
+) -> Union[Items, Listed, None]:
     """Return values that stay apart, None for none."""
-    return None if values is None else Items(values)
+    return values if values is None or isinstance(values, Listed) else Items(values)
+
+
+def split(text: str) -> list[str]:
+    """
+    Return the values in a text: ``a, b``, or YAML's ``[a, b]``; none in an empty one.
+
+    :raises ConfigurationError: it begins as a list of YAML's and is none, or not of texts.
+    """
+    if not text.lstrip().startswith('['):
+        return [part.strip() for part in text.split(',') if part.strip()]
+    found = read_yaml(text)
+    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        raise ConfigurationError(f'{text!r} is no list of texts', "write 'a, b' or '[a, b]'")
+    return found
+
+
+def read_yaml(text: str) -> Any:
+    """Return what YAML there is in a text, its scalars left as texts; None for what is none."""
+    import yaml
+    try:
+        # the base of the safe loader; it makes no number of 2222:22
+        return yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506
+    except yaml.YAMLError:
+        return None
 
 
 class Number:
@@ -77,7 +110,7 @@ def answered(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """Return a number, a truth, or a text for people, of a value that may not be resolved yet."""
-    if isinstance(value, (Number, Truth)):
+    if isinstance(value, (Number, Truth, Listed)):
         return plain(value.value)
     return value if value is None or isinstance(value, (bool, int, float)) else describe(value)
 
@@ -92,18 +125,11 @@ def resolve(context: LaunchContext, value: Any) -> Any:
     if value is None or isinstance(value, (str, int, float, Decimal)):
         return value
     if isinstance(value, Number):
-        text = resolve(context, value.value)
-        try:
-            return float(text)
-        except ValueError:
-            raise ConfigurationError(f'{text!r} is no number') from None
+        return _number(resolve(context, value.value))
     if isinstance(value, Truth):
-        text = resolve(context, value.value)
-        if not isinstance(text, str):
-            return bool(text)
-        if text.lower() not in _TRUTHS:
-            raise ConfigurationError(f'{text!r} is neither true nor false')
-        return _TRUTHS[text.lower()]
+        return read_truth(resolve(context, value.value))
+    if isinstance(value, Listed):
+        return split(resolve(context, value.value))
     if isinstance(value, Items):
         return [resolve(context, item) for item in value]
     if isinstance(value, Mapping):
@@ -112,6 +138,44 @@ def resolve(context: LaunchContext, value: Any) -> Any:
         return os.fspath(value)
     from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
     return perform_substitutions(context, normalize_to_list_of_substitutions(value))
+
+
+def is_text(value: Any) -> bool:
+    """Return whether a value is a text, or what launch resolves to one."""
+    from launch import Substitution
+    parts = value if isinstance(value, (list, tuple)) and value else [value]
+    return all(isinstance(part, (str, Substitution)) for part in parts)
+
+
+def check_plain(value: Any) -> None:
+    """
+    Hold a Number or a Truth against what it has to be, as far as it is known already.
+
+    :raises ConfigurationError: it is something else.
+    """
+    if isinstance(value, (Number, Truth)) and isinstance(
+            value.value, (str, bool, int, float, Decimal)):
+        (_number if isinstance(value, Number) else read_truth)(value.value)
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigurationError(f'{value!r} is no number') from None
+
+
+def read_truth(value: Any) -> bool:
+    """
+    Return the truth in a text, as launch reads a condition; or of a value that is none.
+
+    :raises ConfigurationError: a text says neither.
+    """
+    if not isinstance(value, str):
+        return bool(value)
+    if value.lower() not in _TRUTHS:
+        raise ConfigurationError(f'{value!r} is neither true nor false')
+    return _TRUTHS[value.lower()]
 
 
 def describe(value: Any) -> str:

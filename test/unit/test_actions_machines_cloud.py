@@ -114,7 +114,8 @@ def test_info_has_fogros2_s_keys(context):
     machine.spec(context)
     # once it is up, with what the provider chose
     machine.is_up(SimpleNamespace(
-        spec=SimpleNamespace(options={'region': 'us-west-2', 'ec2_instance_type': 't3.nano'}),
+        spec=SimpleNamespace(
+            provider='aws', options={'region': 'us-west-2', 'ec2_instance_type': 't3.nano'}),
         machine=SimpleNamespace(id='aws:us-west-2/i-0123', vpn_host='198.51.100.7', shell=None),
         vpn_address='198.18.0.2'))
     told = machine.info()

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FogMachine: a machine as an action, for launch files that have nothing but actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Optional, TYPE_CHECKING
+
+from launch import Action, LaunchContext
+
+from fogros2.actions import keywords, words
+from fogros2.actions.coordinator import Coordinator
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.actions.machines import CloudInstance
+
+
+class FogMachine(Action):
+    """
+    A machine that nodes name after this action was executed.
+
+    :param provider: 'container', 'ssh', 'aws', 'kubernetes' or another that is installed; 'robot'
+        runs what is meant for the machine here.
+    :param given: keywords of that provider's class. Where the provider is a substitution, those
+        that it doesn't have may be empty texts.
+    :param containers: ``docker run`` command lines executed there before its nodes start.
+    :raises ConfigurationError: what is plain is wrong.
+    """
+
+    def __init__(
+        self, provider: SomeSubstitutionsType, given: Mapping[str, Any],
+        containers: Sequence[SomeSubstitutionsType] = (), **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self._provider = provider
+        self._given = dict(given)
+        self._containers = list(containers)
+        #: The machine, None while its provider isn't known.
+        self.machine: Optional[CloudInstance] = None
+        if isinstance(provider, str):
+            self.machine = self._make(provider, self._given)
+
+    def execute(self, context: LaunchContext) -> None:
+        """Execute the action: from now on the machine's name stands for it."""
+        if self.machine is None:
+            provider = words.resolve(context, self._provider)
+            known = keywords.keywords(keywords.machine_class(provider))
+            self.machine = self._make(provider, {
+                name: value for name, value in self._given.items()
+                if name in known or not self._is_empty(context, value)})
+        # its name may be a substitution, and is to be found resolved
+        self.machine.spec(context)
+        Coordinator.of(context).know(self.machine)
+
+    def _make(self, provider: str, given: Mapping[str, Any]) -> CloudInstance:
+        machine = keywords.make(provider, given)
+        for line in self._containers:
+            machine.add_docker_container(line)
+        return machine
+
+    @staticmethod
+    def _is_empty(context: LaunchContext, value: Any) -> bool:
+        return bool(words.is_text(value)) and words.resolve(context, value) == ''

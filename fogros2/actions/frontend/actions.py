@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What XML and YAML say in actions where Python has objects: a stream, a description."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, cast, Optional, TYPE_CHECKING, Union
+
+from launch import Action, LaunchContext, LaunchDescriptionEntity
+
+from fogros2.actions import words
+from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.launch_description import FogROSLaunchDescription
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.image_transport.streams import StreamTopic
+    from fogros2.model import RobotNodes
+
+
+class StreamTopicEverywhere(Action):
+    """
+    A topic that crosses the VPN encoded, between the robot and every machine of the launch.
+
+    Below a CloudNode or a CloudGroup it is that one's alone: these take ``entry`` from it.
+    """
+
+    def __init__(self, entry: StreamTopic, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.entry = entry
+
+    def execute(self, context: LaunchContext) -> None:
+        """Execute the action: processes that execute after it bring the stream along."""
+        Coordinator.of(context).stream_everywhere(
+            [self.entry], context.launch_configurations.get('ros_namespace', '/'))
+
+
+class FogROSLaunch(Action):
+    """
+    A FogROSLaunchDescription that stands in another description.
+
+    :param actions: the content.
+    :param robot_nodes: see there.
+    """
+
+    def __init__(
+        self, actions: Iterable[Action], *,
+        robot_nodes: SomeSubstitutionsType = 'after_cloud',
+        stream_topics: Sequence[StreamTopic] = (), **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self._actions = list(actions)
+        self._robot_nodes: Union[SomeSubstitutionsType, RobotNodes] = robot_nodes
+        self._stream_topics = list(stream_topics)
+        if isinstance(robot_nodes, str):
+            self._description(robot_nodes)
+
+    def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
+        """Return the content, for launch's own look ahead."""
+        return list(self._actions)
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Execute the action: yields the description."""
+        return [self._description(words.resolve(context, self._robot_nodes))]
+
+    def _description(self, robot_nodes: str) -> FogROSLaunchDescription:
+        return FogROSLaunchDescription(
+            self._actions, robot_nodes=cast('RobotNodes', robot_nodes),
+            stream_topics=self._stream_topics)
+
+
+def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopic]]:
+    """
+    Return actions, and the streams that stand among them, apart.
+
+    :raises ConfigurationError: a stream has a condition, which is for the whole launch alone.
+    """
+    others: list[Action] = []
+    entries: list[StreamTopic] = []
+    for action in actions:
+        if not isinstance(action, StreamTopicEverywhere):
+            others.append(action)
+        elif action.condition is None:
+            entries.append(action.entry)
+        else:
+            raise ConfigurationError(
+                f'{words.describe(action.entry.topic)}: a stream of one part of a launch has no '
+                'condition', 'give the node or the group one')
+    return others, entries

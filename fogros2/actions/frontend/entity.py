@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading an element of a launch file, in XML or YAML, by what a constructor takes."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Mapping
+import re
+from typing import Any, List, Optional, TYPE_CHECKING, Union
+
+from fogros2.actions import keywords, words
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import Substitution
+    from launch.frontend import Entity, Parser
+
+    Parsed = Union[str, list[Substitution]]
+
+#: How the parsers name what nobody has read: ``... found in `node`: {'a', 'b'}``.
+_UNREAD = re.compile(r'found in `.*?`: (\{.*\})', re.DOTALL)
+#: What every action has.
+CONDITIONS = ('if', 'unless')
+_EXPECTED = {
+    'text': "a text, such as '512'", 'number': 'a number', 'truth': 'true or false',
+    'scalar': 'true, a number or a text', 'list': 'a list of texts'}
+
+
+def text(parser: Parser, raw: str) -> Parsed:
+    """Return a text as launch reads it: plain, or substitutions that are performed later."""
+    from launch.substitutions import TextSubstitution
+    parts: list[Substitution] = parser.parse_substitution(raw)
+    plain = [part.text for part in parts if isinstance(part, TextSubstitution)]
+    return ''.join(plain) if len(plain) == len(parts) else parts
+
+
+def attribute(entity: Entity, parser: Parser, name: str) -> Optional[Parsed]:
+    """
+    Return an attribute that is a text, None for none.
+
+    :raises ConfigurationError: it is another thing.
+    """
+    found: Optional[Parsed] = value(entity, parser, keywords.Keyword(name, 'text'))
+    return found
+
+
+def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
+    """
+    Return what an element says of a keyword in its constructor's kind, None for nothing.
+
+    Texts with substitutions stay such, to be resolved when executed.
+
+    :raises ConfigurationError: it is of another kind.
+    """
+    if keyword.kind == 'mapping':
+        return _mapping(entity, parser, keyword)
+    if keyword.kind == 'table':
+        return _table(entity, parser, keyword)
+    raw = _raw(entity, keyword.name)
+    if isinstance(raw, list):
+        if keyword.kind != 'list' or not all(isinstance(item, str) for item in raw):
+            raise _wrong(entity, keyword, raw)
+        return [text(parser, item) for item in raw]
+    if isinstance(raw, str):
+        parsed = text(parser, raw)
+        if isinstance(parsed, str):
+            return keywords.read(keyword, parsed)
+        return words.Listed(parsed) if keyword.kind == 'list' else parsed
+    if raw is None or _fits(keyword.kind, raw):
+        return raw
+    raise _wrong(entity, keyword, raw)
+
+
+def _raw(entity: Entity, name: str) -> Union[str, int, float, bool, list[Any], None]:
+    """Return an attribute as it is written: a text in XML, whatever it is in YAML."""
+    # YAML has types, and refuses another; XML has a list where x-sep stands beside x. The parsers
+    # look at the type, not at what it stands for, so it has to be typing's List
+    for kind in (str, List[str], None):
+        try:
+            found: Union[str, int, float, bool, list[Any], None] = entity.get_attr(
+                name, data_type=kind, optional=True)
+            return found
+        except TypeError:
+            continue
+    raise ConfigurationError(
+        f"{entity.type_name}: '{name}' is no value", 'write a text, a number, true or false, or '
+        'several of these; names and values are elements of their own')
+
+
+def _fits(kind: keywords.Kind, raw: object) -> bool:
+    if isinstance(raw, bool):
+        return kind in ('truth', 'scalar')
+    return kind in ('number', 'scalar') and isinstance(raw, (int, float))
+
+
+def _wrong(entity: Entity, keyword: keywords.Keyword, raw: object) -> ConfigurationError:
+    return ConfigurationError(f"{entity.type_name}: {keyword.name} can't be {raw!r}",
+                              f'it takes {_EXPECTED[keyword.kind]}')
+
+
+def children(entity: Entity, name: str) -> list[Entity]:
+    """
+    Return the elements of that name below an element.
+
+    :raises ConfigurationError: YAML has something else there.
+    """
+    try:
+        found: Optional[list[Entity]] = entity.get_attr(
+            name, data_type=_list_of_entities(), optional=True)
+    except TypeError as error:
+        raise ConfigurationError(
+            f"{entity.type_name}: '{name}' is no list of elements",
+            'write - {name: ..., value: ...} for each') from error
+    return found or []
+
+
+def _list_of_entities() -> Any:
+    from launch.frontend import Entity
+    return List[Entity]
+
+
+def _mapping(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
+    found: dict[str, Parsed] = {}
+    for child in children(entity, keyword.name):
+        name, content = attribute(child, parser, 'name'), attribute(child, parser, 'value')
+        complete(child, ('name', 'value'))
+        if not isinstance(name, str) or content is None:
+            raise ConfigurationError(f'{entity.type_name}: {keyword.name} takes a name, written '
+                                     'out, and a value', '<{0} name="..." value="..."/>'.format(
+                                         keyword.name))
+        found[name] = content
+    return found or None
+
+
+def _table(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
+    rows: list[Mapping[str, Any]] = []
+    for child in children(entity, keyword.name):
+        columns = {name: value(child, parser, keywords.Keyword(name, kind))
+                   for name, kind in keyword.columns.items()}
+        complete(child, keyword.columns)
+        rows.append({name: content for name, content in columns.items() if content is not None})
+    return rows or None
+
+
+def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
+    """
+    Refuse what nobody has read of an element; the parsers would, without a word of what there is.
+
+    :param known: the attributes and elements that there are.
+    :param what: what the element is, its own name unless given.
+    :raises ConfigurationError: something is left; the hint has the nearest name.
+    """
+    try:
+        entity.assert_entity_completely_parsed()
+    except ValueError as error:
+        left = _UNREAD.search(str(error))
+        names = sorted(ast.literal_eval(left[1])) if left is not None else []
+        if not names:
+            raise ConfigurationError(str(error)) from error
+        raise keywords.unknown(what or entity.type_name, names[0], known) from error

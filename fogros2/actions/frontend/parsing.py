@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the elements of a launch file to FogROS2's actions."""
+
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
+from launch import Action
+from launch.actions import GroupAction
+from launch_ros.actions import Node
+
+from fogros2.actions import keywords
+from fogros2.actions.cloud_group import CloudGroup
+from fogros2.actions.cloud_node import CloudNode
+from fogros2.actions.fog_machine import FogMachine
+from fogros2.actions.frontend.actions import FogROSLaunch, instead_of, StreamTopicEverywhere
+from fogros2.actions.frontend.entity import (
+    attribute,
+    children,
+    complete,
+    CONDITIONS,
+    text,
+    value,
+)
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.streams import StreamTopic
+
+if TYPE_CHECKING:
+    from launch.frontend import Entity, Parser
+
+    from fogros2.actions.frontend import Parsed
+
+#: What launch_ros reads of ``<node>``.
+_NODE = (
+    'additional_env', 'args', 'cwd', 'emulate_tty', 'env', 'exec', 'exec_name', 'launch-prefix',
+    'name', 'namespace', 'on_exit', 'output', 'output_format', 'param', 'pkg', 'remap',
+    'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args', 'shell', 'sigkill_timeout',
+    'sigterm_timeout')
+_GROUP = ('forwarding', 'keep', 'scoped')
+
+
+def fog_machine(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<fog_machine name="planner" provider="aws" region="nearest"/>``."""
+    _, kwargs = Action.parse(entity, parser)
+    provider = attribute(entity, parser, 'provider')
+    if not provider:
+        raise ConfigurationError('a fog_machine needs a provider',
+                                 keywords.near('', keywords.providers()))
+    if isinstance(provider, str):
+        known = dict(keywords.keywords(keywords.machine_class(provider)))
+    else:
+        # which one it is, is known when the action is executed
+        known = {name: keyword for each in keywords.providers() if _loads(each)
+                 for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
+    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+    containers = []
+    for child in children(entity, 'docker_container'):
+        command = attribute(child, parser, 'cmd')
+        complete(child, ('cmd',))
+        if not command:
+            raise ConfigurationError('a docker_container needs a cmd', 'docker run ...')
+        containers.append(command)
+    what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
+    complete(entity, (*known, 'provider', 'docker_container', *CONDITIONS), what)
+    if given['name'] is None:
+        raise ConfigurationError('a fog_machine needs a name', 'its nodes say machine="that name"')
+    kwargs.update(provider=provider, containers=containers, given={
+        name: content for name, content in given.items() if content is not None})
+    return FogMachine, kwargs
+
+
+def _loads(provider: str) -> bool:
+    """Return whether a provider's class can be had; another may be meant."""
+    try:
+        keywords.machine_class(provider)
+    except ConfigurationError:
+        return False
+    return True
+
+
+def cloud_node(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<cloud_node machine="planner" pkg="demo" exec="talker">``, else as ``<node>``."""
+    _, kwargs = Node.parse(entity, parser)
+    kwargs['machine'] = _machine(entity, parser)
+    streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
+    _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
+    complete(entity, ('machine', 'stream_topic', *_NODE, *CONDITIONS))
+    return CloudNode, kwargs
+
+
+def cloud_group(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<cloud_group machine="planner">``, otherwise as ``<group>``."""
+    _, kwargs = GroupAction.parse(entity, parser)
+    kwargs['machine'] = _machine(entity, parser)
+    kwargs['actions'], kwargs['stream_topics'] = instead_of(kwargs['actions'])
+    complete(entity, ('machine', 'stream_topic', *_GROUP, *CONDITIONS))
+    return CloudGroup, kwargs
+
+
+def _machine(entity: Entity, parser: Parser) -> Any:
+    machine = attribute(entity, parser, 'machine')
+    if not machine:
+        raise ConfigurationError(f'a {entity.type_name} needs a machine',
+                                 'machine="planner", as <fog_machine name="planner" .../> says')
+    return machine
+
+
+def stream_topic(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<stream_topic topic="/camera" transport="h264"><param name= value=/>``."""
+    _, kwargs = Action.parse(entity, parser)
+    topic: Any = attribute(entity, parser, 'topic')
+    if not topic:
+        raise ConfigurationError('a stream_topic needs a topic', 'topic="/camera"')
+    parameters: dict[str, Any] = {}
+    for child in children(entity, 'param'):
+        name = attribute(child, parser, 'name')
+        content = value(child, parser, keywords.Keyword('value', 'scalar'))
+        complete(child, ('name', 'value'))
+        if not name or not isinstance(name, str) or content is None:
+            raise ConfigurationError('a param of a stream_topic takes a name, written out, and a '
+                                     'value', '<param name="bitrate" value="2000000"/>')
+        parameters[name] = content
+    said: dict[str, Any] = {
+        name: attribute(entity, parser, name) for name in ('transport', 'direction', 'source')}
+    complete(entity, ('topic', 'param', *said, *CONDITIONS))
+    kwargs['entry'] = StreamTopic(
+        topic, **{name: content for name, content in said.items() if content is not None},
+        **parameters)
+    return StreamTopicEverywhere, kwargs
+
+
+def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<fogros_launch robot_nodes="after_cloud">`` with its content."""
+    _, kwargs = Action.parse(entity, parser)
+    robot_nodes = entity.get_attr('robot_nodes', optional=True)
+    if robot_nodes is not None:
+        kwargs['robot_nodes'] = text(parser, robot_nodes)
+    kwargs['actions'], kwargs['stream_topics'] = instead_of(
+        parser.parse_action(child) for child in entity.children)
+    complete(entity, ('robot_nodes', *CONDITIONS))
+    return FogROSLaunch, kwargs

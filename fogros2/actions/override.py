@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where machines run instead of where the launch file says: ``--machine planner=container``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import dataclasses
+import fnmatch
+from typing import Any, Optional, TYPE_CHECKING
+
+from launch import Action, LaunchContext, LaunchDescriptionEntity
+
+from fogros2.actions import keywords
+from fogros2.actions.wrapping import wrap
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from fogros2.actions.machines import CloudInstance
+    from fogros2.model import MachineSpec
+
+#: Keywords of every machine that a MachineSpec calls otherwise, None for those it doesn't have.
+_FIELDS = {'ros_workspace': 'workspace', 'working_dir_base': None, 'name': None}
+#: How ``ssh:user@host:port`` comes apart.
+_SSH = 'ssh:'
+
+
+@dataclasses.dataclass(frozen=True)
+class Override:
+    """
+    One machine, or several, that run elsewhere.
+
+    :param pattern: the machine's name; ``*`` in it stands for anything.
+    :param given: keywords of the provider's class, in its kinds.
+    """
+
+    pattern: str
+    provider: str
+    given: Mapping[str, Any]
+
+    @property
+    def on_robot(self) -> bool:
+        """Whether no machine is made."""
+        return self.provider == keywords.ROBOT
+
+    def instead(self, spec: MachineSpec, context: LaunchContext) -> MachineSpec:
+        """
+        Return what to make instead.
+
+        What launch files say of any machine holds, what they say to a provider only for that one.
+        """
+        said = self.machine(spec.name).spec(context)
+        before = spec.options if spec.provider == self.provider else {}
+        common = {_FIELDS.get(name, name) for name in self.given if name not in said.options}
+        return dataclasses.replace(
+            spec, provider=self.provider, options={**before, **said.options},
+            **{field: getattr(said, field) for field in common if field is not None})
+
+    def machine(self, name: str) -> CloudInstance:
+        """
+        Return the machine of that name as the override alone describes it.
+
+        :raises ConfigurationError: it is wrong.
+        """
+        return keywords.make(self.provider, {**self.given, 'name': name})
+
+
+class Overrides:
+    """
+    All that one command line says.
+
+    :param texts: such as 'planner=aws,region=eu-west-1'.
+    :raises ConfigurationError: see :func:`parse`.
+    """
+
+    def __init__(self, texts: Iterable[str]) -> None:
+        self._overrides = [parse(text) for text in texts]
+
+    def of(self, name: str) -> Optional[Override]:
+        """Return what holds for a machine: a name beats a pattern, what is said last the rest."""
+        for override in reversed(self._overrides):
+            if override.pattern == name:
+                return override
+        return next((override for override in reversed(self._overrides)
+                     if fnmatch.fnmatchcase(name, override.pattern)), None)
+
+    def apply(self, spec: MachineSpec, context: LaunchContext) -> MachineSpec:
+        """Return what to make for a machine."""
+        override = self.of(spec.name)
+        return spec if override is None else override.instead(spec, context)
+
+    def check(self, names: Sequence[str]) -> None:
+        """
+        Hold them against the machines that the launch has.
+
+        :raises ConfigurationError: one is for a machine that there isn't.
+        """
+        for override in self._overrides:
+            if not any(fnmatch.fnmatchcase(name, override.pattern) for name in names):
+                raise ConfigurationError(
+                    f'--machine {override.pattern}=...: no machine of this launch is called so',
+                    keywords.near(override.pattern, sorted(names), all_too=True)
+                    or 'it has no machine at all')
+
+
+class OverrideMachines(Action):
+    """
+    Has machines of some content run elsewhere.
+
+    :param overrides: which, and where.
+    :param entities: the content: a launch.
+    """
+
+    def __init__(
+        self, overrides: Overrides, entities: Sequence[LaunchDescriptionEntity],
+    ) -> None:
+        super().__init__()
+        self._overrides = overrides
+        self._entities = list(entities)
+
+    def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
+        """Return the content, for launch's own look ahead."""
+        return list(self._entities)
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Execute the action: yields the content, looked through for the machines it mentions."""
+        from fogros2.actions.coordinator import Coordinator
+        coordinator = Coordinator.of(context)
+        coordinator.override(self._overrides)
+        return wrap(self._entities, _mention)
+
+
+def _mention(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+    """Remember the machines that an entity has, those that come with a timer or an event too."""
+    from fogros2.actions.coordinator import Coordinator
+    from fogros2.actions.fog_machine import FogMachine
+    from fogros2.actions.launch_description import cloud_entities
+    for found, certain in cloud_entities([entity]):
+        if certain or not isinstance(found, FogMachine):
+            Coordinator.of(context).know(found.machine)
+
+
+def parse(text: str) -> Override:
+    """
+    Return an override from its text: ``NAME=PROVIDER[,KEYWORD=VALUE]...``.
+
+    ``ssh:user@host:port`` is short for ``ssh,host=host,user=user,port=port``. A value with commas
+    stands in brackets or braces, as YAML has lists and mappings.
+
+    :raises ConfigurationError: it isn't one; an unknown provider or keyword; a wrong value.
+    """
+    pattern, _, rest = text.partition('=')
+    if not pattern.strip() or not rest.strip():
+        raise ConfigurationError(
+            f"--machine '{text}' doesn't say which machine runs where",
+            f"write planner=container; there are: {', '.join(keywords.providers())}")
+    provider, *words = (part.strip() for part in _parts(rest))
+    given: dict[str, Any] = {}
+    if provider.startswith(_SSH):
+        given.update(_computer(provider[len(_SSH):]))
+        provider = 'ssh'
+    known = keywords.keywords(keywords.machine_class(provider))
+    for word in words:
+        name, equals, value = (part.strip() for part in word.partition('='))
+        if not equals:
+            raise ConfigurationError(f"--machine '{text}': '{word}' is no keyword=value",
+                                     'such as region=eu-west-1')
+        if name not in known or name == 'name':
+            raise keywords.unknown(f"a machine of the provider '{provider}'", name, known)
+        given[name] = keywords.read(known[name], value)
+    override = Override(pattern.strip(), provider, given)
+    # what is wrong with it is said before anything begins; any name will do
+    override.machine('machine')
+    return override
+
+
+def _parts(text: str) -> Iterator[str]:
+    """Yield what commas separate, but for those in brackets and braces."""
+    depth, begin = 0, 0
+    for at, character in enumerate(text):
+        depth += (character in '[{') - (character in ']}')
+        if character == ',' and depth == 0:
+            yield text[begin:at]
+            begin = at + 1
+    yield text[begin:]
+
+
+def _computer(text: str) -> dict[str, Any]:
+    """Return the keywords in ``user@host:port``; an IPv6 address stands in brackets."""
+    user, at, host = text.rpartition('@')
+    name, colon, port = host.rpartition(':')
+    if not colon or host.endswith(']'):
+        name, port = host, ''
+    given = {'host': name.strip('[]'), 'user': user if at else None,
+             'port': keywords.number(port) if port else None}
+    return {key: value for key, value in given.items() if value is not None}

@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines, nodes, groups and streams in XML and YAML: what they become, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import OpaqueFunction, SetLaunchConfiguration
+from launch.frontend import Parser
+import pytest
+
+from fogros2 import AWSCloudInstance, ContainerInstance, KubeInstance, SSHInstance, StreamTopic
+from fogros2.actions import keywords
+from fogros2.actions.coordinator import Coordinator
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.h264 import H264
+from fogros2.testing.plugins import instead
+
+CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'kubernetes': KubeInstance,
+           'ssh': SSHInstance}
+
+
+class Harmless(H264):
+    """H.264's decisions, carried out by a program that only sleeps."""
+
+    def encoder(self, stream):
+        return dataclasses.replace(
+            super().encoder(stream), package='demo', executable='talker')
+
+    def decoder(self, stream):
+        return dataclasses.replace(
+            super().decoder(stream), package='demo', executable='talker')
+
+
+class Other(Harmless):
+    def encoder(self, stream):
+        return dataclasses.replace(super().encoder(stream), name='back_other_encoder')
+
+
+def load(text):
+    """Return the description in a text of XML (it begins with <) or YAML."""
+    kind = 'xml' if text.lstrip().startswith('<') else 'yaml'
+    source = io.StringIO(text.strip())
+    source.name = f'test.launch.{kind}'
+    entity, parser = Parser.load(source)
+    return parser.parse_description(entity)
+
+
+def xml(text):
+    return load(f'<launch>{text}</launch>')
+
+
+def machine(description, **configurations):
+    """Return the spec of the description's first machine."""
+    context = LaunchContext()
+    context.launch_configurations.update(configurations)
+    return description.entities[0].machine.spec(context)
+
+
+def refused(text):
+    with pytest.raises(ConfigurationError) as error:
+        xml(text) if text.lstrip().startswith('<') else load(text)
+    return str(error.value)
+
+
+# -- machines ------------------------------------------------------------------------------------
+
+XML_MACHINE = """
+  <fog_machine name="planner" provider="aws" region="nearest" ec2_instance_type="cheapest"
+      disk_size="40" spot="true" min_memory_gb="7.5" gpu="L4" max_price="0.30"
+      regions="eu-west-1, eu-west-2" ssh_from="[198.51.100.0/24]" instance_types="t3.large;t3.nano"
+      instance_types-sep=";" on_exit="stop" lifetime="1h30m" robot_timeout="60"
+      launch_foxglove="false" ros_workspace="">
+    <tags name="team" value="slam"/>
+    <tags name="cost" value="42"/>
+    <environment name="RCUTILS_COLORIZED_OUTPUT" value="1"/>
+  </fog_machine>"""
+
+YAML_MACHINE = """
+launch:
+- fog_machine:
+    name: planner
+    provider: aws
+    region: nearest
+    ec2_instance_type: cheapest
+    disk_size: 40
+    spot: true
+    min_memory_gb: 7.5
+    gpu: L4
+    max_price: 0.30
+    regions: [eu-west-1, eu-west-2]
+    ssh_from: ['198.51.100.0/24']
+    instance_types: [t3.large, t3.nano]
+    on_exit: stop
+    lifetime: 1h30m
+    robot_timeout: 60
+    launch_foxglove: false
+    ros_workspace: ''
+    tags:
+    - {name: team, value: slam}
+    - {name: cost, value: '42'}
+    environment:
+    - {name: RCUTILS_COLORIZED_OUTPUT, value: '1'}
+"""
+
+PYTHON_MACHINE = {
+    'name': 'planner', 'region': 'nearest', 'ec2_instance_type': 'cheapest', 'disk_size': 40,
+    'spot': True, 'min_memory_gb': 7.5, 'gpu': 'L4', 'max_price': 0.30,
+    'regions': ['eu-west-1', 'eu-west-2'], 'ssh_from': ['198.51.100.0/24'],
+    'instance_types': ['t3.large', 't3.nano'], 'on_exit': 'stop', 'lifetime': '1h30m',
+    'robot_timeout': 60, 'ros_workspace': '', 'tags': {'team': 'slam', 'cost': '42'},
+    'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
+
+
+@pytest.mark.parametrize('text', [f'<launch>{XML_MACHINE}</launch>', YAML_MACHINE])
+def test_a_machine_is_the_one_that_python_makes(text):
+    assert machine(load(text)) == AWSCloudInstance(**PYTHON_MACHINE).spec(LaunchContext())
+
+
+def test_a_pod_s_tolerations_are_elements_of_their_own():
+    found = machine(xml("""
+      <fog_machine name="pod" provider="kubernetes" ros_workspace="" mcpu="500">
+        <tolerations key="gpu" operator="Exists" effect="NoExecute" tolerationSeconds="30"/>
+        <env name="A" value="b"/>
+        <node_selector name="zone" value="$(var zone)"/>
+      </fog_machine>"""), zone='z1')
+    assert found == KubeInstance(
+        name='pod', ros_workspace='', mcpu=500, env={'A': 'b'}, node_selector={'zone': 'z1'},
+        tolerations=[{'key': 'gpu', 'operator': 'Exists', 'effect': 'NoExecute',
+                      'tolerationSeconds': 30}]).spec(LaunchContext())
+
+
+#: A text, and the Python value it stands for, of each kind.
+EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'truth': ('true', True),
+            'scalar': ('true', True), 'list': ('a,b', ['a', 'b'])}
+#: Where not every value will do.
+CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'name': 'planner'}
+
+
+@pytest.mark.parametrize('provider', sorted(CLASSES))
+def test_every_keyword_of_every_provider_is_an_attribute_plain_and_as_a_substitution(provider):
+    needed = {'name': 'planner', 'ros_workspace': '', **(
+        {'host': 'here'} if provider == 'ssh' else {})}
+    for keyword in keywords.keywords(CLASSES[provider]).values():
+        if keyword.kind in ('mapping', 'table'):
+            continue
+        text, value = EXAMPLES[keyword.kind]
+        text = CHOICES.get(keyword.name, text)
+        value = CHOICES.get(keyword.name, value)
+        expected = CLASSES[provider](**{**needed, keyword.name: value}).spec(LaunchContext())
+        for written in (text, '$(var it)'):
+            attributes = ' '.join(
+                f'{name}="{one}"' for name, one in {**needed, keyword.name: written}.items())
+            found = machine(xml(f'<fog_machine provider="{provider}" {attributes}/>'), it=text)
+            for spec in (found, expected):
+                # what a substitution makes a text, the provider reads as such
+                spec.options.update({
+                    name: option if isinstance(option, list) else str(option).lower()
+                    for name, option in spec.options.items()})
+            assert found == expected, keyword.name
+
+
+def test_the_provider_may_be_a_substitution(run, fake):
+    there = {}
+    description = load("""
+launch:
+- fog_machine: {name: $(var name), provider: $(var provider), ros_workspace: '', host: $(var host),
+                memory: 2g}
+""")
+    run(LaunchDescription([
+        *(SetLaunchConfiguration(*pair) for pair in (
+            ('name', 'planner'), ('provider', 'container'), ('host', ''))),
+        *description.entities,
+        OpaqueFunction(function=lambda context: there.update(
+            spec=Coordinator.of(context)._by_name('planner').spec(context)))]))
+    assert there['spec'] == ContainerInstance(
+        name='planner', memory='2g', ros_workspace='').spec(LaunchContext())
+
+
+@pytest.mark.parametrize('text, words', [
+    ('<fog_machine name="p" provider="awz"/>',
+     ["no provider is called 'awz'", "did you mean 'aws'", 'container']),
+    ('<fog_machine name="p"/>', ['needs a provider', 'aws, container, kubernetes, robot, ssh']),
+    ('<fog_machine provider="aws"/>', ['needs a name']),
+    ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),
+    ('<fog_machine name="P_" provider="aws"/>', ["'P_' is no name for a machine"]),
+    ('<fog_machine name="p" provider="aws" regoin="x"/>',
+     ["provider 'aws'", "'regoin'", "did you mean 'region'"]),
+    ('<fog_machine name="p" provider="container" region="x"/>', ["'region'", 'did you mean']),
+    ('<fog_machine name="p" provider="aws"><tag name="a" value="b"/></fog_machine>',
+     ["'tag'", "did you mean 'tags'"]),
+    ('<fog_machine name="p" provider="aws"><tags nmae="a" value="b"/></fog_machine>',
+     ["tags has no 'nmae'", "did you mean 'name'"]),
+    ('<fog_machine name="p" provider="aws"><tags name="a"/></fog_machine>', ['a name', 'a value']),
+    ('<fog_machine name="p" provider="aws" spot="perhaps"/>', ['spot:', 'neither true nor false']),
+    ('<fog_machine name="p" provider="aws" disk_size="large"/>', ['disk_size:', 'no number']),
+    ('<fog_machine name="p" provider="aws" on_exit="kepe"/>', ['on_exit', "did you mean 'keep'"]),
+    ('<fog_machine name="p" provider="aws" lifetime="1y"/>', ['lifetime', 'no duration']),
+    ('<fog_machine name="p" provider="aws" regions="[a"/>', ['regions:', 'no list']),
+    ('<fog_machine name="p" provider="aws"><docker_container/></fog_machine>', ['needs a cmd']),
+    ('<fog_machine name="p" provider="kubernetes"><tolerations kye="a"/></fog_machine>',
+     ["tolerations has no 'kye'", "did you mean 'key'"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, spot: 3}}]', ["spot can't be 3",
+                                                                    'true or false']),
+    ('launch: [{fog_machine: {name: p, provider: aws, disk_size: true}}]', ["can't be True"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, region: 3}}]', ["region can't be 3"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, region: [a]}}]', ["can't be ['a']"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, regions: [1]}}]', ["can't be [1]"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, region: {a: b}}}]', ["'region' is no"]),
+    ('launch: [{fog_machine: {name: p, provider: aws, tags: {a: b}}}]', ['no list of elements']),
+    ('<cloud_node pkg="demo" exec="talker"/>', ['needs a machine', 'fog_machine']),
+    ('<cloud_node machine="p" pkg="demo" exec="talker" respwan="true"/>',
+     ["cloud_node has no 'respwan'", "did you mean 'respawn'"]),
+    ('<cloud_group><node pkg="demo" exec="talker"/></cloud_group>', ['needs a machine']),
+    ('<cloud_group machine="p" scopde="true"/>', ["did you mean 'scoped'"]),
+    ('<stream_topic transport="h264"/>', ['needs a topic']),
+    ('<stream_topic topic="/a" bitrate="3"/>', ["stream_topic has no 'bitrate'"]),
+    ('<stream_topic topic="/a"><param name="bitrate"/></stream_topic>', ['a name', 'value']),
+    ('<fogros_launch robot_nodes="never"/>', ["robot_nodes='never' is unknown"]),
+    ('<fogros_launch robot_node="x"/>', ["did you mean 'robot_nodes'"]),
+    ('<cloud_group machine="p"><stream_topic topic="/a" if="true"/></cloud_group>',
+     ['/a', 'condition']),
+])
+def test_what_is_wrong_is_refused_with_a_word_on_what_is_right(text, words):
+    said = refused(text)
+    for word in words:
+        assert word in said, said
+
+
+def test_what_turns_out_wrong_when_executed_says_where(run, fake):
+    description = xml('<arg name="size" default="large"/>'
+                      '<fog_machine name="p" provider="aws" disk_size="$(var size)"/>')
+    assert run(description) == 1
+    assert fake.notes == []
+
+
+# -- nodes, groups, streams ----------------------------------------------------------------------
+
+XML_LAUNCH = """
+<launch>
+  <arg name="machine" default="planner"/>
+  <fog_machine name="$(var machine)" provider="container" ros_workspace=""/>
+  <cloud_node machine="$(var machine)" pkg="demo" exec="talker" name="one" exec_name="first"
+      namespace="up" args="--fast" output="screen" respawn="false">
+    <param name="rate" value="3"/>
+    <remap from="chatter" to="/talk"/>
+    <env name="COLOUR" value="$(var machine)"/>
+    <stream_topic topic="camera">
+      <param name="bitrate" value="$(eval '2 * 1000000')"/>
+    </stream_topic>
+  </cloud_node>
+  <cloud_group machine="$(var machine)">
+    <stream_topic topic="/back" direction="to_robot" transport="other"/>
+    <push_ros_namespace namespace="group"/>
+    <node pkg="demo" exec="talker" exec_name="second"/>
+  </cloud_group>
+</launch>"""
+
+YAML_LAUNCH = """
+launch:
+- arg: {name: machine, default: planner}
+- fog_machine: {name: $(var machine), provider: container, ros_workspace: ''}
+- cloud_node:
+    machine: $(var machine)
+    pkg: demo
+    exec: talker
+    name: one
+    exec_name: first
+    namespace: up
+    args: --fast
+    output: screen
+    respawn: 'false'
+    param: [{name: rate, value: 3}]
+    remap: [{from: chatter, to: /talk}]
+    env: [{name: COLOUR, value: $(var machine)}]
+    stream_topic:
+    - {topic: camera, param: [{name: bitrate, value: "$(eval '2 * 1000000')"}]}
+- cloud_group:
+    machine: $(var machine)
+    children:
+    - stream_topic: {topic: /back, direction: to_robot, transport: other}
+    - push_ros_namespace: {namespace: group}
+    - node: {pkg: demo, exec: talker, exec_name: second}
+"""
+
+
+@pytest.mark.parametrize('text', [XML_LAUNCH, YAML_LAUNCH])
+def test_nodes_groups_and_streams_become_processes_of_the_machine(
+        text, run, fake, monkeypatch):
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'other': Other})
+
+    def on_start(machine, node):
+        machine.say('exited', node, returncode=0, respawns=False)
+
+    fake.on_start = on_start
+    assert run(load(text)) == 0
+    there = {spec.name.rpartition('-')[0] or spec.name: spec
+             for spec in fake.machines['planner'].all}
+    first, second = there['first'], there['second']
+    assert first.arguments[0] == '--fast'
+    assert '__node:=one' in first.arguments and '__ns:=/up' in first.arguments
+    assert first.environment['COLOUR'] == 'planner'
+    assert 'chatter:=/talk' in first.arguments
+    assert any('rate' in str(content) for content in first.files.values())
+    assert '/up/camera:=/fogros2/planner/up/camera' in first.arguments
+    assert '__ns:=/group' in second.arguments
+    assert 'image:=/fogros2/planner/up/camera' in there['up_camera_h264_decoder'].arguments
+    assert 'image:=/fogros2/planner/back' in there['back_other_encoder'].arguments
+
+
+def test_a_stream_of_the_whole_launch_and_robot_nodes_at_once(run, fake):
+    coordinators = []
+    description = xml("""
+      <arg name="when" default="immediately"/>
+      <fog_machine name="planner" provider="container" ros_workspace=""/>
+      <fogros_launch robot_nodes="$(var when)">
+        <stream_topic topic="/camera"/>
+        <cloud_node machine="planner" pkg="demo" exec="talker"/>
+      </fogros_launch>
+      <stream_topic topic="/other" if="$(eval '1 == 2')"/>
+      <stream_topic topic="/third"/>""")
+    description.add_action(OpaqueFunction(
+        function=lambda context: coordinators.append(Coordinator.of(context))))
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=0, respawns=False)
+    assert run(description) == 0
+    (coordinator,) = coordinators
+    assert [entries for entries, _ in coordinator._stream_everywhere] == [
+        [StreamTopic('/camera')], [StreamTopic('/third')]]
+    assert coordinator.gate is None, 'robot nodes wait'
+
+
+def test_of_two_machines_of_one_name_the_condition_chooses(run, fake):
+    description = xml("""
+      <arg name="where" default="b"/>
+      <fogros_launch>
+        <fog_machine name="planner" provider="container" memory="1g" ros_workspace=""
+            if="$(eval '&quot;$(var where)&quot; == &quot;a&quot;')"/>
+        <fog_machine name="planner" provider="container" memory="2g" ros_workspace=""
+            if="$(eval '&quot;$(var where)&quot; == &quot;b&quot;')"/>
+        <cloud_node machine="planner" pkg="demo" exec="talker"/>
+      </fogros_launch>""")
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=0, respawns=False)
+    assert run(description) == 0
+    assert fake.machines['planner'].spec.options == {'memory': '2g'}
+
+
+def test_a_machine_that_nobody_described_is_refused(run, fake):
+    description = xml('<fog_machine name="planner" provider="container"/>'
+                      '<cloud_node machine="planer" pkg="demo" exec="talker"/>')
+    assert run(description) == 1
+    assert fake.noted('prepare') == []
+
+
+def test_docker_containers_of_a_machine():
+    found = machine(xml("""
+      <fog_machine name="planner" provider="container" ros_workspace="">
+        <docker_container cmd="docker run --rm $(var image)"/>
+      </fog_machine>"""), image='redis')
+    assert found.containers == ('docker run --rm redis',)
