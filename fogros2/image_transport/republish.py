@@ -17,8 +17,8 @@ class Republish(ImageTransport):
     """
     A transport whose plugin is installed on both sides.
 
-    The stream's options become ``republish``'s parameters as they are, such as
-    ``{'.camera.theora.quality': 31}``; see ``ros2 param list`` for the plugin's own names.
+    The stream's options are the plugin's parameters, such as ``quality=31`` for Theora, which
+    ``republish`` calls ``out.theora.quality``. One with a dot in it is taken for such a full name.
     """
 
     plugin: ClassVar[str]
@@ -61,8 +61,12 @@ class Republish(ImageTransport):
         for old, new in {**names, f'{side}/{self.plugin}': between}.items():
             words += ['-r', f'{old}:={new}']
         if role == 'encoder':
+            # cameras often publish by best effort, which hears nobody that wants more
+            words += ['-p', f"qos_overrides.{names['in']}.subscription.reliability:=best_effort"]
             for key, value in stream.options.items():
-                words += ['-p', f'{key}:={value}']
+                if key != 'camera_info':
+                    name = key if '.' in key else f'out.{self.plugin}.{key}'
+                    words += ['-p', f'{name}:={value}']
         return NodeSpec(
             id=f"{machine or 'robot'}/{label}", name=label, package='image_transport',
             executable='republish', arguments=tuple(words), respawn=True, respawn_delay=1.0)

@@ -73,12 +73,14 @@ def test_compressed(options: dict[str, object], codec: str) -> None:
 def test_raw_and_republish() -> None:
     stream = Stream('/camera', 'raw', target='m')
     assert words(Raw().decoder(stream).arguments)['stream'] == '"/camera/raw"'
-    theora = Stream('/camera', 'theora', target='m', options={'.camera.theora.quality': 31})
+    theora = Stream('/camera', 'theora', target='m', options={
+        'quality': 31, 'out.format': 'x', 'camera_info': False})
     encoder, decoder = Theora().encoder(theora), Theora().decoder(theora)
     assert (encoder.package, encoder.executable) == ('image_transport', 'republish')
     assert words(encoder.arguments) == {
         '__node': 'camera_theora_encoder', 'in_transport': 'raw', 'out_transport': 'theora',
-        'in': '/camera', 'out/theora': '/camera/theora', '.camera.theora.quality': '31'}
+        'in': '/camera', 'out/theora': '/camera/theora', 'out.theora.quality': '31',
+        'out.format': 'x', 'qos_overrides./camera.subscription.reliability': 'best_effort'}
     assert words(decoder.arguments) == {
         '__node': 'camera_theora_decoder_on_m', 'in_transport': 'theora', 'out_transport': 'raw',
         'in/theora': '/camera/theora', 'out': '/fogros2/m/camera'}
