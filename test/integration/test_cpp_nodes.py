@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""C++ nodes of ROS 2 on a machine: programs, components, image transports, a package built there."""
+"""C++ of ROS 2 on a machine: programs, components, image transports, a package built there."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import os
 from pathlib import Path
 import re
 import shutil
-import subprocess
 import sys
-import textwrap
 import uuid
 
 import pytest
 
-from fogros2 import process
+from fogros2 import process, workspace
+from fogros2.host import HostFacts
 from fogros2.testing.launched import launching
 
 pytestmark = [
@@ -161,3 +160,98 @@ def test_images_cross_by_image_transport(
     assert not launched.errors, launched.text
     # one raw image a direction would be 1.8 MB
     assert 0 < found['traffic'] < len(found['seen']) * 400_000, found
+
+
+MANIFEST = """<?xml version="1.0"?>
+<package format="3">
+  <name>{name}</name><version>1.0.0</version><description>A node of a test's own.</description>
+  <maintainer email="somebody@example.com">Somebody</maintainer><license>Apache-2.0</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <depend>rclcpp</depend><depend>std_msgs</depend>
+  <export><build_type>ament_cmake</build_type></export>
+</package>
+"""
+
+RECIPE = """cmake_minimum_required(VERSION 3.16)
+project({name} CXX)
+find_package(ament_cmake REQUIRED)
+find_package(rclcpp REQUIRED)
+find_package(std_msgs REQUIRED)
+add_executable(counter counter.cpp)
+ament_target_dependencies(counter rclcpp std_msgs)
+install(TARGETS counter DESTINATION lib/${{PROJECT_NAME}})
+ament_package()
+"""
+
+COUNTER = """
+#include <unistd.h>
+#include <chrono>
+#include <string>
+#include <rclcpp/rclcpp.hpp>
+#include <std_msgs/msg/string.hpp>
+
+int main(int argc, char ** argv)
+{
+  rclcpp::init(argc, argv);
+  auto node = std::make_shared<rclcpp::Node>("counter");
+  auto publisher = node->create_publisher<std_msgs::msg::String>("chatter", 10);
+  int count = 0;
+  auto timer = node->create_wall_timer(std::chrono::milliseconds(200), [&]() {
+    char host[64];
+    gethostname(host, sizeof host);
+    std_msgs::msg::String message;
+    message.data = std::string("counted on ") + host + ": " + std::to_string(count++);
+    publisher->publish(message);
+  });
+  rclcpp::spin(node);
+  rclcpp::shutdown();
+}
+"""
+
+WORKSPACE = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name='{name}', network='{network}', ros_workspace='{root}')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='{package}', executable='counter'),
+        Node(package='demo_nodes_cpp', executable='listener', output='screen'),
+    ])
+"""
+
+
+def test_a_compiled_package_is_built_as_on_a_machine_and_travels(
+        tmp_path: Path, cloud_network: str) -> None:
+    needs('rclcpp', 'ament_cmake', 'demo_nodes_cpp')
+    if shutil.which('colcon') is None or shutil.which('c++') is None:
+        pytest.skip('needs colcon and a C++ compiler')
+    package = f'counted_{uuid.uuid4().hex[:6]}'
+    root = tmp_path / 'workspace'
+    source = root / 'src' / package
+    source.mkdir(parents=True)
+    (source / 'package.xml').write_text(MANIFEST.format(name=package))
+    (source / 'CMakeLists.txt').write_text(RECIPE.format(name=package))
+    (source / 'counter.cpp').write_text(COUNTER)
+    here = HostFacts(architecture='x86_64')
+    way = workspace.plan(workspace.inspect(root), here, here, ros_setup=(), can_build=True,
+                         name=NAME)
+    assert way.reason == 'it is not built'
+    # the last of a machine's commands; the one before asks rosdep, which asks the internet
+    process.run(way.commands[-1], timeout=120.0)
+    assert workspace.inspect(root).compiled is not None
+    variables = dict(os.environ)
+    for name, below in (('AMENT_PREFIX_PATH', package), ('COLCON_PREFIX_PATH', '')):
+        variables[name] = os.pathsep.join(
+            filter(None, (str(root / 'install' / below), os.environ.get(name))))
+    path = tmp_path / 'workspace.launch.py'
+    path.write_text(WORKSPACE.format(
+        name=NAME, network=cloud_network, root=root, package=package))
+    with launching() as launch:
+        launched = launch(str(path), environment=variables)
+        launched.wait_for('I heard: [counted on ', times=3)
+        launched.interrupt()
+        assert launched.ended(30.0) == 0, launched.text
+    assert f'counted on {os.uname().nodename}:' not in launched.text
+    assert not launched.errors, launched.text
