@@ -134,13 +134,26 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
     undo.callback(close)
 
 
+def let_go(entry: Entry) -> bool:
+    """
+    Return whether a machine is kept for a launch to come, and has no agent until then.
+
+    Where the agent comes with a launch (a pod), it leaves with it.
+    """
+    return entry.record is not None and not entry.record.launch \
+        and not machines.load(entry.provider).agent_directory
+
+
 def agent(entry: Entry, to: Shell) -> AgentClient:
     """
     Return a connection to the machine's agent.
 
-    :raises AgentError: this robot doesn't know where it is.
+    :raises AgentError: this robot doesn't know where it is, or there is none.
     """
     record = entry.record
+    if let_go(entry):
+        raise AgentError(f"nothing of a launch runs on '{entry.name}': it is kept for the next "
+                         'one, and the agent of the last one has left with its log')
     if record is None or not record.agent or not record.agent_program:
         raise AgentError(f"this robot knows of no agent on '{entry.name}'",
                          'only the robot that launched it does')

@@ -22,13 +22,17 @@ class StatusVerb(VerbExtension):
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Print it; 1 if the machine doesn't run, or its agent doesn't answer."""
+        """Print it; 1 if the machine doesn't run, or an agent that it should have is silent."""
         from fogros2.errors import FogError
         from ros2fog_cli.api import reach
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'agent': None}
         problems: list[str] = []
-        if entry.record is not None:
+        idle = reach.let_go(entry) and not entry.gone
+        if idle:
+            # told by its tags: the one that made it
+            status['launch'] = ''
+        elif entry.record is not None:
             try:
                 link = reach.link(entry.record)
                 status['vpn'] = dataclasses.asdict(link) if link is not None else None
@@ -51,14 +55,18 @@ class StatusVerb(VerbExtension):
         if args.json:
             print(json.dumps({**status, 'problems': problems}, indent=2))
         else:
-            show(status)
+            show(status, idle=idle)
         for problem in problems:
             warn(problem)
-        return 0 if status['agent'] is not None and not problems else 1
+        return 0 if (status['agent'] is not None or idle) and not problems else 1
 
 
-def show(status: dict[str, Any]) -> None:
-    """Print a status for people."""
+def show(status: dict[str, Any], *, idle: bool = False) -> None:
+    """
+    Print a status for people.
+
+    :param idle: it is kept, and nothing of a launch runs on it.
+    """
     from decimal import Decimal
 
     from ros2fog_cli.api.table import cost, duration, size, table
@@ -70,7 +78,7 @@ def show(status: dict[str, Any]) -> None:
         *((key, status[key]) for key in ('place', 'kind') if status[key]),
         ('age', duration(status['age'])),
         ('time left', duration(status['time_left'])),
-        ('launch', status['launch'] or '-'),
+        ('launch', 'none: it is kept for the next one' if idle else status['launch'] or '-'),
     ]
     if status['cost'] is not None:
         lines.append(('cost', f"{cost(Decimal(status['cost_per_hour']))} an hour, "

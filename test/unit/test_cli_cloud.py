@@ -209,6 +209,18 @@ def test_status_tells_place_and_cost(capsys: pytest.CaptureFixture[str]) -> None
     assert 'eu-west-1' in said and 't3.medium' in said and '$0.0456 an hour, $0.05 so far' in said
 
 
+def test_a_kept_machine_whose_agent_has_left_is_in_order(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('slam')
+    record('slam')  # of no launch: the last one has kept it
+    assert run('status', 'slam') == 0
+    said = capsys.readouterr()
+    assert 'launch     none: it is kept for the next one' in said.out and said.err == ''
+    said = run('logs', 'slam')
+    assert 'it is kept for the next one' in f'{said}{capsys.readouterr().err}'
+
+
 # -- ending -------------------------------------------------------------------------------
 
 

@@ -9,29 +9,33 @@ a pod's namespaces. They are kept, unpacked as containerd does it, in the user's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import dataclasses
+import fcntl
 import hashlib
 import io
 import json
 import os
 from pathlib import Path
 import platform
+import sys
 import tarfile
 import tempfile
 import threading
-import time
 from typing import Any, Optional
 
 from fogros2 import bootstrap, plan, process, wheels
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command, MachineSpec, Result, SyncReport
+from fogros2.provider.kubernetes.options import IMAGE
 from fogros2.testing.cluster import services
 from fogros2.testing.cluster.node_process import run_node
 
 BARE = 'fogros2.test/machine:bare'
 READY = 'fogros2.test/machine:ready'
+#: ``READY`` under the name that ``KubeInstance()`` asks for if nothing else is said.
+DEFAULT = IMAGE
 SANDBOX = 'fogros2.test/sandbox:1'
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
@@ -162,21 +166,41 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
 
     :param binaries: the cluster's programs.
     """
-    root = base(cache, say)
     packed = wheels.collect()
-    system = cache / f'system-{_checksum(f"1 {root.name}")}'
-    target = cache / f'images-{_checksum(f"2 {system.name} {packed.key}")}'
-    for path in (system, target):
-        # root's; one who isn't can't say that it was used
-        with contextlib.suppress(FileNotFoundError, PermissionError):
-            os.utime(path)
-    if target.is_dir():
-        return target
-    say('packing the machine images')
-    with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside, \
-            contextlib.ExitStack() as undo:
-        layers = [Path(aside, name) for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
-        upper, archive = Path(aside, 'upper'), Path(aside, 'images.tar')
+    with _alone(cache):
+        root = base(cache, say)
+        system = cache / f'system-{_checksum(f"1 {root.name}")}'
+        target = cache / f'images-{_checksum(f"3 {system.name} {packed.key}")}'
+        for path in (system, target):
+            # root's; one who isn't can't say that it was used
+            with contextlib.suppress(FileNotFoundError, PermissionError):
+                os.utime(path)
+        if not target.is_dir():
+            say('packing the machine images')
+            with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside:
+                _make(Path(aside), root, system, target, packed, binaries)
+            _forget_old(cache, 'images-', keep=target)
+            _forget_old(cache, 'system-', keep=system)
+    return target
+
+
+@contextlib.contextmanager
+def _alone(cache: Path) -> Iterator[None]:
+    """Let one run of tests at a time make images; what one that was killed left half made goes."""
+    cache.mkdir(parents=True, exist_ok=True)
+    with open(cache / 'images.lock', 'w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for path in cache.glob('new-*'):
+            _remove(path)
+        yield
+
+
+def _make(
+    aside: Path, root: Path, system: Path, target: Path, packed: wheels.Wheels, binaries: Path,
+) -> None:
+    layers = [aside / name for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
+    upper, archive = aside / 'upper', aside / 'images.tar'
+    with contextlib.ExitStack() as undo:
         undo.callback(_remove, upper)
         upper.mkdir()
         _tar(layers[0], root)
@@ -194,11 +218,10 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
             _add_embedded(shell)
         _tar(layers[1], upper / 'files')
         # the lower layer is there already
-        write_archive(archive, [Image(READY, tuple(layers[:2]), _CONFIG)], leave_out=layers[:1])
+        write_archive(archive, [
+            Image(name, tuple(layers[:2]), _CONFIG) for name in (READY, DEFAULT)],
+            leave_out=layers[:1])
         _unpack(archive, target, binaries, system)
-    _forget_old(cache, 'images-', keep=target)
-    _forget_old(cache, 'system-', keep=system)
-    return target
 
 
 def _unpack(
@@ -214,7 +237,9 @@ def _unpack(
 
 def _add_embedded(shell: RootShell) -> None:
     """Install the embedded default as a launch would."""
-    ros2 = process.which('ros2')
+    # tests may be run by an interpreter whose folder isn't on PATH
+    beside = str(Path(sys.executable).with_name('ros2'))
+    ros2 = process.which('ros2') or process.which(beside)
     if ros2 is None:
         raise PrerequisiteError('ros2 is not on PATH', 'run this by tools/run.sh')
     under = plan.underlay(dict(os.environ), None, ros2)
@@ -317,10 +342,7 @@ def _remove(folder: Path) -> None:
 
 
 def _forget_old(cache: Path, prefix: str, *, keep: Path, number: int = 2) -> None:
-    """Remove all but the last used, and what was left half made."""
-    for path in cache.glob('new-*'):
-        if time.time() - path.stat().st_mtime > 3600:
-            _remove(path)
+    """Remove all but the last used."""
     others = [path for path in cache.glob(f'{prefix}*') if path != keep]
     for path in sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
         _remove(path)

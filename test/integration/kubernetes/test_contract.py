@@ -232,7 +232,7 @@ def test_a_way_that_lets_nothing_through_is_told(place, monkeypatch):
 
 @pytest.fixture
 def in_the_way(place, client):
-    """Return what makes a Service of a machine's name that isn't the machine's, gone at the end."""
+    """Return what makes a Service that has a machine's name and isn't its; gone at the end."""
     base = f'/api/v1/namespaces/{place.name}/services'
     made = []
 

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
+from pathlib import Path
 import shutil
 import time
 import uuid
 
 import pytest
 
-from fogros2.testing.cluster import READY
+from fogros2.testing.cluster import DEFAULT, READY
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
@@ -50,6 +52,26 @@ def listener(**more):
 
 def generate_launch_description():
     return FogROSLaunchDescription([
+"""
+
+
+#: What FogROS2's talker.kube.launch.py asks for, in its words; FOGROS2_ORIGINAL names a checkout
+#: whose own is taken instead.
+THEIRS = """
+from launch_ros.actions import Node
+
+import fogros2
+
+
+def generate_launch_description():
+    ld = fogros2.FogROSLaunchDescription()
+    machine1 = fogros2.KubeInstance()
+    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
+    talker_node = fogros2.CloudNode(
+        package='fogros2_examples', executable='talker', output='screen', machine=machine1)
+    ld.add_action(talker_node)
+    ld.add_action(listener_node)
+    return ld
 """
 
 
@@ -120,6 +142,24 @@ def test_the_example(namespace):
     assert run.text.count('I heard: [Hello World from planner ') >= 2
     assert clean(run), run.text
     assert 'node_port' in run.text, f'it says which way UDP took: {run.text}'
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_fogros2s_own_launch_file_runs_unchanged(namespace, tmp_path):
+    """Its image is the one that KubeInstance() names; the cluster has one of that name."""
+    path = tmp_path / 'theirs.launch.py'
+    checkout = os.environ.get('FOGROS2_ORIGINAL')
+    path.write_text(THEIRS if not checkout else Path(
+        checkout, 'fogros2_examples', 'launch', 'talker.kube.launch.py').read_text())
+    with launching() as start:
+        run = start(str(path))
+        run.wait_for('I heard: [Hello World from ', timeout=PATIENCE)
+        (pod,) = namespace.all('pods')
+        assert pod['spec']['containers'][0]['image'] == DEFAULT
+        run.interrupt()
+        assert run.ended() == 0, run.text
+    assert clean(run), run.text
     assert namespace.left() == []
 
 
@@ -216,6 +256,9 @@ def test_a_kept_pod_is_a_warm_start(launch, namespace):
     assert len(pods) == 2 and len({*pods}) == 1, "the second launch took the first one's pod"
     listed = ros2('fog', 'list')
     assert 'warm' in listed.stdout and namespace.name in listed.stdout, listed
+    status = ros2('fog', 'status', 'warm')
+    assert status.returncode == 0 and 'kept for the next one' in status.stdout, status
+    assert status.stderr == '', status
     deleted = ros2('fog', 'delete', 'warm', '--yes')
     assert deleted.returncode == 0, deleted
     assert namespace.left() == []
