@@ -898,10 +898,11 @@ class Agent:
                           kind='released')
         age = self.sign_of_life()
         dead = request.get('force') or None
-        if taken_over and age is not None and dead != self.config['launch']:
+        owner = self.config['launch']  # '' after a later boot: nobody's until a launch comes
+        if taken_over and owner and age is not None and dead != owner:
             raise Refused(
-                f"this machine belongs to launch '{self.config['launch']}', whose last sign of "
-                f'life is {age:.0f} s old', 'end that launch, or choose another name', 'busy')
+                f"this machine belongs to launch '{owner}', whose last sign of life is "
+                f'{age:.0f} s old', 'end that launch, or choose another name', 'busy')
         stale = self.launch is not None and any(
             key in new and new[key] != self.config[key] for key in ('setup', 'ros_command'))
         running = any(node['state'] in ('starting', 'running') for node in self.nodes.values())

@@ -794,6 +794,14 @@ def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
     client.request('configure', launch='def456')
 
 
+def test_a_machine_that_booted_again_is_whose_launch_comes_first(rig):
+    rig.serve(launch='', boot_timeout=60.0)
+    client = rig.client()
+    client.request('configure', launch='abc123', force='')
+    with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
+        client.request('configure', launch='def456')
+
+
 def test_what_comes_after_a_release_does_not_claim_the_machine_again(rig):
     """Such as a sign of life that was under way when the connection broke."""
     rig.serve(launch='first', on_exit='keep', boot_timeout=60.0)

@@ -438,6 +438,18 @@ def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
     assert keys.read_text() == 'ours'
 
 
+def test_a_machine_that_boots_again_is_not_its_first_launchs(booted):
+    """That one is over; later ones of the same robot came and went, by other ids."""
+    told = config(machine='planner', launch='l1', directory='/run/fogros2')
+    file = booted(told) / 'opt/fogros2/agent.json'
+    assert json.loads(file.read_text())['launch'] == 'l1'
+    booted(told)
+    assert json.loads(file.read_text())['launch'] == ''
+    assert oct(file.stat().st_mode)[-3:] == '600'
+    booted(told, INSTANCE_ID='i-2')
+    assert json.loads(file.read_text())['launch'] == 'l1'
+
+
 def test_a_machine_that_can_not_be_guarded_ends(booted, monkeypatch):
     monkeypatch.setattr(boot, 'UNGUARDED', 1)
     told = boot.cloud_config(

@@ -58,11 +58,14 @@ _BOOT = """\
 umask 022
 mkdir -p {folder}
 # an image that was baked of another machine brings the keys that could log in there
+owned=yes
 if [ "$(cat {folder}/instance 2>/dev/null)" != "$INSTANCE_ID" ]; then
     home=$(getent passwd {user} | cut -d: -f6)
     [ -z "$home" ] || rm -f "$home/.ssh/authorized_keys"
     rm -f /root/.ssh/authorized_keys
     echo "$INSTANCE_ID" >{folder}/instance
+else
+    owned=  # at a later boot it is whose launch comes first
 fi
 cat >{program} <<'{mark}'
 {agent}
@@ -73,6 +76,7 @@ cat >{folder}/guard.sh <<'{mark}'
 (umask 077; cat >{folder}/agent.json) <<'{mark}'
 {config}
 {mark}
+[ -n "$owned" ] || sed -i 's/"launch": "[^"]*"/"launch": ""/' {folder}/agent.json
 # of its own, or it would end with the step of the boot that it was started in
 systemd-run --no-block --unit=fogros2-guard --property=DefaultDependencies=no \\
     --property=Restart=on-failure /bin/sh {folder}/guard.sh >/dev/null 2>&1 \\

@@ -218,11 +218,14 @@ def test_a_stopped_instance_is_started_again(robot, box, name):
     box.wait_for(stopped.id, 'stopped')
     listed = robot.ros2('fog', 'list')
     assert listed.returncode == 0 and 'stopped' in listed.stdout, listed.stdout + listed.stderr
-    again = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
-                         'on_exit:=delete', 'count:=1')
-    assert again.ended() == 0, again.text
-    assert clean(again), again.text
-    assert box.instances()[-1].id == stopped.id
+    # more than once, and the last time to be deleted, which it was not made for
+    for on_exit in ('stop', 'delete'):
+        again = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
+                             f'on_exit:={on_exit}', 'count:=1')
+        assert again.ended() == 0, again.text
+        assert clean(again), again.text
+        assert box.instances()[-1].id == stopped.id
+        assert box.instances()[-1].tags['fogros2-on-exit'] == on_exit
     assert box.wait_for(stopped.id, 'terminated').reason == 'Client.UserInitiatedShutdown'
 
 
