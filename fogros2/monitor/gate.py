@@ -19,6 +19,7 @@ import asyncio
 from collections.abc import Sequence
 import contextlib
 import hmac
+import os
 import signal
 import socket
 import ssl
@@ -26,6 +27,8 @@ import sys
 from typing import Optional
 import urllib.parse
 
+#: Variable of all nodes on a machine: its address in the VPN.
+VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'
 #: Bytes and seconds that a request may take until its empty line.
 HEAD, HEAD_TIME = 16384, 10.0
 #: Seconds for the handshake of TLS.
@@ -201,8 +204,11 @@ def _listen(address: tuple[str, int]) -> socket.socket:
 
 async def _run(options: argparse.Namespace) -> None:
     ended = asyncio.ensure_future(asyncio.Event().wait())
+    loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, ended.cancel)
+        loop.add_signal_handler(number, ended.cancel)
+    if options.until_eof:
+        loop.add_reader(0, ended.cancel)  # nothing is ever written there
     token, tls = '', None
     if options.guarded:
         with open(options.token_file, encoding='ascii') as file:
@@ -228,11 +234,18 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument('--to', type=endpoint, required=True, help='where the bridge listens')
     parser.add_argument('--listen', type=endpoint, action='append', default=[],
                         help='where to listen for whoever gets there')
+    parser.add_argument('--vpn', type=int, metavar='PORT', help=f'the same, at ${VPN_ADDRESS}')
+    parser.add_argument('--until-eof', action='store_true',
+                        help='end with the process that has the other end of the input')
     parser.add_argument('--guarded', type=endpoint, help='where to listen with TLS and a token')
     parser.add_argument('--certificate', help='PEM file')
     parser.add_argument('--key', help='PEM file')
     parser.add_argument('--token-file', help='file with the token, so that no process list has it')
     options = parser.parse_args(arguments)
+    if options.vpn is not None:
+        if VPN_ADDRESS not in os.environ:
+            parser.error(f'--vpn takes {VPN_ADDRESS}, which nodes on a machine have')
+        options.listen.append((os.environ[VPN_ADDRESS], options.vpn))
     if options.guarded and not (options.certificate and options.key and options.token_file):
         parser.error('--guarded takes --certificate, --key and --token-file')
     asyncio.run(_run(options))
