@@ -188,6 +188,7 @@ class Executor(AbstractContextManager['Executor']):
             for node in self._nodes:
                 for entity in node._entities():
                     if not entity.callback_group.can_execute(entity):
+                        self._stale = True  # a group may change its mind without a word
                         continue
                     if isinstance(entity, Timer):
                         timers.append(entity)

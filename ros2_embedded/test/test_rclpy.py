@@ -587,6 +587,28 @@ def test_callbacks_run_at_the_same_time_only_where_groups_let_them(context):
         assert most[0] >= together if together == 2 else most[0] == 1
 
 
+def test_a_group_of_ones_own_may_change_its_mind(world):
+    from rclpy.callback_groups import CallbackGroup
+
+    class Tokens(CallbackGroup):
+        left = 1
+
+        def can_execute(self, entity):
+            return self.left > 0
+
+        def beginning_execution(self, entity):
+            self.left -= 1
+            return self.left >= 0
+
+        def ending_execution(self, entity):
+            pass
+
+    node, group, calls = world.node(), Tokens(), []
+    node.create_timer(0.01, lambda: calls.append(1), callback_group=group)
+    node.create_timer(0.1, lambda: setattr(group, 'left', 1))
+    world.until(lambda: len(calls) == 3)
+
+
 def test_adding_and_removing_nodes(world):
     node = world.node()
     assert node.executor is world.executor and not world.executor.add_node(node)

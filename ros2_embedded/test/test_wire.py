@@ -10,6 +10,7 @@ import importlib.metadata
 import os
 from pathlib import Path
 import subprocess
+import sys
 import time
 
 from example_interfaces.srv import AddTwoInts
@@ -201,16 +202,38 @@ def test_we_show_in_its_graph_and_answer_its_commands(side):
         topic = output('ros2', 'topic', 'info', '-v', '--no-daemon', '/embedded/chatter')
         assert 'Node name: ours' in topic and 'RIHS01_df668c74' in topic
         assert 'History (Depth): KEEP_LAST (3)' in topic
+        topics = output('ros2', 'topic', 'list', '--no-daemon')
+        assert '/embedded/chatter' in topics.splitlines()
         values = output('ros2', 'param', 'get', '--no-daemon', '/embedded/ours', 'speed')
         assert 'Double value is: 1.5' in values
         called = output('ros2', 'service', 'call', '/embedded/add',
                         'example_interfaces/srv/AddTwoInts', '{a: 3, b: 4}')
         assert 'sum=7' in called
-        for text in (info, topic, values, called):
+        for text in (info, topic, topics, values, called):
             assert 'WARN' not in text and 'Failed' not in text
     finally:
         side.executor.shutdown()
         thread.join(LIMIT)
+
+
+def test_it_shows_in_our_commands(peer):
+    command = str(Path(sys.executable).with_name('ros2'))
+    for words, expected in ((('node', 'list'), '/real/peer'), (('topic', 'list'), '/real/there'),
+                            (('service', 'list'), '/real/add'),
+                            (('param', 'get', '/real/peer', 'gain'), 'Double value is: ')):
+        done = subprocess.run([command, *words], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0 and done.stderr == ''
+        assert any(line.startswith(expected) for line in done.stdout.splitlines()), done.stdout
+
+
+def test_nobody_warned_of_anything(side, capfd):
+    publisher = side.node.create_publisher(String, '/real/there', 10)
+    side.node.create_subscription(String, '/real/back', lambda _: None, 10)
+    side.until(lambda: publisher.get_subscription_count() == 1)
+    publisher.publish(String(data='one more'))
+    side.until(lambda: side.node.count_publishers('/real/back') == 1)
+    said = capfd.readouterr()
+    assert 'WARN' not in said.err + said.out and 'ERROR' not in said.err + said.out
 
 
 def test_type_hashes_are_those_that_ros_2_generated():
