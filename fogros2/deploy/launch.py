@@ -304,12 +304,8 @@ class Launch:
             self._closed = True
         self.cancel.set()
         ups = list(self._ups.values())
-        ended: list[Future[None]] = []
         with ThreadPoolExecutor(max(1, len(ups)), 'fog-down') as pool:
-            for up in ups:
-                # one that still comes up sees the cancel and takes itself away
-                if up.exception() is None:
-                    ended.append(pool.submit(up.result().close))
+            ended = [pool.submit(_end, up) for up in ups]
         with self._lock:
             self._ups.clear()
             try:
@@ -350,3 +346,9 @@ class Launch:
             output = process.run(command, timeout=self.timeouts.vpn,
                                  cancel=self.cancel if cancel else None).stdout
         return output
+
+
+def _end(up: Future[RunningMachine]) -> None:
+    """End a machine; one that still comes up sees the cancel and takes itself away."""
+    if up.exception() is None:
+        up.result().close()
