@@ -445,3 +445,19 @@ def test_a_machine_that_vanishes_while_it_ends_its_nodes_is_given_up(launch):
         client.request('release', timeout=30.0, silent=0.3)
     assert time.monotonic() - begin < 5
     client.close()
+
+
+def test_a_machine_is_ended_while_another_still_comes_up(launch):
+    ended = threading.Event()
+    slow, fast = Future(), Future()
+    launch._ups.update(slow=slow, fast=fast)
+    fast.set_result(SimpleNamespace(close=ended.set))
+
+    def fail():
+        slow.set_exception(Cancelled() if ended.wait(10) else AssertionError('one by one'))
+
+    thread = threading.Thread(target=fail)
+    thread.start()
+    assert launch.down() == []
+    thread.join(10)
+    assert isinstance(slow.exception(), Cancelled)
