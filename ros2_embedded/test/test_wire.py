@@ -75,7 +75,7 @@ def ros2(*command, **kwargs):
     environment.update(PATH='/usr/local/bin:/usr/bin:/bin', PYTHONUNBUFFERED='1')
     script = f'. "{SETUP}" && export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp && exec "$@"'
     return subprocess.Popen(['sh', '-c', script, 'sh', *command], env=environment, text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **kwargs)
+                            cwd='/', stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **kwargs)
 
 
 def output(*command):
