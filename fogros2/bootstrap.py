@@ -331,13 +331,8 @@ def _why_not_apt(facts: HostFacts) -> str:
 
 def _fits(facts: HostFacts, wheels: wheel_cache.Wheels) -> Optional[Python]:
     """Return the interpreter that can take the robot's compiled wheels as they are, if any."""
-    def libc(text: str) -> tuple[str, tuple[int, ...]]:
-        kind, _, version = text.partition(' ')
-        return kind, tuple(int(n) for n in version.split('.') if n.isdigit())
-
-    if facts.architecture != wheels.architecture or libc(facts.libc) < libc(wheels.libc):
-        return None
-    if libc(facts.libc)[0] != libc(wheels.libc)[0]:
+    if facts.architecture != wheels.architecture or not wheel_cache.runs_on(
+            wheels.libc, facts.libc):
         return None
     return next((p for p in facts.pythons if p.venv and p.version == wheels.python), None)
 

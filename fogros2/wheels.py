@@ -99,11 +99,20 @@ def collect(folder: Optional[Path] = None) -> Wheels:
     files = json.loads((target / 'wheels.json').read_text())
     return Wheels(
         str(target), key, (sys.version_info.major, sys.version_info.minor), platform.machine(),
-        _libc(files.values()), files[OWN], files.get(PIP, ''), EMBEDDED in files)
+        libc_for(files.values()), files[OWN], files.get(PIP, ''), EMBEDDED in files)
 
 
-def _libc(files: Iterable[str]) -> str:
-    """Return the oldest C library that takes all of these wheels."""
+def runs_on(needed: str, libc: str) -> bool:
+    """Return whether a C library (such as ``glibc 2.36``) takes what needs at least another."""
+    def parts(text: str) -> tuple[str, tuple[int, ...]]:
+        kind, _, version = text.partition(' ')
+        return kind, tuple(int(n) for n in version.split('.') if n.isdigit())
+
+    return parts(needed)[0] == parts(libc)[0] and parts(needed) <= parts(libc)
+
+
+def libc_for(files: Iterable[str]) -> str:
+    """Return the oldest C library that takes all of these wheels, by their file names."""
     newest = (0, 0)
     for file in files:
         platforms = file.removesuffix('.whl').rpartition('-')[2]

@@ -7,9 +7,10 @@ from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from fogros2 import bootstrap, workspace
+from fogros2 import bootstrap, modules, workspace
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
+from fogros2.deploy.equipping import Equipment
 from fogros2.deploy.guarding import Guard
 from fogros2.deploy.job import Job
 from fogros2.deploy.joining import Joining
@@ -39,7 +40,7 @@ class Deployment:
         with job.undo:
             job.undo.enter_context(job.folder.lock())
             # the robot's side needs nothing of the machine's: it comes up meanwhile
-            with ThreadPoolExecutor(4, f'fog-{job.name}') as pool:
+            with ThreadPoolExecutor(5, f'fog-{job.name}') as pool:
                 robot = pool.submit(self.launch.robot_vpn().ensure)
                 machine = self.creation.run()
                 shell = self.entrance.connect(machine)
@@ -51,7 +52,9 @@ class Deployment:
                 joining = pool.submit(self.joining.join, machine, shell, agent, interface)
                 syncing = pool.submit(self.sync, shell, ros)
                 configuring = pool.submit(self.configure_dds, shell, interface)
-                self._all_of(joining, syncing, configuring)
+                equipment = Equipment(job, shell, ros)
+                equipping = pool.submit(self.equip, equipment)
+                self._all_of(joining, syncing, configuring, equipping)
                 public_key = joining.result().place.peer.public_key
                 dds = configuring.result()
             with job.step('agent') as detail:
@@ -64,7 +67,7 @@ class Deployment:
             job.failed = False
             running = RunningMachine(
                 self.launch, job, machine, shell, agent, heartbeat, interface,
-                self.guard.first_event, self.joining.redial)
+                self.guard.first_event, self.joining.redial, equipment)
             running.undo = job.undo.pop_all()
             return running
 
@@ -86,6 +89,11 @@ class Deployment:
                 timeout=job.timeouts.install, cancel=job.cancel)
             detail.append(note)
             return ros
+
+    def equip(self, equipment: Equipment) -> None:
+        """Bring what nodes import that are known to come; later ones bring theirs."""
+        if modules.needed_by(self.launch.programs(self.job.name)):
+            equipment.ensure()
 
     # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
 

@@ -63,6 +63,7 @@ class Launch:
         self._indices: dict[str, int] = {}
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
+        self._programs: dict[str, Sequence[tuple[str, str]]] = {}
         self.choices = Choices(self.provider, report)
         self._robot: Optional[RobotVpn] = None
         self._rmw = ''
@@ -83,6 +84,7 @@ class Launch:
         """
         self.dds()
         check_robot()
+        self._programs.update(programs)
         names = [spec.name for spec in specs]
         for name in names:
             check_name(name)
@@ -118,6 +120,10 @@ class Launch:
             return False
         return before is not None and before.machine_id is not None \
             and before.provider == spec.provider
+
+    def programs(self, name: str) -> Sequence[tuple[str, str]]:
+        """Return the (package, executable) pairs that are known to run on a machine."""
+        return self._programs.get(name, ())
 
     def provider(self, name: str) -> Provider:
         """

@@ -10,6 +10,7 @@ import threading
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.deploy.equipping import Equipment
 from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
 from fogros2.model import Machine, NodeSpec, VpnInterface
@@ -29,12 +30,13 @@ class RunningMachine:
 
     :param first_event: number of the agent's first event that is this launch's.
     :param found: takes what the provider tells of the machine when its heartbeat stays away.
+    :param equipment: brings what some nodes import.
     """
 
     def __init__(
         self, launch: Launch, job: Job, machine: Machine, shell: Shell, agent: AgentClient,
         heartbeat: Heartbeat, interface: VpnInterface, first_event: int,
-        found: Callable[[Machine], None],
+        found: Callable[[Machine], None], equipment: Equipment,
     ) -> None:
         self.spec = job.spec
         self.machine = machine
@@ -47,6 +49,7 @@ class RunningMachine:
         self.undo = contextlib.ExitStack()
         self._launch = launch
         self._job = job
+        self._equipment = equipment
         self._first_event = first_event
         self._warm = False
         self._lock = threading.Lock()
@@ -64,7 +67,12 @@ class RunningMachine:
             self.agent.request('launch')
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
-        """Start nodes; what becomes of them arrives as events."""
+        """
+        Start nodes; what becomes of them arrives as events.
+
+        :raises PrerequisiteError: the machine can't have what they import.
+        """
+        nodes = self._equipment.fitted(nodes)
         self.agent.request('start', nodes=[_json(node) for node in nodes])
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:

@@ -13,19 +13,15 @@ one topic.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import importlib.util
 import json
 import re
 from typing import Any, Optional
 
+from fogros2 import modules
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import NodeSpec, Stream
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
-#: What image_transport_h264 imports, and what brings it with pip and apt.
-_MODULES = {
-    'av': ('av', 'python3-av'), 'cv2': ('opencv-python-headless', 'python3-opencv'),
-    'numpy': ('numpy', 'python3-numpy')}
 #: Options of a Stream that are no parameters of the encoder.
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
 
@@ -87,13 +83,15 @@ def check_modules() -> None:
 
     :raises PrerequisiteError: it can't.
     """
-    lacking = [names for module, names in _MODULES.items()
-               if importlib.util.find_spec(module) is None]
+    lacking = modules.lacking_here()
     if lacking:
-        pip, apt = (' '.join(words) for words in zip(*lacking))
+        names = [f'{m.distributions[0]} {m.oldest} or newer' if m.oldest else m.distributions[0]
+                 for m in lacking]
+        wanted = ' '.join(f"'{m.distributions[0]}>={m.oldest}'" if m.oldest
+                          else m.distributions[0] for m in lacking)
         raise PrerequisiteError(
-            f'streams of images need {pip}, which this Python does not have',
-            f'pip install {pip}, or apt install {apt}')
+            f"streams of images need {', '.join(names)}, which this Python does not have",
+            f'pip install {wanted}')
 
 
 def remappings(

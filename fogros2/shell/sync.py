@@ -77,14 +77,15 @@ def to_machine(
         raise missing_there(where)
     with contextlib.ExitStack() as undo:
         failures: list[FogError] = []
-        if not there and process.which('ssh') and is_large(source, BULK):
+        bulk = not there and process.which('ssh') is not None and is_large(source, BULK)
+        if bulk:
             rsh = undo.enter_context(open_ssh(shell.endpoint))
         else:
             rsh, failures = undo.enter_context(relay.remote_shell(shell.start))
         left = timeout - (time.monotonic() - begin)
         result = process.run(
             rsync(source, f'machine:{remote_folder(target)}',
-                  excludes=excludes, includes=includes, rsh=rsh,
+                  excludes=excludes, includes=includes, rsh=rsh, compress=bulk,
                   progress=on_progress is not None),
             timeout=max(0.1, left), cancel=cancel, check=False,
             on_output=None if on_progress is None else Progress(on_progress))
@@ -150,19 +151,22 @@ def remote_folder(target: str) -> str:
 
 def rsync(
     source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
-    rsh: str = '', progress: bool = False,
+    rsh: str = '', compress: bool = False, progress: bool = False,
 ) -> Command:
     """
     Return the command that makes ``target`` equal ``source``.
 
     :param target: a folder here, or ``machine:folder``.
     :param rsh: program and words that reach ``machine``.
+    :param compress: by the best way that both sides have: zstd mostly, quicker than most links.
     :param progress: print how far it is, a line each.
     """
     # protected arguments: no shell over there looks into a folder's name
     words = ['rsync', '-a', '-s', '--delete', '--stats', '--no-human-readable']
     words += [f'--include={pattern}' for pattern in includes]
     words += [f'--exclude={pattern}' for pattern in excludes]
+    if compress:
+        words.append('--compress')
     if progress:
         words += ['--info=progress2', '--no-inc-recursive']
     if rsh:

@@ -208,3 +208,37 @@ def test_a_workspace_travels_and_a_kept_computer_gets_only_what_changed(
     assert 'workspace' in second.text and '(1 files, ' in second.text
     assert nothing_runs(computer) == []
     assert name not in listed()
+
+
+@pytest.mark.skipif(not embedded(), reason='with ROS 2 the computer has all that the robot has')
+def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
+    path = tmp_path / 'video.launch.py'
+    path.write_text(textwrap.dedent(f"""
+        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance, StreamTopic
+        from launch.actions import Shutdown
+        from launch_ros.actions import Node
+
+
+        def generate_launch_description():
+            machine = SSHInstance(
+                '{computer.address}', '{computer.user}', key='{computer.key}',
+                host_key='{computer.host_key}', name='video-{RUN}', bootstrap='embedded')
+            return FogROSLaunchDescription([
+                CloudNode(machine=machine, package='fogros2_examples', output='screen',
+                          executable='image_processor', on_exit=Shutdown(), stream_topics=[
+                              ('/camera', 'h264'), StreamTopic('/annotated', 'h264', 'to_robot')]),
+                Node(package='fogros2_examples', executable='camera',
+                     parameters=[{{'count': 75}}], on_exit=Shutdown()),
+            ])
+        """))
+    assert computer.run('python3 -c "import numpy" || echo none').stdout == 'none\n'
+    for turn, how in enumerate(('av, cv2 sent', 'there from before')):
+        computer.run('touch /tmp/marker')
+        seen = launch(str(path))
+        assert seen.ended() == 0, seen.text
+        assert f'({how})' in seen.text
+        assert 'images/s' in seen.text and 'after it was taken' in seen.text
+        assert 'WARNING' not in seen.text and seen.errors == []
+        sent = [path for path in sent_since(computer, '/tmp/marker') if '/modules-' in path]
+        assert bool(sent) == (turn == 0)
+        assert nothing_runs(computer) == []

@@ -52,7 +52,7 @@ def test_that_it_is_gone_is_its_provider_s_to_say():
     agent, heard = Told(), []
     machine = RunningMachine(
         SimpleNamespace(ending=False), job, None, None, agent, None,
-        SimpleNamespace(address='198.18.7.2'), 7, None)
+        SimpleNamespace(address='198.18.7.2'), 7, None, None)
     machine.subscribe(heard.append)
     assert agent.since == 7
     for event in ('lost', 'connection', 'gap'):

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What nodes that handle images import: looked for, brought, and found by them alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import metadata
+import os
+from pathlib import Path
+import platform
+import subprocess
+import sys
+import threading
+from types import SimpleNamespace
+from typing import Optional
+import zipfile
+
+import pytest
+
+from fogros2 import modules
+from fogros2.bootstrap import RosInstall
+from fogros2.deploy.equipping import Equipment
+from fogros2.errors import PrerequisiteError
+from fogros2.host import HostFacts
+from fogros2.model import Endpoint, NodeSpec
+from fogros2.report import step
+from fogros2.shell.local import LocalShell
+from fogros2.waiting import Timeouts
+
+HERE = modules.Answer(
+    (sys.version_info.major, sys.version_info.minor), platform.machine(),
+    ' '.join(platform.libc_ver()), ('numpy', 'av', 'cv2'))
+
+
+@pytest.mark.parametrize('programs, needed', [
+    ([], False), ([('fogros2_examples', 'talker')], False), ([('my_robot', 'encoder')], False),
+    ([('fogros2_examples', 'talker'), ('image_transport_h264', 'decoder')], True),
+    ([('fogros2_examples', 'image_processor')], True)])
+def test_who_needs_them(programs: list[tuple[str, str]], needed: bool) -> None:
+    assert modules.needed_by(programs) is needed
+
+
+def test_nodes_that_need_them_find_them_first_and_no_other_does(tmp_path: Path) -> None:
+    decoder = NodeSpec('1', 'decoder', 'image_transport_h264', 'decoder', ('--ros-args',))
+    talker = NodeSpec('2', 'talker', 'fogros2_examples', 'talker')
+    place = tmp_path / 'a folder'
+    assert modules.fitted(talker, str(place)) is talker
+    assert modules.fitted(decoder, '') is decoder
+    prefix = modules.fitted(decoder, str(place)).prefix
+    for before, after in ((None, f'{place}/site'), ('/a:/b', f'{place}/site:/a:/b')):
+        environment = {'PATH': os.environ['PATH'], **({'PYTHONPATH': before} if before else {})}
+        said = subprocess.run(
+            [*prefix, 'sh', '-c', 'echo "$PYTHONPATH $0 $1"', 'a word', 'b c'], check=True,
+            env=environment, text=True, stdout=subprocess.PIPE).stdout
+        assert said == f'{after} a word b c\n'
+
+
+def test_what_is_here_can_be_copied_where_it_runs() -> None:
+    copy = modules.copy(HERE)
+    assert copy is not None
+    assert {'numpy', 'av', 'cv2', 'av.libs'} <= set(copy.entries)
+    assert not {'..', 'bin', 'fogros2'} & set(copy.entries)
+    assert Path(copy.folder, 'av', '__init__.py').is_file()
+    some = modules.copy(dataclasses.replace(HERE, missing=('av',)))
+    assert some is not None and 'av' in some.entries and 'cv2' not in some.entries
+
+
+@pytest.mark.parametrize('changes', [
+    {'python': (3, 9)}, {'architecture': 'riscv64'}, {'libc': 'glibc 2.17'}, {'libc': ' '}])
+def test_nothing_is_copied_that_would_not_run_there(changes: dict[str, object]) -> None:
+    assert modules.copy(dataclasses.replace(HERE, **changes)) is None  # type: ignore[arg-type]
+
+
+def test_one_need_has_one_folder() -> None:
+    one = modules.folder('/home/a', HERE, ['av 18'])
+    assert one.startswith('/home/a/.local/share/fogros2/modules-')
+    assert one == modules.folder('/home/a', HERE, ['av 18'])
+    less = dataclasses.replace(HERE, missing=('av',))
+    assert len({one, modules.folder('/home/a', HERE, ['av 17']),
+                modules.folder('/home/a', less, ['av 18'])}) == 3
+
+
+@pytest.mark.parametrize('output', ['', 'bash: python3: command not found', '[1]', '{}'])
+def test_a_machine_without_python_says_so(output: str) -> None:
+    with pytest.raises(PrerequisiteError, match='no Python there'):
+        modules.answer(output)
+
+
+def test_one_that_is_too_old_is_lacking(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert modules.lacking_here() == []
+    monkeypatch.setattr(metadata, 'version', lambda name: '11.0.0')
+    assert [module.name for module in modules.lacking_here()] == ['av']
+
+
+# --- on a machine: this computer, by its own shell ----------------------------------------------
+
+@pytest.fixture
+def machine(tmp_path: Path) -> SimpleNamespace:
+    """Return a machine whose PyAV can't be imported, and whose index is a folder."""
+    broken, index = tmp_path / 'broken', tmp_path / 'index'
+    broken.mkdir()
+    (broken / 'av.py').write_text("raise OSError('libavcodec.so.60 is not there')\n")
+    index.mkdir()
+    ros = RosInstall('ros', ('ros2', 'launch'), (f'{tmp_path}/not there yet.sh',), {
+        'PATH': f"{Path(sys.executable).parent}:{os.environ['PATH']}", 'PYTHONPATH': str(broken),
+        'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(index)}, HostFacts(home=str(tmp_path)))
+    told: list[object] = []
+    job = SimpleNamespace(
+        name='m', spec=SimpleNamespace(environment={}), timeouts=Timeouts(),
+        cancel=threading.Event(), step=lambda name: step(told.append, 'm', name))
+    return SimpleNamespace(ros=ros, job=job, index=index, told=told, home=tmp_path, broken=broken)
+
+
+def wheel(index: Path, version: str, program: str = '') -> None:
+    with zipfile.ZipFile(index / f'av-{version}-py3-none-any.whl', 'w') as archive:
+        info = f'av-{version}.dist-info'
+        archive.writestr('av/__init__.py', program or f"__version__ = '{version}'\n")
+        archive.writestr(f'{info}/METADATA', f'Metadata-Version: 2.1\nName: av\n'
+                                             f'Version: {version}\n')
+        archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
+                                          'Tag: py3-none-any\n')
+        archive.writestr(f'{info}/RECORD', '')
+
+
+def equipped(machine: SimpleNamespace) -> tuple[NodeSpec, str]:
+    """Return a decoder as it is started there, and what was said of its modules."""
+    equipment = Equipment(machine.job, LocalShell(Endpoint('local'), name='m'), machine.ros)
+    (node,) = equipment.fitted([NodeSpec('1', 'd', 'image_transport_h264', 'decoder')])
+    return node, machine.told[-1].detail
+
+
+def test_what_works_there_is_left_alone(machine: SimpleNamespace) -> None:
+    (machine.broken / 'av.py').unlink()
+    node, said = equipped(machine)
+    assert node.prefix == () and said == 'there already'
+
+
+@pytest.mark.parametrize('old', [None, "__version__ = '11.0.0'\n"])
+def test_a_machine_of_another_kind_asks_its_index(
+    machine: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, old: Optional[str],
+) -> None:
+    monkeypatch.setattr(modules, 'copy', lambda there: None)
+    if old is not None:
+        (machine.broken / 'av.py').write_text(old)
+    for version in ('14.0.0', '99.1.0'):
+        wheel(machine.index, version)
+    node, said = equipped(machine)
+    assert said == 'av installed'
+    (place,) = machine.home.glob('.local/share/fogros2/modules-*/site')
+    assert (place / 'av' / '__init__.py').read_text() == "__version__ = '99.1.0'\n"
+    assert not (place.parent / 'pip').exists() and str(place) in node.prefix[-2]
+    # the next launch finds it
+    again, said = equipped(machine)
+    assert said == 'there from before' and again == node
+
+
+def test_a_machine_that_can_not_have_them_says_what_to_do(
+    machine: SimpleNamespace, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(modules, 'copy', lambda there: None)
+    with pytest.raises(PrerequisiteError, match="'m' can't get av, .*") as caught:
+        equipped(machine)
+    assert 'pip install av' in caught.value.hint
+    wheel(machine.index, '99.0', 'import a_library_that_is_not_there\n')
+    with pytest.raises(PrerequisiteError, match='can not be imported'):
+        equipped(machine)
+    # and it isn't taken for complete by the next launch
+    with pytest.raises(PrerequisiteError, match='can not be imported'):
+        equipped(machine)
