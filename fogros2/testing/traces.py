@@ -1,32 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What launches leave on this computer, and which of it may be somebody else's.
+What launches leave on this computer, told from what others do on it at the same time.
 
-A trace is taken for ours unless it can be shown not to be: it carries the id of a launch, or the
-token of a machine, that another state folder on this computer knows. So another test run, or the
-user's own robot, disturbs nobody, and what nobody knows is a leak.
+A trace is taken for this run's if it carries the id of a launch, or the token of a machine, that a
+state folder of this run has known while a test ran, or if it is among the run's own files or comes
+from a process of its own. So another run of tests, or the user's own robot, disturbs nobody.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import contextlib
 import dataclasses
+import itertools
 import json
 import os
 from pathlib import Path
 import re
-import tempfile
+import threading
 from typing import Any
 
 from fogros2.errors import DeadlineExceeded
 from fogros2.model import Command
 from fogros2.process import run, which
-from fogros2.store import process_start
 from fogros2.waiting import wait_until
 
 #: Variable by which a process is known to come from a run of tests; its value is the run's own.
 RUN = 'FOGROS2_TEST_RUN'
+
+#: Seconds between two looks at state folders, which know a launch for longer than that; and how
+#: many of these looks there are for each one for folders.
+NOTE, FOLDERS = 0.05, 10
 
 #: 'fogt' begins the names of tests of single parts, which tidy up by themselves.
 _SINGLE = 'fogt'
@@ -41,24 +45,12 @@ class Trace:
 
     :param what: a line for people.
     :param marks: ids of launches and tokens of machines that it carries.
+    :param ours: whether it is this run's, whatever it carries.
     """
 
     what: str
     marks: frozenset[str] = frozenset()
-
-
-@dataclasses.dataclass(frozen=True)
-class Known:
-    """
-    What a state folder knows of a launch or a machine.
-
-    :param mark: its id, or its token.
-    :param pid: the launch's process, with its start (clock ticks); 0 for none.
-    """
-
-    mark: str
-    pid: int = 0
-    start: int = 0
+    ours: bool = False
 
 
 class Traces:
@@ -66,73 +58,47 @@ class Traces:
     A look at this computer, by one run of tests.
 
     :param state: the state folder of the launches that are looked for.
-    :param files: folder below which the run keeps all its files, its state folders too.
+    :param files: folder below which the run keeps all its files.
     :param run: what its processes have in the variable ``RUN``.
     """
 
     def __init__(self, state: Path, files: Path, run: str) -> None:
-        self._state = state
         self._files = files
         self._run = run
-        self._known_before = {known.mark for known in self._known_elsewhere()}
-        self._before = {trace.what for trace in look(state, files)}
+        self._state = state
+        self._folders = {state}
+        #: The marks of this run's launches and machines.
+        self.marks: set[str] = set()
+        self._before = {trace.what for trace in self._look()}
 
-    def left(self) -> set[str]:
-        """Return what wasn't there when this was made, and is nobody else's."""
-        new = [trace for trace in look(self._state, self._files) if trace.what not in self._before]
-        if not new:
-            return set()
-        others = self.others()
-        return {trace.what for trace in new
-                if not trace.marks & others and not self._used_by_others(trace.what)}
+    def note(self) -> None:
+        """Remember the marks of the launches and machines that there are now."""
+        for folder in self._folders:
+            self.marks |= _known(folder)
 
-    def others(self) -> set[str]:
-        """
-        Return the marks of launches and machines that are certainly not this run's.
-
-        A state folder of another run of tests says so by its place. Of any other folder that
-        counts which was there before, or whose launch lives and doesn't come from this run: a
-        test that forgot its own state folder is no excuse for what it leaves.
-        """
-        found = set()
-        for folder in self._folders_elsewhere():
-            for known in _known(folder):
-                if _of_a_test_run(folder) or known.mark in self._known_before or (
-                        known.pid and process_start(known.pid) == known.start
-                        and not self._ours(known.pid)):
-                    found.add(known.mark)
-        return found
-
-    def _known_elsewhere(self) -> Iterator[Known]:
-        for folder in self._folders_elsewhere():
-            yield from _known(folder)
-
-    def _folders_elsewhere(self) -> set[Path]:
-        """Return state folders that processes on this computer name, or that tests have."""
-        found = set(Path(tempfile.gettempdir()).glob('pytest-of-*/pytest-*/state*'))
+    def find_folders(self) -> None:
+        """Look for more state folders, which processes of this run have."""
         for process in _processes():
             variables = _variables(process)
-            own, base = variables.get('FOGROS2_STATE_HOME'), variables.get('XDG_STATE_HOME')
-            home = variables.get('HOME')
-            if own:
-                found.add(Path(own))
-            elif base:
-                found.add(Path(base, 'fogros2'))
-            elif home:
-                found.add(Path(home, '.local/state/fogros2'))
-        files = self._files.resolve()
-        return {folder for folder in found
-                if folder.is_absolute() and not folder.resolve().is_relative_to(files)}
+            if variables.get(RUN) == self._run and 'FOGROS2_STATE_HOME' in variables:
+                self._folders.add(Path(variables['FOGROS2_STATE_HOME']))
 
-    def _ours(self, pid: int) -> bool:
-        return _variables(Path('/proc', str(pid))).get(RUN) == self._run
+    def left(self) -> set[str]:
+        """Return what wasn't there when this was made, and is this run's."""
+        self.note()
+        return {trace.what for trace in self._look()
+                if trace.what not in self._before and (trace.ours or trace.marks & self.marks)
+                and not self._used_by_others(trace.what)}
+
+    def _look(self) -> set[Trace]:
+        return look(self._state, self._files, self._run)
 
     def _used_by_others(self, what: str) -> bool:
         """Return whether a file is named by processes of which none is this run's."""
         kind, _, path = what.partition(' ')
         users = [process for process in _processes()
                  if any(path in word for word in _words(process))] if kind == 'file' else []
-        return bool(users) and not any(self._ours(int(user.name)) for user in users)
+        return bool(users) and not any(_of_run(user, self._run) for user in users)
 
 
 @contextlib.contextmanager
@@ -143,7 +109,23 @@ def nothing_left(traces: Traces, *, timeout: float) -> Iterator[None]:
     :param timeout: seconds that what is ending by itself may take.
     :raises AssertionError: something is there still.
     """
-    yield
+    done = threading.Event()
+
+    def note() -> None:
+        for number in itertools.count():
+            if number % FOLDERS == 0:
+                traces.find_folders()
+            traces.note()
+            if done.wait(NOTE):
+                return
+
+    noting = threading.Thread(target=note, name='fog-note', daemon=True)
+    noting.start()
+    try:
+        yield
+    finally:
+        done.set()
+        noting.join()
     left: set[str] = set()
 
     def gone() -> bool:
@@ -157,17 +139,13 @@ def nothing_left(traces: Traces, *, timeout: float) -> Iterator[None]:
         raise AssertionError(f'left behind: {sorted(left)}') from None
 
 
-def look(state: Path, files: Path) -> set[Trace]:
-    """
-    Return everything on this computer now that a launch may leave behind.
-
-    :param files: see :class:`Traces`.
-    """
+def look(state: Path, files: Path, run: str) -> set[Trace]:
+    """Return everything on this computer now that a launch may leave behind; see ``Traces``."""
     found = {_named('interface', name) for name in os.listdir('/sys/class/net')
              if name.startswith('fog') and not name.startswith(_SINGLE)}
     containers = _containers()
     found |= {container.trace for container in containers.values() if container.of_a_launch}
-    found |= set(_programs(containers, files))
+    found |= set(_programs(containers, files, run))
     for words, kind in (
         (('nft', 'list', 'tables'), 'nftables'),
         (('ip', 'route', 'show', 'table', 'all'), 'route'),
@@ -179,8 +157,9 @@ def look(state: Path, files: Path) -> set[Trace]:
         if 'fogros2' in target:
             found.add(Trace(f'mount {target}', frozenset(_ROOT.findall(target))))
     for folder in ('run', 'tmp', 'var/tmp'):
-        found |= {Trace(f'file {path}') for path in Path('/', folder).glob('fogros2*')}
-    found |= {Trace(f'state {path.relative_to(state)}')
+        found |= {Trace(f'file {path}', ours=True)
+                  for path in Path('/', folder).glob('fogros2*')}
+    found |= {Trace(f'state {path.relative_to(state)}', ours=True)
               for path in state.rglob('*') if not path.is_dir()}
     return found
 
@@ -205,10 +184,10 @@ class _Container:
     def trace(self) -> Trace:
         return Trace(f'container {self.name}', frozenset({self.launch, self.token} - {''}))
 
-    def holds(self, files: Path) -> bool:
-        """Return whether it may be a machine of ours, or a computer among a test's own files."""
+    def is_among(self, files: Path) -> bool:
+        """Return whether it is a computer among a test's own files, such as an SSH machine."""
         if _SINGLE not in self.name:
-            return self.of_a_launch
+            return False
         root = ''.join(_output('podman', 'inspect', '--format', '{{.Rootfs}}', self.name)).strip()
         return bool(root) and Path(root).is_relative_to(files)
 
@@ -225,7 +204,7 @@ def _containers() -> dict[str, _Container]:
     return found
 
 
-def _programs(containers: dict[str, _Container], files: Path) -> Iterator[Trace]:
+def _programs(containers: dict[str, _Container], files: Path, run: str) -> Iterator[Trace]:
     """Yield agents and VPN programs, in containers too."""
     for process in _processes():
         words = _words(process)
@@ -234,16 +213,14 @@ def _programs(containers: dict[str, _Container], files: Path) -> Iterator[Trace]
                 yield Trace(f'process {process.name} wireguard-go',
                             frozenset(_INTERFACE.findall(' '.join(words))))
         elif any(word.endswith('agent.py') for word in words[:3]):
-            if any(_of_a_test_run(Path(word)) and not Path(word).is_relative_to(files)
-                   for word in words):
-                continue  # its program is a file of another run's
             marks = set(_agent_marks(process, words))
             container = containers.get(_container_of(process))
             if container is not None:
-                if not container.holds(files):
-                    continue
                 marks |= container.trace.marks
-            yield Trace(f'process {process.name} {" ".join(words[:4])}', frozenset(marks))
+            yield Trace(f'process {process.name} {" ".join(words[:4])}', frozenset(marks),
+                        _of_run(process, run) or any(
+                            Path(word).is_relative_to(files) for word in words)
+                        or container is not None and container.is_among(files))
 
 
 def _container_of(process: Path) -> str:
@@ -283,20 +260,16 @@ def _read_json(process: Path, path: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _known(folder: Path) -> Iterator[Known]:
-    """Yield what a state folder knows; one that changes meanwhile, or isn't ours to read, less."""
-    for path, key in (
-        *((path, '') for path in _listed(folder / 'launches')),
-        *((path, 'launch') for path in _listed(folder / 'machines')),
-    ):
+def _known(folder: Path) -> set[str]:
+    """Return the marks that a state folder knows; of one that changes meanwhile, some."""
+    marks = {path.name for path in _listed(folder / 'launches')}
+    for path in _listed(folder / 'machines'):
         try:
-            name = 'record.json' if key else 'process.json'
-            told = json.loads((path / name).read_text())
+            told = json.loads((path / 'record.json').read_text())
         except (OSError, ValueError):
-            told = {}
-        process = (told.get('pid') or 0, told.get('pid_start') or 0)
-        marks: Iterable[str] = (told.get('launch'), told.get('token')) if key else (path.name,)
-        yield from (Known(mark, *process) for mark in marks if mark)
+            continue
+        marks |= {told[key] for key in ('launch', 'last', 'token') if told.get(key)}
+    return marks
 
 
 def _listed(folder: Path) -> list[Path]:
@@ -306,8 +279,8 @@ def _listed(folder: Path) -> list[Path]:
         return []
 
 
-def _of_a_test_run(folder: Path) -> bool:
-    return any(part.startswith('pytest-of-') for part in folder.parts)
+def _of_run(process: Path, run: str) -> bool:
+    return _variables(process).get(RUN) == run
 
 
 def _processes() -> Iterator[Path]:

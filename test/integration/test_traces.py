@@ -16,7 +16,6 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
-from fogros2.store import process_start
 from fogros2.testing.traces import nothing_left, RUN, Traces
 from fogros2.waiting import wait_until
 
@@ -65,12 +64,9 @@ def interface(launch_id, tun):
     run(Command(('ip', 'link', 'delete', name), sudo=True), timeout=10)
 
 
-def store(folder, launch_id, child):
-    """Write what a launch keeps of itself."""
-    path = folder / 'launches' / launch_id
-    path.mkdir(parents=True)
-    (path / 'process.json').write_text(json.dumps(
-        {'pid': child.pid, 'pid_start': process_start(child.pid)}))
+def store(folder, launch_id):
+    """Make what a launch keeps of itself."""
+    (folder / 'launches' / launch_id).mkdir(parents=True)
 
 
 def fake_agent(folder, launch_id, *, first=True):
@@ -83,7 +79,7 @@ def fake_agent(folder, launch_id, *, first=True):
     return str(program), 'serve', '--config', str(config)
 
 
-def test_what_nobody_knows_is_ours(look, interface, state_home):
+def test_a_file_of_ours_is_found(look, interface, state_home):
     assert look().left() == set(), 'it was there before'
     traces = look()
     (state_home / 'forgotten').write_text('')
@@ -95,91 +91,65 @@ def test_what_nobody_knows_is_ours(look, interface, state_home):
         pass
 
 
-def test_an_interface_of_ours_is_found(look, tun, request):
+def test_an_interface_of_ours_is_found(look, tun, launch_id, state_home, request):
+    """Though the launch's folder has gone."""
+    traces = look()
+    with pytest.raises(AssertionError, match=f'left behind.*interface fog{launch_id}'):
+        with nothing_left(traces, timeout=0.1):
+            store(state_home, launch_id)
+            wait_until(lambda: launch_id in traces.marks, timeout=5, what='a look')
+            request.getfixturevalue('interface')
+            shutil.rmtree(state_home / 'launches')
+
+
+def test_what_another_launch_makes_is_its_own(look, tun, start, elsewhere, launch_id, request):
+    """Whether it can be told whose it is or not: another user's can't."""
+    with nothing_left(look(), timeout=0.1):
+        request.getfixturevalue('interface')
+        start(*fake_agent(elsewhere, launch_id), **{RUN: 'another'})
+
+
+def test_a_launch_of_ours_with_a_state_folder_of_its_own_is_ours(
+    look, tun, start, elsewhere, launch_id, request,
+):
     traces = look()
     name = request.getfixturevalue('interface')
+    (elsewhere / 'waits.py').write_text(WAITS)
+    start(str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere))
+    store(elsewhere, launch_id)
+    traces.find_folders()
     assert traces.left() == {f'interface {name}'}
 
 
-def test_a_machine_is_found_and_its_owner(look, engine, launch_id, start, elsewhere, tmp_path):
+@pytest.mark.parametrize('of_ours', [True, False])
+def test_a_machine_is_found_and_its_owner(
+    look, engine, launch_id, state_home, tmp_path, of_ours,
+):
     """A container without a launch's label comes from the test of a provider alone."""
     traces = look()
+    if of_ours:
+        store(state_home, launch_id)
     names = [f'fogros2-{launch_id}a', f'fogros2-{launch_id}b']
     try:
         for name, label in zip(names, (f'fogros2-launch={launch_id}', 'fogros2-token=x')):
             run(Command((engine, 'create', '--name', name, '--label', label, '--network', 'none',
                          '--ulimit', 'nofile=1024', '--ulimit', 'nproc=1024',
                          '--rootfs', str(tmp_path), 'true'), sudo=True), timeout=30)
-        assert traces.left() == {f'container {names[0]}'}
-        (elsewhere / 'waits.py').write_text(WAITS)
-        stranger = start(
-            str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere), **{RUN: 'another'})
-        store(elsewhere, launch_id, stranger)
-        assert traces.left() == set()
+        assert traces.left() == ({f'container {names[0]}'} if of_ours else set())
     finally:
         run(Command((engine, 'rm', '-f', *names), sudo=True), timeout=30, check=False)
 
 
-def test_an_agent_is_found(look, start, tmp_path, launch_id):
+@pytest.mark.parametrize('by', ['place', 'run', 'launch', 'launch told later'])
+def test_an_agent_of_ours_is_found(look, start, tmp_path, elsewhere, state_home, launch_id, by):
     traces = look()
-    words = fake_agent(tmp_path, launch_id)
-    child = start(*words)
+    words = fake_agent(tmp_path if by == 'place' else elsewhere, launch_id,
+                       first=by != 'launch told later')
+    if by.startswith('launch'):
+        store(state_home, launch_id)
+    child = start(*words, **({} if by == 'run' else {RUN: 'another'}))
     (found,) = traces.left()
     assert found.startswith(f'process {child.pid} ') and words[0] in found
-
-
-def test_an_agent_in_a_test_of_its_own_is_no_launchs(look, start, elsewhere, launch_id):
-    traces = look()
-    folder = elsewhere / 'pytest-of-somebody' / 'pytest-0'
-    folder.mkdir(parents=True)
-    start(*fake_agent(folder, launch_id))
-    assert traces.left() == set()
-
-
-@pytest.mark.parametrize('first', [True, False])
-def test_a_strangers_launch_is_his(
-    look, tun, start, elsewhere, launch_id, tmp_path, request, first,
-):
-    traces = look()
-    name = request.getfixturevalue('interface')
-    program = start(*fake_agent(tmp_path, launch_id, first=first))
-    (elsewhere / 'waits.py').write_text(WAITS)
-    launch = start(
-        str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere), **{RUN: 'another'})
-    assert len(traces.left()) == 2, 'nobody knows the launch yet'
-    store(elsewhere, launch_id, launch)
-    assert traces.left() == set()
-    # he is still there, but that launch of his isn't: it could be anybody's, also ours
-    store(elsewhere, '000000', launch)
-    shutil.rmtree(elsewhere / 'launches' / launch_id)
-    assert traces.left() == {f'interface {name}', *(
-        trace for trace in traces.left() if f' {program.pid} ' in trace)}
-
-
-def test_a_launch_of_ours_that_forgot_its_state_folder_is_ours(
-    look, tun, start, elsewhere, launch_id, request,
-):
-    traces = look()
-    name = request.getfixturevalue('interface')
-    (elsewhere / 'waits.py').write_text(WAITS)
-    launch = start(str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(elsewhere))
-    store(elsewhere, launch_id, launch)
-    assert traces.left() == {f'interface {name}'}
-
-
-def test_another_run_of_tests_may_kill_its_launches(
-    look, tun, elsewhere, launch_id, start, request,
-):
-    traces = look()
-    request.getfixturevalue('interface')
-    folder = elsewhere / 'pytest-of-somebody' / 'pytest-0' / 'state0'
-    (elsewhere / 'waits.py').write_text(WAITS)
-    start(str(elsewhere / 'waits.py'), FOGROS2_STATE_HOME=str(folder), **{RUN: 'another'})
-    launch = start(str(elsewhere / 'waits.py'))
-    store(folder, launch_id, launch)
-    launch.kill()
-    launch.wait(10)
-    assert traces.left() == set()
 
 
 def test_a_file_that_a_strangers_program_uses_is_his(look, start, elsewhere):
