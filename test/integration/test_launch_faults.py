@@ -13,6 +13,8 @@ import uuid
 
 import pytest
 
+from fogros2 import process
+from fogros2.model import Command
 from fogros2.waiting import wait_until
 
 pytestmark = [
@@ -156,9 +158,10 @@ def end_group(group: int) -> None:
 
 
 def containers() -> list[str]:
-    return subprocess.run(
-        ['podman', 'ps', '-aq', '--filter', f'name=fogros2-{NAME}'], check=True,
-        capture_output=True, text=True).stdout.split()
+    # root's, and as a user without sudo the engine would leave a process of its own behind
+    return process.run(
+        Command(('podman', 'ps', '-aq', '--filter', f'name=fogros2-{NAME}'), sudo=True),
+        timeout=30.0).stdout.split()
 
 
 def fog(*words: str) -> int:
