@@ -15,8 +15,15 @@ from typing import Optional
 
 from fogros2 import shell as shells
 from fogros2.deploy.job import Job
-from fogros2.errors import ConnectError, DeadlineExceeded, FogError, HostKeyError
-from fogros2.model import Command, Endpoint, Machine, VpnInterface
+from fogros2.errors import (
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    HostKeyError,
+    MachineNotFound,
+    ProviderError,
+)
+from fogros2.model import Command, Endpoint, Machine, MachineState, VpnInterface
 from fogros2.shell import host_key, Shell
 from fogros2.shell.movable import MovableShell
 from fogros2.waiting import wait_until
@@ -24,7 +31,7 @@ from fogros2.waiting import wait_until
 #: Seconds one attempt to log in may take: a cancel isn't seen before its end. A computer that
 #: exists already has answered once, and gets no more than this.
 LOGIN_ATTEMPT = 10.0
-#: Seconds between two looks at the robot's public address while nobody lets it in.
+#: Seconds between two looks at the robot's public address, and the machine, while it waits.
 ADDRESS_INTERVAL = 10.0
 #: What a machine that still boots answers.
 _TRANSIENT: tuple[type[FogError], ...] = (ConnectError, DeadlineExceeded)
@@ -123,8 +130,6 @@ class Entrance:
         job = self._job
         last: Optional[FogError] = None
         self._looked = time.monotonic()
-        patience = job.timeouts.ssh if job.provider.owned else min(
-            job.timeouts.ssh, LOGIN_ATTEMPT)
 
         def probe() -> bool:
             nonlocal last
@@ -134,21 +139,43 @@ class Entrance:
                 return True
             except transient as error:
                 last = error
-                self._follow_robot()
+                self._look_around()
                 return False
 
         try:
-            wait_until(probe, timeout=patience, cancel=job.cancel, longest=0.5,
+            wait_until(probe, timeout=self._patience(), cancel=job.cancel, longest=0.5,
                        what=f"'{job.name}' to let us in")
         except DeadlineExceeded as error:
             raise last or error from error
 
-    def _follow_robot(self) -> None:
-        """Look now and then whether the robot has another address than the one let in."""
+    def _patience(self) -> float:
+        """Return how long (s) logging in may take; one that runs may have to boot yet."""
+        job = self._job
+        if not job.provider.owned:
+            return min(job.timeouts.ssh, LOGIN_ATTEMPT)
+        boots = job.provider.one_time_host_key and not job.record.host_key
+        left = job.timeouts.boot - (time.time() - job.record.armed) if boots else 0.0
+        return max(job.timeouts.ssh, left)
+
+    def _look_around(self) -> None:
+        """
+        Look now and then whether the machine is there, and the robot where it was let in from.
+
+        :raises ProviderError: the machine has ended.
+        """
         job = self._job
         if not job.provider.firewall or time.monotonic() - self._looked < ADDRESS_INTERVAL:
             return
         self._looked = time.monotonic()
+        try:
+            state = job.provider.describe(job.machine_id).state
+        except MachineNotFound:
+            state = MachineState.DELETED
+        except FogError:
+            return
+        if state not in (MachineState.PENDING, MachineState.RUNNING):
+            raise ProviderError(f"'{job.name}' ended while it was coming up",
+                                "the provider's own log says why")
         # who can't be asked now is asked again; the login says what is wrong in the end
         with contextlib.suppress(FogError):
             if job.provider.robot_address() != self._allowed:

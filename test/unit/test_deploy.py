@@ -249,6 +249,36 @@ def test_a_login_that_nobody_answers_can_be_cancelled(launch, provider, monkeypa
     timer.join()
 
 
+@pytest.mark.parametrize('ended', [True, False])
+def test_a_machine_that_ends_while_it_boots_is_waited_for_no_longer(
+        launch, provider, monkeypatch, ended):
+    monkeypatch.setattr(entering, 'ADDRESS_INTERVAL', 0.1)
+    monkeypatch.setattr(FakeProvider, 'firewall', True)
+    mine = Job(launch, SPEC)
+    Creation(mine).run()
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        port = server.getsockname()[1]
+    machine = dataclasses.replace(provider.describe(mine.machine_id), shell=Endpoint(
+        'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
+    launch.timeouts = mine.timeouts = Timeouts(ssh=0.8)
+    if ended:
+        provider.destroy(mine.machine_id)
+    known = (ProviderError, 'ended while') if ended else (ConnectError, 'refuses connections')
+    with mine.undo, pytest.raises(known[0], match=known[1]):
+        Entrance(mine).connect(machine)
+
+
+def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
+    mine = Job(launch, SPEC)
+    mine.timeouts = Timeouts(boot=300.0, ssh=60.0)
+    mine.record = dataclasses.replace(mine.record, armed=time.time() - 20)
+    assert Entrance(mine)._patience() == 60.0
+    monkeypatch.setattr(FakeProvider, 'one_time_host_key', True)
+    assert 270 < Entrance(mine)._patience() <= 280
+    mine.record = dataclasses.replace(mine.record, host_key='its own')
+    assert Entrance(mine)._patience() == 60.0
+
+
 def test_a_login_that_is_refused_to_the_end_says_so(launch, provider, mute):
     with socket.create_server(('127.0.0.1', 0)) as server:
         port = server.getsockname()[1]

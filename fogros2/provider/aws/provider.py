@@ -232,7 +232,7 @@ class AWSProvider(Provider):
     def describe(self, machine_id: str) -> Machine:
         """Return what EC2 knows of an instance now."""
         machine = MachineId.parse(machine_id)
-        found = self._look(machine)
+        found = self._look(machine, self._rising())
         if found is None:
             return Machine(machine_id, '', self.name, MachineState.PENDING, place=machine.region)
         if found['State']['Name'] == 'terminated':

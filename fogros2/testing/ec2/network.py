@@ -203,8 +203,13 @@ class Network:
 
     def remove(self, space: str) -> None:
         """Take a namespace away, and its link with it."""
-        process.run(Command(('ip', 'netns', 'delete', space), sudo=True), timeout=20.0,
-                    check=False)
+        # the link first: a namespace goes only when the last of its sockets has, and until then
+        # its addresses would be where nobody is
+        link = space.removeprefix(f'{PREFIX}{self._mark}')
+        _run(f"""
+            ip -n {self.router} link delete {link} || :
+            ip netns delete {space} || :
+            """, 'take a place away', check=False)
 
     def close(self) -> None:
         """Take everything away."""
