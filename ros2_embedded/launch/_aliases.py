@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The deep module paths of ROS 2 (``launch.actions.execute_process``) over fewer files."""
+"""ROS 2's deep module paths (``launch.actions.shutdown``), and errors for what isn't here."""
 from importlib.machinery import ModuleSpec
-import re
 import sys
 from types import ModuleType
-from typing import Dict, Iterable, Optional, Tuple
+from typing import Any, Callable
 
-_BEFORE_WORD = re.compile('(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])')
-_modules: Dict[str, Tuple[str, ...]] = {}
+#: Modules whose names don't follow from a class or function in them.
+_OTHERS = {
+    'launch.actions.shutdown_action', 'launch.events.matchers',
+    'launch.events.process.process_matchers', 'launch.utilities.class_tools_impl'}
 
 
 class _AliasFinder:
-    """Finds what :func:`alias_submodules` announced; real files come first on the meta path."""
+    """Finds modules that ROS 2 has for single classes; real files come first on the meta path."""
 
     @staticmethod
-    def find_spec(name: str, path: object = None, target: object = None) -> Optional[ModuleSpec]:
-        return ModuleSpec(name, _AliasFinder) if name in _modules else None  # type: ignore
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        package, _, module = name.rpartition('.')
+        if name.partition('.')[0] not in ('launch', 'launch_ros') or package not in sys.modules:
+            return None
+        wanted = module.removesuffix('_impl').replace('_', '')
+        if name in _OTHERS or any(wanted == known.replace('_', '').lower() and known != module
+                                  for known in vars(sys.modules[package])):
+            return ModuleSpec(name, _AliasFinder)  # type: ignore[arg-type]
+        return None
 
     @staticmethod
     def create_module(spec: ModuleSpec) -> None:
@@ -24,21 +32,19 @@ class _AliasFinder:
     @staticmethod
     def exec_module(module: ModuleType) -> None:
         package = sys.modules[module.__name__.rpartition('.')[0]]
-        for name in _modules[module.__name__]:
-            setattr(module, name, getattr(package, name))
+        vars(module).update((name, value) for name, value in vars(package).items()
+                            if not name.startswith('__'))
 
 
 sys.meta_path.append(_AliasFinder)
 
 
-def alias_submodules(package: str, names: Iterable[str], **special: Tuple[str, ...]) -> None:
-    """
-    Make ``package.execute_process`` importable for a class ``ExecuteProcess`` of ``package``.
-
-    :param special: modules whose name or content doesn't follow from a class's name.
-    """
-    for name in names:
-        if name[0].isupper():
-            _modules[f"{package}.{_BEFORE_WORD.sub('_', name).lower()}"] = (name,)
-    for module, content in special.items():
-        _modules[f'{package}.{module}'] = content
+def lacking(module: str, names: str) -> Callable[[str], Any]:
+    """Give a module's ``__getattr__``, for names that ROS 2 has there and this hasn't."""
+    def look_up(name: str) -> Any:
+        if name in names.split():
+            from rclpy.exceptions import NotEmbeddedError
+            # Of an AttributeError an import statement wouldn't show the text.
+            raise ImportError(str(NotEmbeddedError(f'{module}.{name}')))
+        raise AttributeError(f"module '{module}' has no attribute '{name}'")
+    return look_up

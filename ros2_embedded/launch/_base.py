@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import collections.abc
-from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple, Type, TYPE_CHECKING, Union
+from typing import Any, Callable, Iterable, Optional, TYPE_CHECKING, Union
 
 if TYPE_CHECKING:
     from .frontend import Entity, Parser
     from .launch_context import LaunchContext
 
+__all__ = [
+    'Action', 'BaseEventHandler', 'Condition', 'Event', 'EventHandler', 'InvalidLaunchFileError',
+    'LaunchDescriptionEntity', 'SomeEntitiesType', 'SomeEntitiesType_types_tuple',
+    'SomeSubstitutionsType', 'SomeSubstitutionsType_types_tuple', 'Substitution']
+
 
 class Event:
+    """Something that happened, or is to happen; its class's path is its name."""
+
     name = 'launch.Event'
+
+    def __init_subclass__(cls) -> None:
+        if 'name' not in vars(cls):
+            cls.name = f'{cls.__module__}.{cls.__name__}'
 
 
 class Substitution:
@@ -32,7 +43,7 @@ SomeSubstitutionsType_types_tuple = (str, Substitution, collections.abc.Iterable
 class Condition:
     """Decides, when an action is visited, whether it executes."""
 
-    def __init__(self, *, predicate: Optional[Callable[[LaunchContext], bool]] = None) -> None:
+    def __init__(self, *, predicate: Callable[[LaunchContext], bool] | None = None) -> None:
         self._predicate = predicate
 
     def describe(self) -> str:
@@ -46,26 +57,25 @@ class LaunchDescriptionEntity:
     """Something that launch visits, with other entities below it."""
 
     def describe(self) -> str:
-        raise NotImplementedError()
+        return repr(self)
 
-    def describe_sub_entities(self) -> List[LaunchDescriptionEntity]:
+    def describe_sub_entities(self) -> list[LaunchDescriptionEntity]:
         return []
 
-    def describe_conditional_sub_entities(
-        self
-    ) -> List[Tuple[str, Iterable[LaunchDescriptionEntity]]]:
+    def describe_conditional_sub_entities(self) -> Conditional:
         return []
 
-    def visit(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def visit(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
         """Do the entity's work; return what is to be visited next, in order."""
         return None
 
-    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
+    def get_asyncio_future(self) -> asyncio.Future[Any] | None:
         """Return what launch waits for before it is idle."""
         return None
 
 
-Entities = List[LaunchDescriptionEntity]
+Entities = list[LaunchDescriptionEntity]
+Conditional = list[tuple[str, Iterable[LaunchDescriptionEntity]]]
 SomeEntitiesType = Union[LaunchDescriptionEntity, Iterable[LaunchDescriptionEntity]]
 SomeEntitiesType_types_tuple = (LaunchDescriptionEntity, collections.abc.Iterable)
 
@@ -75,29 +85,16 @@ class BaseEventHandler:
 
     def __init__(self, *, matcher: Callable[[Event], bool], handle_once: bool = False) -> None:
         self.__matcher = matcher
-        self.__handle_once = handle_once
-
-    @property
-    def handle_once(self) -> bool:
-        return self.__handle_once
-
-    @property
-    def handler_description(self) -> Optional[str]:
-        return None
-
-    @property
-    def matcher_description(self) -> Optional[str]:
-        return None
+        self.handle_once = handle_once
 
     def matches(self, event: Event) -> bool:
         return self.__matcher(event)
 
-    def describe(self) -> Tuple[str, List[Any]]:
+    def describe(self) -> tuple[str, list[Any]]:
         """Return a text for humans, and the entities that the handler may return."""
-        return (f"{type(self).__name__}(matcher='{self.matcher_description}', handler="
-                f"'{self.handler_description}', handle_once={self.handle_once})"), []
+        return f'{type(self).__name__}(handle_once={self.handle_once})', []
 
-    def handle(self, event: Event, context: LaunchContext) -> Optional[SomeEntitiesType]:
+    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
         """Put the event into the context's locals; return what is to be visited."""
         context.extend_locals({'event': event})
         if self.handle_once:
@@ -113,24 +110,19 @@ class EventHandler(BaseEventHandler):
         handle_once: bool = False
     ) -> None:
         super().__init__(matcher=matcher, handle_once=handle_once)
-        self.__entities = entities
+        self.entities = entities
 
-    @property
-    def entities(self) -> Optional[SomeEntitiesType]:
-        return self.__entities
+    def describe(self) -> tuple[str, list[Any]]:
+        entities = self.entities or ()
+        return super().describe()[0], [
+            entities] if isinstance(entities, LaunchDescriptionEntity) else [*entities]
 
-    def describe(self) -> Tuple[str, List[Any]]:
-        text, entities = super().describe()
-        if self.__entities:
-            entities.extend(self.__entities)  # type: ignore[arg-type]
-        return text, entities
-
-    def handle(self, event: Event, context: LaunchContext) -> Optional[SomeEntitiesType]:
+    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
         super().handle(event, context)
-        return self.__entities
+        return self.entities
 
 
-ParsedAction = Tuple[Type['Action'], Dict[str, Any]]
+ParsedAction = tuple[type['Action'], dict[str, Any]]
 
 
 class Action(LaunchDescriptionEntity):
@@ -138,9 +130,11 @@ class Action(LaunchDescriptionEntity):
 
     #: For :meth:`parse`: arguments that are texts with substitutions, and their attributes in
     #: launch files; a question mark where they may be absent.
-    _texts: Dict[str, str] = {}
+    _texts: dict[str, str] = {}
+    #: Likewise, arguments of other types, which may be absent.
+    _typed: dict[str, type] = {}
 
-    def __init__(self, *, condition: Optional[Condition] = None) -> None:
+    def __init__(self, *, condition: Condition | None = None) -> None:
         self.__condition = condition
 
     @classmethod
@@ -151,7 +145,7 @@ class Action(LaunchDescriptionEntity):
         :raises RuntimeError: for both ``if`` and ``unless``.
         """
         from .conditions import IfCondition, UnlessCondition
-        kwargs: Dict[str, Any] = {}
+        kwargs: dict[str, Any] = {}
         for name, kind in (('if', IfCondition), ('unless', UnlessCondition)):
             expression = entity.get_attr(name, optional=True)
             if expression is not None:
@@ -162,14 +156,15 @@ class Action(LaunchDescriptionEntity):
             text = entity.get_attr(attribute.rstrip('?'), optional=attribute.endswith('?'))
             if text is not None:
                 kwargs[argument] = parser.parse_substitution(text)
+        for argument, data_type in cls._typed.items():
+            value = entity.get_attr(argument, data_type=data_type, optional=True)
+            if value is not None:
+                kwargs[argument] = parser.parse_if_substitutions(value)
         return cls, kwargs
 
     @property
-    def condition(self) -> Optional[Condition]:
+    def condition(self) -> Condition | None:
         return self.__condition
-
-    def describe(self) -> str:
-        return repr(self)
 
     def get_sub_entities(self) -> Entities:
         """Return what executing the action yields, as far as it is known before."""
@@ -178,14 +173,12 @@ class Action(LaunchDescriptionEntity):
     def describe_sub_entities(self) -> Entities:
         return self.get_sub_entities() if self.condition is None else []
 
-    def describe_conditional_sub_entities(
-        self
-    ) -> List[Tuple[str, Iterable[LaunchDescriptionEntity]]]:
+    def describe_conditional_sub_entities(self) -> Conditional:
         if self.condition is None:
             return []
         return [(f'Conditionally included by {self.describe()}', self.get_sub_entities())]
 
-    def visit(self, context: LaunchContext) -> Optional[Entities]:
+    def visit(self, context: LaunchContext) -> Entities | None:
         """Execute if the condition holds; ExecutionComplete follows, if anybody listens."""
         if self.__condition is not None and not self.__condition.evaluate(context):
             return None
@@ -201,7 +194,7 @@ class Action(LaunchDescriptionEntity):
                 else:
                     future.add_done_callback(lambda _: context.emit_event_sync(event))
 
-    def execute(self, context: LaunchContext) -> Optional[Entities]:
+    def execute(self, context: LaunchContext) -> Entities | None:
         """Do the action's work, without blocking; return what is to be visited next."""
         return None
 
@@ -210,10 +203,8 @@ class InvalidLaunchFileError(Exception):
     """No loader could read a launch file; the first of their errors is the likeliest."""
 
     def __init__(
-        self, extension: str = '', *, likely_errors: Optional[List[Exception]] = None
+        self, extension: str = '', *, likely_errors: list[Exception] | None = None
     ) -> None:
-        self._extension = extension
-        self._likely_errors = likely_errors
         text = 'The launch file may have a syntax error, or its format is unknown'
         if extension and likely_errors:
             kind = 'multiple exceptions' if len(likely_errors) > 1 else 'exception'

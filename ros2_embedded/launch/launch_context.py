@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import os
-from typing import Any, Deque, Dict, Iterable, List, MutableMapping, Optional
+from typing import Any, Iterable, MutableMapping
 
 import launch.logging
 
@@ -15,19 +15,21 @@ from ._base import BaseEventHandler, Event, Substitution
 class _Locals:
     """Read-only attributes of the context."""
 
-    def __init__(self, values: Dict[str, Any]) -> None:
-        self.__dict__['_values'] = values
+    def __init__(self, values: dict[str, Any]) -> None:
+        vars(self).update(values)
 
     def __getattr__(self, name: str) -> Any:
-        values = self.__dict__['_values']
-        if name not in values:
-            raise AttributeError(
-                f"context.locals does not contain attribute '{name}', "
-                f"it contains: [{', '.join(values)}]")
-        return values[name]
+        raise AttributeError(f"context.locals does not contain attribute '{name}', "
+                             f"it contains: [{', '.join(vars(self))}]")
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"can't set attribute '{name}', locals are read-only")
+
+
+def _pop(stack: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    if not stack:
+        raise RuntimeError(f'{name} stack unexpectedly empty')
+    return stack.pop()
 
 
 class LaunchContext:
@@ -38,47 +40,30 @@ class LaunchContext:
     """
 
     def __init__(
-        self, *, argv: Optional[Iterable[str]] = None, noninteractive: bool = False
+        self, *, argv: Iterable[str] | None = None, noninteractive: bool = False
     ) -> None:
-        self.__argv = argv if argv is not None else []
-        self.__noninteractive = noninteractive
+        self.argv: Iterable[str] = argv if argv is not None else []
+        self.noninteractive = noninteractive
+        self.is_shutdown = False
+        #: The loop that the launch runs in; None while it doesn't.
+        self.asyncio_loop: Any = None
+        self.launch_configurations: dict[str, Any] = {}
         self._event_queue: asyncio.Queue[Event] = asyncio.Queue()
-        self._event_handlers: Deque[BaseEventHandler] = collections.deque()
-        self._completion_futures: List[asyncio.Future[Any]] = []
-        self.__globals: Dict[str, Any] = {}
-        self.__locals: Dict[str, Any] = {}
-        self.__locals_stack: List[Dict[str, Any]] = []
-        self.__combined_locals: Optional[Dict[str, Any]] = None
-        self.__launch_configurations: Dict[str, Any] = {}
-        self.__launch_configurations_stack: List[Dict[str, Any]] = []
-        self.__environment_stack: List[Dict[str, str]] = []
+        self._event_handlers: collections.deque[BaseEventHandler] = collections.deque()
+        self._completion_futures: list[asyncio.Future[Any]] = []
+        self.__globals: dict[str, Any] = {}
+        self.__locals: dict[str, Any] = {}
+        self.__locals_stack: list[dict[str, Any]] = []
+        self.__launch_configurations_stack: list[dict[str, Any]] = []
+        self.__environment_stack: list[dict[str, str]] = []
         self.__environment_reset = dict(os.environ)
-        self.__is_shutdown = False
-        self.__asyncio_loop: Optional[asyncio.AbstractEventLoop] = None
         self.__logger = launch.logging.get_logger(__name__)
 
-    @property
-    def argv(self) -> Iterable[str]:
-        return self.__argv
-
-    @property
-    def noninteractive(self) -> bool:
-        return self.__noninteractive
-
-    @property
-    def is_shutdown(self) -> bool:
-        return self.__is_shutdown
-
     def _set_is_shutdown(self, state: bool) -> None:
-        self.__is_shutdown = state
+        self.is_shutdown = state
 
-    @property
-    def asyncio_loop(self) -> Any:
-        """The loop that the launch runs in; None while it doesn't."""
-        return self.__asyncio_loop
-
-    def _set_asyncio_loop(self, loop: Optional[asyncio.AbstractEventLoop]) -> None:
-        self.__asyncio_loop = loop
+    def _set_asyncio_loop(self, loop: asyncio.AbstractEventLoop | None) -> None:
+        self.asyncio_loop = loop
 
     def add_completion_future(self, completion_future: asyncio.Future[Any]) -> None:
         """Let the launch wait for this future before it is idle."""
@@ -88,25 +73,18 @@ class LaunchContext:
         self.__locals_stack.append(dict(self.__locals))
 
     def _pop_locals(self) -> None:
-        if not self.__locals_stack:
-            raise RuntimeError('locals stack unexpectedly empty')
-        self.__locals = self.__locals_stack.pop()
-        self.__combined_locals = None
+        self.__locals = _pop(self.__locals_stack, 'locals')
 
-    def extend_globals(self, extensions: Dict[str, Any]) -> None:
+    def extend_globals(self, extensions: dict[str, Any]) -> None:
         """Add local variables that outlive the handling of an event."""
         self.__globals.update(extensions)
-        self.__combined_locals = None
 
-    def extend_locals(self, extensions: Dict[str, Any]) -> None:
+    def extend_locals(self, extensions: dict[str, Any]) -> None:
         """Add local variables that last until the event being handled is done with."""
         self.__locals.update(extensions)
-        self.__combined_locals = None
 
-    def get_locals_as_dict(self) -> Dict[str, Any]:
-        if self.__combined_locals is None:
-            self.__combined_locals = {**self.__globals, **self.__locals}
-        return self.__combined_locals
+    def get_locals_as_dict(self) -> dict[str, Any]:
+        return {**self.__globals, **self.__locals}
 
     @property
     def locals(self) -> Any:
@@ -116,29 +94,22 @@ class LaunchContext:
         self.__environment_stack.append(dict(os.environ))
 
     def _pop_environment(self) -> None:
-        if not self.__environment_stack:
-            raise RuntimeError('environment stack unexpectedly empty')
-        self.__set_environment(self.__environment_stack.pop())
+        self.__set_environment(_pop(self.__environment_stack, 'environment'))
 
     def _reset_environment(self) -> None:
         self.__set_environment(self.__environment_reset)
 
     @staticmethod
-    def __set_environment(environment: Dict[str, str]) -> None:
+    def __set_environment(environment: dict[str, str]) -> None:
         os.environ.clear()
         os.environ.update(environment)
 
     def _push_launch_configurations(self) -> None:
-        self.__launch_configurations_stack.append(dict(self.__launch_configurations))
+        self.__launch_configurations_stack.append(dict(self.launch_configurations))
 
     def _pop_launch_configurations(self) -> None:
-        if not self.__launch_configurations_stack:
-            raise RuntimeError('launch_configurations stack unexpectedly empty')
-        self.__launch_configurations = self.__launch_configurations_stack.pop()
-
-    @property
-    def launch_configurations(self) -> Dict[str, Any]:
-        return self.__launch_configurations
+        self.launch_configurations = _pop(
+            self.__launch_configurations_stack, 'launch_configurations')
 
     @property
     def environment(self) -> MutableMapping[str, str]:
@@ -151,10 +122,8 @@ class LaunchContext:
         self, event_handler: BaseEventHandler, append: bool = False
     ) -> None:
         """Add a handler, before all others or after them."""
-        if append:
-            self._event_handlers.append(event_handler)
-        else:
-            self._event_handlers.appendleft(event_handler)
+        add = self._event_handlers.append if append else self._event_handlers.appendleft
+        add(event_handler)
 
     def unregister_event_handler(self, event_handler: BaseEventHandler) -> None:
         self._event_handlers.remove(event_handler)

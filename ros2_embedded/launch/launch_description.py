@@ -2,8 +2,7 @@
 """A description of what to launch, and where one may come from."""
 from __future__ import annotations
 
-import traceback
-from typing import Any, Iterable, List, Optional, Tuple, TYPE_CHECKING
+from typing import Any, Iterable, TYPE_CHECKING
 
 import launch.logging
 
@@ -19,45 +18,42 @@ class LaunchDescription(LaunchDescriptionEntity):
     """Entities that are visited in order."""
 
     def __init__(
-        self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
-        deprecated_reason: Optional[str] = None
+        self, initial_entities: Iterable[LaunchDescriptionEntity] | None = None, *,
+        deprecated_reason: str | None = None
     ) -> None:
-        self.__entities = list(initial_entities) if initial_entities is not None else []
-        self.__deprecated_reason = deprecated_reason
+        self.entities = list(initial_entities or ())
+        self.deprecated = deprecated_reason is not None
+        self.deprecated_reason = deprecated_reason
 
-    def visit(self, context: LaunchContext) -> Optional[Entities]:
+    def visit(self, context: LaunchContext) -> Entities | None:
         if self.deprecated:
             path = context.get_locals_as_dict().get('current_launch_file_path')
-            what = 'deprecated launch description' if path is None else (
-                f'launch file [{path}] is deprecated')
-            launch.logging.get_logger().warning(f'{what}: {self.__deprecated_reason}')
-        return self.__entities
+            what = f'launch file [{path}] is deprecated' if path else (
+                'deprecated launch description')
+            launch.logging.get_logger().warning(f'{what}: {self.deprecated_reason}')
+        return self.entities
 
     def describe_sub_entities(self) -> Entities:
-        return self.__entities
+        return self.entities
 
-    def get_launch_arguments(
-        self, conditional_inclusion: bool = False
-    ) -> List[DeclareLaunchArgument]:
+    def get_launch_arguments(self) -> list[DeclareLaunchArgument]:
         """Return the arguments declared here and below, the first of each name."""
-        pairs = self.get_launch_arguments_with_include_launch_description_actions(
-            conditional_inclusion)
+        pairs = self.get_launch_arguments_with_include_launch_description_actions()
         return [argument for argument, _ in pairs]
 
     def get_launch_arguments_with_include_launch_description_actions(
-        self, conditional_inclusion: bool = False
-    ) -> List[Tuple[DeclareLaunchArgument, Optional[List[Any]]]]:
+        self
+    ) -> list[tuple[DeclareLaunchArgument, list[Any]]]:
         """Return the arguments, each with the includes on the way to it."""
         from .actions import (
             DeclareLaunchArgument,
             IncludeLaunchDescription,
             ResetLaunchConfigurations,
         )
-        found: List[Tuple[DeclareLaunchArgument, Optional[List[Any]]]] = []
+        found: list[tuple[DeclareLaunchArgument, list[Any]]] = []
 
         def collect(
-            entities: Iterable[LaunchDescriptionEntity], conditional: bool,
-            includes: Optional[List[Any]]
+            entities: Iterable[LaunchDescriptionEntity], conditional: bool, includes: list[Any]
         ) -> None:
             for entity in entities:
                 if isinstance(entity, DeclareLaunchArgument):
@@ -68,59 +64,46 @@ class LaunchDescription(LaunchDescriptionEntity):
                 if isinstance(entity, ResetLaunchConfigurations):
                     # What follows can't see the arguments of this launch.
                     return
-                inner = includes
-                if isinstance(entity, IncludeLaunchDescription):
-                    inner = [*(includes or ()), entity]
+                is_include = isinstance(entity, IncludeLaunchDescription)
+                inner = [*includes, entity] if is_include else includes
                 collect(entity.describe_sub_entities(), False, inner)
                 for _, conditional_entities in entity.describe_conditional_sub_entities():
                     collect(conditional_entities, True, inner)
 
-        collect(self.entities, conditional_inclusion, None)
+        collect(self.entities, False, [])
         return found
 
-    @property
-    def entities(self) -> Entities:
-        return self.__entities
-
     def add_entity(self, entity: LaunchDescriptionEntity) -> None:
-        self.__entities.append(entity)
+        self.entities.append(entity)
 
     def add_action(self, action: Action) -> None:
         self.add_entity(action)
-
-    @property
-    def deprecated(self) -> bool:
-        return self.__deprecated_reason is not None
-
-    @property
-    def deprecated_reason(self) -> Optional[str]:
-        return self.__deprecated_reason
 
 
 class LaunchDescriptionSource:
     """A launch description, or the location to load it from by the method described."""
 
     def __init__(
-        self, launch_description: Optional[LaunchDescription] = None,
+        self, launch_description: LaunchDescription | None = None,
         location: SomeSubstitutionsType = '<string>',
         method: str = 'unspecified mechanism from a script'
     ) -> None:
         self.__launch_description = launch_description
-        self.__expanded_location: Optional[str] = None
+        self.__expanded_location: str | None = None
         self.__location = normalize_to_list_of_substitutions(location)
         self.method = method
         self.__logger = launch.logging.get_logger(__name__)
 
-    def try_get_launch_description_without_context(self) -> Optional[LaunchDescription]:
+    def try_get_launch_description_without_context(self) -> LaunchDescription | None:
         """Return the description, or None where loading it fails without a context."""
         if self.__launch_description is not None:
             return self.__launch_description
         try:
             return self._get_launch_description(
                 perform_substitutions(LaunchContext(), self.__location))
-        except Exception as exc:  # noqa: BLE001 - A launch file can raise anything.
-            self.__logger.debug(traceback.format_exc())
-            self.__logger.debug(f'Failed to load the launch file without a context: {exc}')
+        except Exception as exc:
+            self.__logger.debug(
+                f'Failed to load the launch file without a context: {exc}', exc_info=True)
         return None
 
     def get_launch_description(self, context: LaunchContext) -> LaunchDescription:
@@ -132,9 +115,8 @@ class LaunchDescriptionSource:
         return self.__launch_description
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
-        raise RuntimeError(
-            'LaunchDescriptionSource.get_launch_description(): '
-            'called without launch description being set')
+        raise RuntimeError('LaunchDescriptionSource.get_launch_description(): '
+                           'called without launch description being set')
 
     @property
     def location(self) -> str:

@@ -8,8 +8,7 @@ import contextlib
 import logging
 import signal
 import threading
-import traceback
-from typing import Any, Coroutine, Dict, Iterable, Iterator, List, Optional, Tuple
+from typing import Any, Coroutine, Iterable, Iterator
 import warnings
 
 import launch.logging
@@ -19,26 +18,22 @@ from .event_handlers import OnIncludeLaunchDescription, OnShutdown
 from .events import IncludeLaunchDescription, Shutdown
 from .launch_context import LaunchContext
 from .launch_description import LaunchDescription
-from .utilities import (
-    AsyncSafeSignalManager,
-    is_a_subclass,
-    visit_all_entities_and_collect_futures,
-)
+from .utilities import AsyncSafeSignalManager, visit_all_entities_and_collect_futures
 
 Loop = asyncio.AbstractEventLoop
+Waiting = Coroutine[Any, Any, None]
 
 
 def _get_loop() -> Loop:
     """Return this thread's event loop, made if need be."""
-    loop: Optional[Loop] = None
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), contextlib.suppress(RuntimeError):
         # Python 3.12 warns of what 3.14 refuses: to make a loop that was never set.
         warnings.simplefilter('ignore', DeprecationWarning)
-        with contextlib.suppress(RuntimeError):
-            loop = asyncio.get_event_loop()
-    if loop is None or loop.is_closed():
-        loop = asyncio.new_event_loop()
-        asyncio.set_event_loop(loop)
+        loop = asyncio.get_event_loop()
+        if not loop.is_closed():
+            return loop
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
     return loop
 
 
@@ -53,21 +48,20 @@ class LaunchService:
     """
 
     def __init__(
-        self, *, argv: Optional[Iterable[str]] = None, noninteractive: bool = False,
+        self, *, argv: Iterable[str] | None = None, noninteractive: bool = False,
         debug: bool = False
     ) -> None:
         launch.logging.launch_config.level = logging.DEBUG if debug else logging.INFO
         self.__debug = debug
         self.__logger = launch.logging.get_logger('launch')
-        self.__context = LaunchContext(
-            argv=argv if argv is not None else [], noninteractive=noninteractive)
+        self.__context = LaunchContext(argv=argv, noninteractive=noninteractive)
         self.__context.register_event_handler(OnIncludeLaunchDescription())
         self.__context.register_event_handler(OnShutdown(on_shutdown=self.__on_shutdown))
-        self._entity_future_pairs: List[
-            Tuple[LaunchDescriptionEntity, asyncio.Future[Any]]] = []
+        self._entity_future_pairs: list[
+            tuple[LaunchDescriptionEntity, asyncio.Future[Any]]] = []
         self.__loop_lock = threading.RLock()
-        self.__loop: Optional[Loop] = None
-        self.__task: Optional[asyncio.Task[Any]] = None
+        self.__loop: Loop | None = None
+        self.__task: asyncio.Task[Any] | None = None
         self.__shutting_down = False
         self.__return_code = 0
 
@@ -95,20 +89,19 @@ class LaunchService:
             or not self.__context._event_queue.empty())
 
     @contextlib.contextmanager
-    def _prepare_run_loop(self) -> Iterator[Tuple[Loop, asyncio.Task[Any]]]:
+    def _prepare_run_loop(self) -> Iterator[Loop]:
         try:
             with self.__loop_lock:
                 if self.__loop is not None:
-                    raise RuntimeError(
-                        'LaunchService cannot be run multiple times concurrently.')
+                    raise RuntimeError('LaunchService cannot be run multiple times concurrently.')
                 loop = _get_loop()
                 if self.__debug:
                     loop.set_debug(True)
                 self.__context._set_asyncio_loop(loop)
                 # A queue belongs to the loop that it was first waited for in.
-                queue: asyncio.Queue[Event] = asyncio.Queue()
-                while not self.__context._event_queue.empty():
-                    queue.put_nowait(self.__context._event_queue.get_nowait())
+                before, queue = self.__context._event_queue, asyncio.Queue[Event]()
+                while not before.empty():
+                    queue.put_nowait(before.get_nowait())
                 self.__context._event_queue = queue
                 self.__loop = loop
             task = asyncio.current_task(loop)
@@ -140,7 +133,7 @@ class LaunchService:
                 manager.handle(signal.SIGINT, on_sigint)
                 manager.handle(signal.SIGTERM, on_sigterm)
                 manager.handle(signal.SIGQUIT, on_sigterm)
-                yield loop, task
+                yield loop
         finally:
             with self.__loop_lock:
                 self.__context._set_asyncio_loop(None)
@@ -159,14 +152,13 @@ class LaunchService:
             self.__context._push_locals()
             entities = handler.handle(event, self.__context)
             if not isinstance(entities, collections.abc.Iterable):
-                entities = () if entities is None else (entities,)
-            for entity in entities:
+                entities = (entities,)  # type: ignore[assignment]
+            for entity in entities:  # type: ignore[union-attr]
                 if entity is None:
                     continue
-                if not is_a_subclass(entity, LaunchDescriptionEntity):
+                if not isinstance(entity, LaunchDescriptionEntity):
                     raise RuntimeError(
-                        'expected a LaunchDescriptionEntity from event_handler, '
-                        f"got '{entity}'")
+                        f"expected a LaunchDescriptionEntity from event_handler, got '{entity}'")
                 self._entity_future_pairs.extend(
                     visit_all_entities_and_collect_futures(entity, self.__context))
             self.__context._pop_locals()
@@ -181,10 +173,10 @@ class LaunchService:
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError('LaunchService can only be run in the main thread.')
         self.__return_code = 0
-        with self._prepare_run_loop() as (loop, _):
+        with self._prepare_run_loop() as loop:
             launch.logging.log_launch_config(logger=self.__logger)
             loop.set_exception_handler(self.__on_loop_exception)
-            event_task: Optional[asyncio.Task[None]] = None
+            event_task: asyncio.Task[None] | None = None
             while True:
                 try:
                     idle = self._is_idle()
@@ -197,7 +189,7 @@ class LaunchService:
                         continue
                     if event_task is None or event_task.done():
                         event_task = loop.create_task(self._process_one_event())
-                    awaited: List[asyncio.Future[Any]] = [event_task]
+                    awaited: list[asyncio.Future[Any]] = [event_task]
                     if self.__context._event_queue.empty():
                         awaited += [future for _, future in self._entity_future_pairs]
                         awaited += self.__context._completion_futures
@@ -209,14 +201,14 @@ class LaunchService:
                 except asyncio.CancelledError:
                     self.__logger.error('run task was canceled')
                     return 1
-                except Exception as exc:  # noqa: BLE001 - Any action or handler may raise anything.
+                except Exception as exc:
                     text = f'Caught exception in launch (see debug for traceback): {exc}'
-                    self.__logger.debug(traceback.format_exc())
+                    self.__logger.debug('', exc_info=True)
                     self.__logger.error(text)
                     await self.__shutdown_and_wait(text)
                     self.__return_code = 1
 
-    def __on_loop_exception(self, loop: Loop, context: Dict[str, Any]) -> None:
+    def __on_loop_exception(self, loop: Loop, context: dict[str, Any]) -> None:
         self.__return_code = 1
         loop.default_exception_handler(context)
 
@@ -250,14 +242,13 @@ class LaunchService:
 
     def _shutdown(
         self, *, reason: str, due_to_sigint: bool, force_sync: bool = False
-    ) -> Optional[Coroutine[Any, Any, None]]:
-        waiting: Optional[Coroutine[Any, Any, None]] = None
+    ) -> Waiting | None:
+        waiting: Waiting | None = None
         if not self.__shutting_down:
             event = Shutdown(reason=reason, due_to_sigint=due_to_sigint)
-            try:
-                here: Optional[Loop] = asyncio.get_running_loop()
-            except RuntimeError:
-                here = None
+            here: Loop | None = None
+            with contextlib.suppress(RuntimeError):
+                here = asyncio.get_running_loop()
             if force_sync:
                 self.__context.emit_event_sync(event)
             elif here is self.__loop:
@@ -268,7 +259,7 @@ class LaunchService:
         self.__context._set_is_shutdown(True)
         return waiting
 
-    def shutdown(self, force_sync: bool = False) -> Optional[Coroutine[Any, Any, None]]:
+    def shutdown(self, force_sync: bool = False) -> Waiting | None:
         """
         Shut down, if running.
 
@@ -288,11 +279,11 @@ class LaunchService:
         return self.__context
 
     @property
-    def event_loop(self) -> Optional[Loop]:
+    def event_loop(self) -> Loop | None:
         """The loop, while running."""
         return self.__loop
 
     @property
-    def task(self) -> Optional[asyncio.Task[Any]]:
+    def task(self) -> asyncio.Task[Any] | None:
         """The task of :meth:`run_async`."""
         return self.__task

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, Optional, Tuple, Union
+from typing import Any
 
 from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.frontend.parse_substitution import parse_substitution
@@ -15,12 +15,7 @@ from launch.utilities import (
     normalize_to_list_of_substitutions,
     perform_substitutions,
 )
-from launch.utilities.type_utils import (
-    AllowedTypesType,
-    normalize_typed_substitution,
-    perform_typed_substitution,
-    SomeValueType,
-)
+from launch.utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 
 
 class ParameterValue:
@@ -30,23 +25,14 @@ class ParameterValue:
     :param value_type: what they become, by default what YAML makes of the text.
     """
 
-    def __init__(
-        self, value: SomeValueType, *, value_type: Optional[AllowedTypesType] = None
-    ) -> None:
+    def __init__(self, value: Any, *, value_type: Any = None) -> None:
         self.__value = normalize_typed_substitution(value, value_type)
         self.value_type = value_type
-        self.__evaluated_parameter_value: Any = None
 
     @property
     def value(self) -> Any:
         """The value once evaluated, before that as it was given."""
-        if self.__evaluated_parameter_value is not None:
-            return self.__evaluated_parameter_value
         return self.__value
-
-    def __str__(self) -> str:
-        return (f'launch_ros.description.ParameterValue(value={self.value}, '
-                f'value_type={self.value_type})')
 
     def evaluate(self, context: LaunchContext) -> Any:
         """
@@ -54,41 +40,32 @@ class ParameterValue:
 
         :raises ValueError: if it isn't of the type.
         """
-        self.__evaluated_parameter_value = perform_typed_substitution(
-            context, self.value, self.value_type)
-        return self.__evaluated_parameter_value
+        self.__value = perform_typed_substitution(context, self.__value, self.value_type)
+        return self.__value
 
 
 class Parameter:
     """A name with a value, see :class:`ParameterValue`."""
 
     def __init__(
-        self, name: SomeSubstitutionsType, value: SomeValueType, *,
-        value_type: Optional[AllowedTypesType] = None
+        self, name: SomeSubstitutionsType, value: Any, *, value_type: Any = None
     ) -> None:
         ensure_argument_type(name, SomeSubstitutionsType_types_tuple, 'name')
         self.name: Any = normalize_to_list_of_substitutions(name)
         self.__parameter_value = ParameterValue(value, value_type=value_type)
-        self.__evaluated_parameter_rule: Optional[Tuple[str, Any]] = None
+        self.__evaluated = False
 
     @property
     def value(self) -> Any:
         return self.__parameter_value.value
 
-    @property
-    def value_type(self) -> Optional[AllowedTypesType]:
-        return self.__parameter_value.value_type
-
-    def __str__(self) -> str:
-        return (f'launch_ros.description.Parameter(name={self.name}, value={self.value}, '
-                f'value_type={self.value_type})')
-
-    def evaluate(self, context: LaunchContext) -> Tuple[str, Any]:
+    def evaluate(self, context: LaunchContext) -> tuple[str, Any]:
         """Return name and value."""
-        if self.__evaluated_parameter_rule is None:
+        if not self.__evaluated:
             self.name = perform_substitutions(context, self.name)
-            self.__evaluated_parameter_rule = (self.name, self.__parameter_value.evaluate(context))
-        return self.__evaluated_parameter_rule
+            self.__parameter_value.evaluate(context)
+            self.__evaluated = True
+        return self.name, self.value
 
 
 class ParameterFile:
@@ -99,12 +76,13 @@ class ParameterFile:
         takes its place, which goes when this object does.
     """
 
+    __evaluated = False
+    __created_tmp_file = False
+
     def __init__(
-        self, param_file: Union[SomeSubstitutionsType, 'os.PathLike[str]', bytes], *,
+        self, param_file: SomeSubstitutionsType | os.PathLike[str] | bytes, *,
         allow_substs: bool = False
     ) -> None:
-        self.__created_tmp_file = False
-        self.__evaluated = False
         ensure_argument_type(
             param_file, SomeSubstitutionsType_types_tuple + (os.PathLike, bytes), 'param_file',
             'ParameterFile()')
@@ -113,10 +91,6 @@ class ParameterFile:
         self.param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
             normalize_to_list_of_substitutions(param_file))
         self.allow_substs = allow_substs
-
-    def __str__(self) -> str:
-        return (f'launch_ros.description.ParameterFile(param_file={self.param_file}, '
-                f'allow_substs={self.allow_substs})')
 
     def evaluate(self, context: LaunchContext) -> Path:
         """
@@ -139,19 +113,17 @@ class ParameterFile:
                 raise SubstitutionFailure(
                     'The substituted parameter file is not a valid yaml file') from exc
             with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
+                path = self.param_file = Path(file.name)
                 self.__created_tmp_file = True
                 file.write(text)
-            path = Path(file.name)
         self.param_file = path
         self.__evaluated = True
         return path
 
     def cleanup(self) -> None:
         """Remove the temporary file, if there is one."""
-        if self.__created_tmp_file and self.__evaluated:
-            self.param_file.unlink(missing_ok=True)
+        if self.__created_tmp_file:
+            Path(self.param_file).unlink(missing_ok=True)
 
     def __del__(self) -> None:
-        # The constructor may have raised before there was anything.
-        if self.__dict__.get('_ParameterFile__created_tmp_file'):
-            self.cleanup()
+        self.cleanup()

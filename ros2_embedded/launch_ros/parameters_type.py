@@ -1,34 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is accepted as parameters of a node, and what becomes of that."""
-import pathlib
-from typing import Any, Dict, Mapping, Sequence, Tuple, Union
+from typing import Any, Mapping, Sequence
 
-from launch import SomeSubstitutionsType, SomeSubstitutionsType_types_tuple, Substitution
-
-from .parameter_descriptions import Parameter as ParameterDescription
-from .parameter_descriptions import ParameterFile
-from .parameter_descriptions import ParameterValue as ParameterValueDescription
-
-_SingleValueType = Union[str, int, float, bool]
-_MultiValueType = Union[Sequence[str], Sequence[int], Sequence[float], Sequence[bool], bytes]
-
-SomeParameterFile = Union[SomeSubstitutionsType, pathlib.Path, ParameterFile]
-SomeParameterName = SomeSubstitutionsType
-SomeParameterValue = Union[
-    ParameterValueDescription, SomeSubstitutionsType, Sequence[SomeSubstitutionsType],
-    _SingleValueType, _MultiValueType]
-SomeParameterValue_types_tuple = (
-    SomeSubstitutionsType_types_tuple + (str, int, float, bool, bytes))
+#: Files (texts with substitutions, paths, ParameterFile), Parameter and dictionaries.
+SomeParameters = Sequence[Any]
 SomeParametersDict = Mapping[Any, Any]
-SomeParameters = Sequence[Union[SomeParameterFile, ParameterDescription, SomeParametersDict]]
-
-ParameterName = Tuple[Substitution, ...]
-ParameterValue = Union[
-    Sequence[Substitution], Sequence[Sequence[Substitution]], _SingleValueType, _MultiValueType,
-    ParameterValueDescription]
-ParametersDict = Dict[ParameterName, ParameterValue]
-Parameters = Sequence[Union[ParameterFile, ParametersDict, ParameterDescription]]
-
-EvaluatedParameterValue = Union[_SingleValueType, _MultiValueType]
-EvaluatedParameters = Sequence[
-    Union[pathlib.Path, ParameterDescription, Dict[str, EvaluatedParameterValue]]]
+#: ParameterFile, Parameter, and dictionaries of values by tuples of substitutions.
+Parameters = Sequence[Any]
+ParametersDict = dict[tuple[Any, ...], Any]
+#: Paths, Parameter, and dictionaries of values by name.
+EvaluatedParameters = Sequence[Any]

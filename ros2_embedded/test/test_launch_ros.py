@@ -35,7 +35,6 @@ from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
 from launch_ros.events.matchers import matches_node_name
 from launch_ros.substitutions import ExecutableInPackage, FindPackagePrefix, FindPackageShare
-from launch_ros.substitutions import Parameter as ParameterSubstitution
 from launch_ros.utilities import (
     evaluate_parameters,
     make_namespace_absolute,
@@ -173,15 +172,6 @@ def test_global_parameters_and_remappings_come_first(tmp_path):
         '--params-file', str(file), '--params-file', own, '-r', 'x:=2y', '-r', 'p:=q']
     assert yaml.safe_load(Path(own).read_text()) == {'/**': {'ros__parameters': {'own': 3}}}
     assert action.expanded_remapping_rules == [('x', '2y'), ('p', 'q')]
-
-
-def test_a_global_parameter_is_a_substitution_too():
-    context = LaunchContext()
-    visit(context, SetParameter('a', 5))
-    assert ParameterSubstitution('a').perform(context) == '5'
-    assert ParameterSubstitution('b', default='d').perform(context) == 'd'
-    with pytest.raises(SubstitutionFailure, match="parameter 'b' not found"):
-        ParameterSubstitution('b').perform(context)
 
 
 def load(path):

@@ -135,8 +135,8 @@ def test_services(worker):
 
 
 def test_parameters(worker):
-    assert {'  arm.joints', '  speed', '  use_sim_time'} <= \
-        set(ros2('param', 'list', '/cell/worker').splitlines())
+    listed = ros2('param', 'list', '/cell/worker').splitlines()
+    assert {'  arm.joints', '  speed', '  use_sim_time'} <= {*listed} and sorted(listed) == listed
     assert '/cell/worker:' in ros2('param', 'list').splitlines()
     assert ros2('param', 'get', '/cell/worker', 'speed') == 'Double value is: 1.5\n'
     assert ros2('param', 'set', '/cell/worker', 'speed', '2.5') == 'Set parameter successful\n'

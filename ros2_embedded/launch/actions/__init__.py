@@ -1,40 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do."""
-from .._aliases import alias_submodules
-from ._environment import (
-    AppendEnvironmentVariable,
-    DeclareLaunchArgument,
-    PopEnvironment,
-    PopLaunchConfigurations,
-    PushEnvironment,
-    PushLaunchConfigurations,
-    ResetEnvironment,
-    ResetLaunchConfigurations,
-    SetEnvironmentVariable,
-    SetLaunchConfiguration,
-    UnsetEnvironmentVariable,
-    UnsetLaunchConfiguration,
-)
-from ._simple import (
-    EmitEvent,
-    LogInfo,
-    OpaqueCoroutine,
-    OpaqueFunction,
-    RegisterEventHandler,
-    Shutdown,
-    UnregisterEventHandler,
-)
-from ._structure import GroupAction, IncludeLaunchDescription, TimerAction
-from .execute_local import ExecuteLocal
-from .execute_process import ExecuteProcess
+from .._aliases import lacking
+from ._environment import *  # noqa: F403
+from ._simple import *  # noqa: F403
+from ._structure import *  # noqa: F403
+from .execute_local import ExecuteLocal as ExecuteLocal
+from .execute_process import ExecuteProcess as ExecuteProcess
 
-__all__ = [
-    'AppendEnvironmentVariable', 'DeclareLaunchArgument', 'EmitEvent', 'ExecuteLocal',
-    'ExecuteProcess', 'GroupAction', 'IncludeLaunchDescription', 'LogInfo', 'OpaqueCoroutine',
-    'OpaqueFunction', 'PopEnvironment', 'PopLaunchConfigurations', 'PushEnvironment',
-    'PushLaunchConfigurations', 'RegisterEventHandler', 'ResetEnvironment',
-    'ResetLaunchConfigurations', 'SetEnvironmentVariable', 'SetLaunchConfiguration', 'Shutdown',
-    'TimerAction', 'UnregisterEventHandler', 'UnsetEnvironmentVariable',
-    'UnsetLaunchConfiguration']
-
-alias_submodules(__name__, __all__, shutdown_action=('Shutdown',))
+__getattr__ = lacking(__name__, 'OpaqueCoroutine UnregisterEventHandler')

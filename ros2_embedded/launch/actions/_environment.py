@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional, TYPE_CHECKING, Union
+from typing import Any, List, TYPE_CHECKING
 
 import launch.logging
 
@@ -17,12 +17,16 @@ from ..utilities.type_utils import normalize_typed_substitution, perform_typed_s
 if TYPE_CHECKING:
     from ..frontend import Parser
 
-SomeConfigurations = Dict[SomeSubstitutionsType, SomeSubstitutionsType]
+__all__ = [
+    'AppendEnvironmentVariable', 'DeclareLaunchArgument', 'PopEnvironment',
+    'PopLaunchConfigurations', 'PushEnvironment', 'PushLaunchConfigurations', 'ResetEnvironment',
+    'ResetLaunchConfigurations', 'SetEnvironmentVariable', 'SetLaunchConfiguration',
+    'UnsetEnvironmentVariable', 'UnsetLaunchConfiguration']
 
 
 def parse_pairs(
     entity: Entity, parser: Parser, element: str, key: str = 'name', value: str = 'value'
-) -> Optional[Dict[Any, Any]]:
+) -> dict[Any, Any] | None:
     """Return what nested elements give by name, None if there are none of that kind."""
     nested = entity.get_attr(element, data_type=List[Entity], optional=True)
     if nested is None:
@@ -73,23 +77,16 @@ class UnsetEnvironmentVariable(_Named):
 class AppendEnvironmentVariable(_NamedValue):
 
     _texts = {**_NamedValue._texts, 'separator': 'separator?'}
+    _typed = {'prepend': bool}
 
     def __init__(
         self, name: SomeSubstitutionsType, value: SomeSubstitutionsType,
-        prepend: Union[bool, SomeSubstitutionsType] = False,
+        prepend: bool | SomeSubstitutionsType = False,
         separator: SomeSubstitutionsType = os.pathsep, **kwargs: Any
     ) -> None:
         super().__init__(name, value, **kwargs)
         self.prepend = normalize_typed_substitution(prepend, bool)
         self.separator = normalize_to_list_of_substitutions(separator)
-
-    @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser)
-        prepend = entity.get_attr('prepend', optional=True, data_type=bool, can_be_str=True)
-        if prepend is not None:
-            kwargs['prepend'] = parser.parse_if_substitutions(prepend)
-        return cls, kwargs
 
     def execute(self, context: LaunchContext) -> None:
         name = perform_substitutions(context, self.name)
@@ -150,7 +147,7 @@ class ResetLaunchConfigurations(Action):
     """Removes all launch configurations and sets the given ones, evaluated before that."""
 
     def __init__(
-        self, launch_configurations: Optional[SomeConfigurations] = None, **kwargs: Any
+        self, launch_configurations: dict[Any, Any] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
         self.__launch_configurations = launch_configurations or {}
@@ -162,9 +159,8 @@ class ResetLaunchConfigurations(Action):
         return cls, kwargs
 
     def execute(self, context: LaunchContext) -> None:
-        def text(substitutions: SomeSubstitutionsType) -> str:
-            return perform_substitutions(
-                context, normalize_to_list_of_substitutions(substitutions))
+        def text(given: SomeSubstitutionsType) -> str:
+            return perform_substitutions(context, normalize_to_list_of_substitutions(given))
 
         kept = {text(name): text(value) for name, value in self.__launch_configurations.items()}
         context.launch_configurations.clear()
@@ -184,8 +180,8 @@ class DeclareLaunchArgument(Action):
     _texts = {'default_value': 'default?'}
 
     def __init__(
-        self, name: str, *, default_value: Optional[SomeSubstitutionsType] = None,
-        description: Optional[str] = None, choices: Optional[List[str]] = None, **kwargs: Any
+        self, name: str, *, default_value: SomeSubstitutionsType | None = None,
+        description: str | None = None, choices: list[str] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
         self.name = name

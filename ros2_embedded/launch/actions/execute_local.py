@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import traceback
-from typing import Any, Callable, cast, Dict, Iterator, List, Optional, Tuple, Union
+from typing import Any, Callable, Iterator
 
 import launch.logging
 
@@ -19,14 +19,13 @@ from .._base import (
     Entities,
     Event,
     EventHandler,
-    SomeEntitiesType,
     SomeSubstitutionsType,
     Substitution,
 )
 from ..conditions import evaluate_condition_expression
 from ..descriptions import Executable
-from ..event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown
-from ..events import matches_action, Shutdown
+from ..event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown, SomeReaction
+from ..events import matches_action
 from ..events.process import (
     ProcessExited,
     ProcessIO,
@@ -38,62 +37,49 @@ from ..events.process import (
 )
 from ..launch_context import LaunchContext
 from ..substitutions import LaunchConfiguration, PythonExpression
-from ..utilities import is_a_subclass, normalize_to_list_of_substitutions, perform_substitutions
+from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 from ._simple import EmitEvent, OpaqueFunction
 from ._structure import TimerAction
 
 OnData = Callable[[bytes], None]
-OnExit = Union[
-    SomeEntitiesType, Callable[[ProcessExited, LaunchContext], Optional[SomeEntitiesType]], None]
 
 _SIGTERM_TIMEOUT = LaunchConfiguration('sigterm_timeout', default=5)
 _SIGKILL_TIMEOUT = LaunchConfiguration('sigkill_timeout', default=5)
 
 
 class _Output:
-    """A process's output on one descriptor: the lines so far, all of it if ``keep``."""
+    """A process's output on one descriptor, as lines, and all of it if ``keep``."""
 
     def __init__(self, keep: bool) -> None:
+        self.text: str | None = '' if keep else None
         self.__decoder = codecs.getincrementaldecoder('utf-8')(errors='replace')
-        self.__keep = keep
-        self.text = ''
-        self.__seen = 0
+        self.__rest = ''
         self.__ended = False
 
     def lines(self, data: bytes) -> Iterator[str]:
         """Take more output; yield the lines that are complete with it."""
         text = self.__decoder.decode(data)
+        if self.text is not None:
+            self.text += text
+        *complete, self.__rest = (self.__rest + text).split('\n')
+        yield from complete
         if self.__ended:
             # The line that this belongs to is out already.
-            yield text
-            return
-        self.text += text
-        while (end := self.text.find('\n', self.__seen)) >= 0:
-            line = self.text[self.__seen:end]
-            self.__seen = end + 1
-            yield line
-        self.__forget()
+            yield from self.rest(True)
 
     def rest(self, ended: bool) -> Iterator[str]:
         """Yield the last line, if it wasn't complete."""
-        rest = self.text[self.__seen:]
-        self.__seen = len(self.text)
-        self.__ended = ended and not self.__keep
-        self.__forget()
+        rest, self.__rest = self.__rest, ''
+        self.__ended = ended
         if rest:
             yield rest
-
-    def __forget(self) -> None:
-        if not self.__keep:
-            self.text = self.text[self.__seen:]
-            self.__seen = 0
 
 
 class Protocol(asyncio.SubprocessProtocol):
     """Hands on what a process writes, by file descriptor, and its id as soon as there is one."""
 
-    def __init__(self, on_start: Callable[[int], None], on_data: Dict[int, OnData]) -> None:
+    def __init__(self, on_start: Callable[[int], None], on_data: dict[int, OnData]) -> None:
         self.complete: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self.__on_start = on_start
         self.on_data = on_data
@@ -121,9 +107,9 @@ class _TerminalReader(asyncio.Protocol):
 
 
 async def _start_process(
-    make_protocol: Callable[[], Protocol], *, cmd: List[str], shell: bool, emulate_tty: bool,
+    make_protocol: Callable[[], Protocol], *, cmd: list[str], shell: bool, emulate_tty: bool,
     **kwargs: Any
-) -> Tuple[asyncio.SubprocessTransport, Protocol]:
+) -> tuple[asyncio.SubprocessTransport, Protocol]:
     """
     Start a process, in this process group, with a pipe as standard input.
 
@@ -177,9 +163,9 @@ class ExecuteLocal(Action):
         sigkill_timeout: SomeSubstitutionsType = _SIGKILL_TIMEOUT,
         emulate_tty: bool = False, output: Any = 'log',
         output_format: str = '[{this.process_description.final_name}] {line}',
-        cached_output: bool = False, log_cmd: bool = False, on_exit: OnExit = None,
-        respawn: Union[bool, SomeSubstitutionsType] = False,
-        respawn_delay: Optional[float] = None, respawn_max_retries: int = -1, **kwargs: Any
+        cached_output: bool = False, log_cmd: bool = False, on_exit: SomeReaction = None,
+        respawn: bool | SomeSubstitutionsType = False, respawn_delay: float | None = None,
+        respawn_max_retries: int = -1, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
         self.process_description = process_description
@@ -188,33 +174,31 @@ class ExecuteLocal(Action):
         self.sigkill_timeout = normalize_to_list_of_substitutions(sigkill_timeout)
         self.emulate_tty = emulate_tty
         output = os.environ.get('OVERRIDE_LAUNCH_PROCESS_OUTPUT', output)
-        self.output: Union[Dict[str, Any], List[Substitution]] = (
+        self.output: dict[str, Any] | list[Substitution] = (
             output if isinstance(output, dict) else normalize_to_list_of_substitutions(output))
         self.__output_format = output_format
         self.__log_cmd = log_cmd
-        self.__cached_output = cached_output
         self.__on_exit = on_exit
         self.__respawn = normalize_typed_substitution(respawn, bool)
         self.__respawn_delay = respawn_delay
         self.__respawn_max_retries = respawn_max_retries
         self.__respawn_retries = 0
-        self.__process_event_args: Optional[Dict[str, Any]] = None
-        self._subprocess_protocol: Optional[Protocol] = None
-        self._subprocess_transport: Optional[asyncio.SubprocessTransport] = None
-        self.__completed_future: Optional[asyncio.Future[None]] = None
-        self.__shutdown_future: Optional[asyncio.Future[None]] = None
-        self.__sigterm_timer: Optional[TimerAction] = None
-        self.__sigkill_timer: Optional[TimerAction] = None
+        self.__process_event_args: dict[str, Any] | None = None
+        self._subprocess_protocol: Protocol | None = None
+        self._subprocess_transport: asyncio.SubprocessTransport | None = None
+        self.__completed_future: asyncio.Future[None] | None = None
+        self.__shutdown_future: asyncio.Future[None] | None = None
+        self.__shutdown_timers: list[TimerAction] = []
         self.__stdout_buffer = _Output(cached_output)
         self.__stderr_buffer = _Output(cached_output)
         self.__executed = False
 
     @property
-    def process_details(self) -> Optional[Dict[str, Any]]:
+    def process_details(self) -> dict[str, Any] | None:
         return self.__process_event_args
 
     @property
-    def return_code(self) -> Optional[int]:
+    def return_code(self) -> int | None:
         """The exit status or minus the signal, None before."""
         if self._subprocess_transport is None:
             return None
@@ -227,18 +211,15 @@ class ExecuteLocal(Action):
         return self.__cached('stderr', self.__stderr_buffer)
 
     def __cached(self, name: str, output: _Output) -> str:
-        if not self.__cached_output:
-            raise RuntimeError(
-                f'cached output must be true to be able to get {name}, '
-                f"proc '{self.process_description.name}'")
+        if output.text is None:
+            raise RuntimeError(f'cached output must be true to be able to get {name}, '
+                               f"proc '{self.process_description.name}'")
         return output.text
 
     def get_sub_entities(self) -> Entities:
         return self.__on_exit if isinstance(self.__on_exit, list) else []
 
-    def _shutdown_process(
-        self, context: LaunchContext, *, send_sigint: bool
-    ) -> Optional[Entities]:
+    def _shutdown_process(self, context: LaunchContext, *, send_sigint: bool) -> Entities | None:
         if self.__shutdown_future is None or self.__shutdown_future.done():
             return None
         if self.__completed_future is None or self.__completed_future.done():
@@ -252,55 +233,44 @@ class ExecuteLocal(Action):
             return None
         self.__shutdown_future.set_result(None)
         context.extend_locals({'process_name': self.__process_event_args['name']})
-        actions = self.__make_shutdown_timers()
+        both = PythonExpression((
+            'float(', *self.sigterm_timeout, ') + float(', *self.sigkill_timeout, ')'))
+        self.__shutdown_timers = [self.__escalate(self.sigterm_timeout, 'SIGINT', 'SIGTERM'),
+                                  self.__escalate([both], 'SIGTERM', 'SIGKILL')]
+        actions: Entities = [*self.__shutdown_timers]
         if send_sigint:
             actions.append(EmitEvent(event=SignalProcess(
                 signal_number=signal.SIGINT, process_matcher=matches_action(self))))
         return actions
 
-    def __make_shutdown_timers(self) -> Entities:
-        def escalate(
-            period: List[Substitution], received: str, number: Union[str, signal.Signals]
-        ) -> TimerAction:
-            def report(context: LaunchContext) -> None:
-                seconds = perform_substitutions(context, period)
-                name = number if isinstance(number, str) else number.name
-                self.__logger.error(
-                    f"process[{context.locals.process_name}] failed to terminate '{seconds}' "
-                    f"seconds after receiving '{received}', escalating to '{name}'")
+    def __escalate(self, period: list[Substitution], received: str, name: str) -> TimerAction:
+        def report(context: LaunchContext) -> None:
+            seconds = perform_substitutions(context, period)
+            self.__logger.error(
+                f"process[{context.locals.process_name}] failed to terminate '{seconds}' "
+                f"seconds after receiving '{received}', escalating to '{name}'")
 
-            event = SignalProcess(signal_number=number, process_matcher=matches_action(self))
-            return TimerAction(
-                period=period, cancel_on_shutdown=False,
-                actions=[OpaqueFunction(function=report), EmitEvent(event=event)])
+        event = SignalProcess(signal_number=name, process_matcher=matches_action(self))
+        return TimerAction(
+            period=period, cancel_on_shutdown=False,
+            actions=[OpaqueFunction(function=report), EmitEvent(event=event)])
 
-        both = PythonExpression((
-            'float(', *self.sigterm_timeout, ') + float(', *self.sigkill_timeout, ')'))
-        self.__sigterm_timer = escalate(self.sigterm_timeout, 'SIGINT', signal.SIGTERM)
-        self.__sigkill_timer = escalate([both], 'SIGTERM', 'SIGKILL')
-        return [self.__sigterm_timer, self.__sigkill_timer]
-
-    def __on_shutdown(
-        self, event: Event, context: LaunchContext
-    ) -> Optional[Entities]:
+    def __on_shutdown(self, event: Any, context: LaunchContext) -> Entities | None:
         # A terminal sends SIGINT to the process too.
-        interrupted = cast(Shutdown, event).due_to_sigint and not context.noninteractive
+        interrupted = event.due_to_sigint and not context.noninteractive
         return self._shutdown_process(context, send_sigint=not interrupted)
 
-    def __on_shutdown_process_event(
-        self, context: LaunchContext
-    ) -> Optional[Entities]:
-        if not cast(ShutdownProcess, context.locals.event).process_matcher(self):
+    def __on_shutdown_process_event(self, context: LaunchContext) -> Entities | None:
+        if not context.locals.event.process_matcher(self):
             return None
         return self._shutdown_process(context, send_sigint=True)
 
     def __on_signal_process_event(self, context: LaunchContext) -> None:
-        event = cast(SignalProcess, context.locals.event)
+        event = context.locals.event
         if not event.process_matcher(self):
             return
-        if self.__process_event_args is None:
-            raise RuntimeError('Signal event received before execution.')
-        if self._subprocess_transport is None or self._subprocess_protocol is None:
+        if (self.__process_event_args is None or self._subprocess_transport is None
+                or self._subprocess_protocol is None):
             raise RuntimeError('Signal event received before subprocess transport available.')
         name = self.__process_event_args['name']
         if self._subprocess_protocol.complete.done():
@@ -331,8 +301,7 @@ class ExecuteLocal(Action):
 
     async def __execute_process(self, context: LaunchContext) -> None:
         details = self.__process_event_args
-        if details is None:
-            raise RuntimeError('process_event_args unexpectedly None')
+        assert details is not None
         cmd, cwd, env = details['cmd'], details['cwd'], details['env']
         words = ' '.join(word for word in cmd if word.strip())
         if self.__log_cmd:
@@ -386,9 +355,8 @@ class ExecuteLocal(Action):
         return not stopped.done()
 
     def __cleanup(self) -> None:
-        for timer in (self.__sigterm_timer, self.__sigkill_timer):
-            if timer is not None:
-                timer.cancel()
+        for timer in self.__shutdown_timers:
+            timer.cancel()
         if self._subprocess_transport is not None:
             self._subprocess_transport.close()
         assert self.__completed_future is not None
@@ -399,15 +367,11 @@ class ExecuteLocal(Action):
         description = self.process_description
         description.prepare(context, self)
         self.__process_event_args = {
-            'action': self,
-            'name': description.final_name,
-            'cmd': description.final_cmd,
-            'cwd': description.final_cwd,
-            'env': description.final_env,
-        }
+            'action': self, 'name': description.final_name, 'cmd': description.final_cmd,
+            'cwd': description.final_cwd, 'env': description.final_env}
         self.__respawn = perform_typed_substitution(context, self.__respawn, bool)
 
-    def execute(self, context: LaunchContext) -> Optional[Entities]:
+    def execute(self, context: LaunchContext) -> Entities | None:
         """
         Start the process, in the background.
 
@@ -424,41 +388,34 @@ class ExecuteLocal(Action):
             # A process started now would miss the shutdown.
             return None
 
-        def on_output(get_logger: Callable[[], logging.Logger], output: _Output) -> Any:
-            return lambda event: self.__log(get_logger(), output.lines(event.text))
-
-        handlers: List[BaseEventHandler] = [
+        self.__completed_future = context.asyncio_loop.create_future()
+        self.__shutdown_future = context.asyncio_loop.create_future()
+        self.__logger = launch.logging.get_logger(name)
+        output = self.output if isinstance(self.output, dict) else (
+            perform_substitutions(context, self.output))
+        self.__stdout_logger, self.__stderr_logger = (
+            launch.logging.get_output_loggers(name, output))
+        handlers: list[BaseEventHandler] = [
             EventHandler(
-                matcher=lambda event: is_a_subclass(event, ShutdownProcess),
+                matcher=lambda event: isinstance(event, ShutdownProcess),
                 entities=OpaqueFunction(function=self.__on_shutdown_process_event)),
             EventHandler(
-                matcher=lambda event: is_a_subclass(event, SignalProcess),
+                matcher=lambda event: isinstance(event, SignalProcess),
                 entities=OpaqueFunction(function=self.__on_signal_process_event)),
             OnProcessIO(
-                target_action=self,
-                on_stdin=self.__on_process_stdin,
-                on_stdout=on_output(lambda: self.__stdout_logger, self.__stdout_buffer),
-                on_stderr=on_output(lambda: self.__stderr_logger, self.__stderr_buffer)),
+                target_action=self, on_stdin=self.__on_process_stdin,
+                on_stdout=lambda event: self.__log(
+                    self.__stdout_logger, self.__stdout_buffer.lines(event.text)),
+                on_stderr=lambda event: self.__log(
+                    self.__stderr_logger, self.__stderr_buffer.lines(event.text))),
             OnShutdown(on_shutdown=self.__on_shutdown),
             OnProcessExit(target_action=self, on_exit=self.__on_exit),
             OnProcessExit(target_action=self, on_exit=self.__flush_buffers),
         ]
         for handler in handlers:
             context.register_event_handler(handler)
-        try:
-            self.__completed_future = context.asyncio_loop.create_future()
-            self.__shutdown_future = context.asyncio_loop.create_future()
-            self.__logger = launch.logging.get_logger(name)
-            output = self.output if isinstance(self.output, dict) else (
-                perform_substitutions(context, self.output))
-            self.__stdout_logger, self.__stderr_logger = (
-                launch.logging.get_output_loggers(name, output))
-            context.asyncio_loop.create_task(self.__execute_process(context))
-        except Exception:
-            for handler in handlers:
-                context.unregister_event_handler(handler)
-            raise
+        context.asyncio_loop.create_task(self.__execute_process(context))
         return None
 
-    def get_asyncio_future(self) -> Optional[asyncio.Future[None]]:
+    def get_asyncio_future(self) -> asyncio.Future[None] | None:
         return self.__completed_future

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from typing import Any, Dict, Iterable, List, Optional, TYPE_CHECKING
+from typing import Any, Iterable, TYPE_CHECKING
 
 from .._base import ParsedAction, SomeSubstitutionsType, Substitution
 from ..descriptions import Executable
@@ -28,22 +28,19 @@ class ExecuteProcess(ExecuteLocal):
 
     def __init__(
         self, *, cmd: Iterable[SomeSubstitutionsType],
-        prefix: Optional[SomeSubstitutionsType] = None,
-        name: Optional[SomeSubstitutionsType] = None,
-        cwd: Optional[SomeSubstitutionsType] = None,
-        env: Optional[Dict[SomeSubstitutionsType, SomeSubstitutionsType]] = None,
-        additional_env: Optional[Dict[SomeSubstitutionsType, SomeSubstitutionsType]] = None,
-        **kwargs: Any
+        prefix: SomeSubstitutionsType | None = None, name: SomeSubstitutionsType | None = None,
+        cwd: SomeSubstitutionsType | None = None, env: dict[Any, Any] | None = None,
+        additional_env: dict[Any, Any] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(process_description=Executable(
             cmd=cmd, prefix=prefix, name=name, cwd=cwd, env=env,
             additional_env=additional_env), **kwargs)
 
     @classmethod
-    def _parse_cmdline(cls, cmd: str, parser: Parser) -> List[SomeSubstitutionsType]:
+    def _parse_cmdline(cls, cmd: str, parser: Parser) -> list[SomeSubstitutionsType]:
         """Split a command line into words, as a shell does; substitutions stay whole."""
-        words: List[SomeSubstitutionsType] = []
-        word: List[Substitution] = []
+        words: list[SomeSubstitutionsType] = []
+        word: list[Substitution] = []
 
         def end_word() -> None:
             nonlocal word
@@ -68,7 +65,7 @@ class ExecuteProcess(ExecuteLocal):
 
     @classmethod
     def parse(
-        cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
+        cls, entity: Entity, parser: Parser, ignore: list[str] | None = None
     ) -> ParsedAction:
         """
         Return the class and the keyword arguments that a frontend's entity gives.
@@ -109,26 +106,12 @@ class ExecuteProcess(ExecuteLocal):
             kwargs['additional_env'] = parse_pairs(entity, parser, 'env')
         return cls, kwargs
 
-    @property
-    def name(self) -> Any:
-        return self.__final('name')
-
-    @property
-    def cmd(self) -> Any:
-        return self.__final('cmd')
-
-    @property
-    def cwd(self) -> Any:
-        return self.__final('cwd')
-
-    @property
-    def env(self) -> Any:
-        return self.__final('env')
-
-    @property
-    def additional_env(self) -> Any:
-        return self.process_description.additional_env
-
     def __final(self, name: str) -> Any:
         final = getattr(self.process_description, f'final_{name}')
         return getattr(self.process_description, name) if final is None else final
+
+    name = property(lambda self: self.__final('name'))
+    cmd = property(lambda self: self.__final('cmd'))
+    cwd = property(lambda self: self.__final('cwd'))
+    env = property(lambda self: self.__final('env'))
+    additional_env = property(lambda self: self.process_description.additional_env)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from typing import Dict, Iterable, List, Optional, Tuple
+from typing import Any, Iterable
 
-from .._aliases import alias_submodules
 from .._base import Action, SomeSubstitutionsType, Substitution
 from ..launch_context import LaunchContext
 from ..substitutions import LaunchConfiguration, normalized_default
@@ -16,16 +15,14 @@ from ..utilities import perform_substitutions
 
 __all__ = ['Executable']
 
-SomeEnvironment = Dict[SomeSubstitutionsType, SomeSubstitutionsType]
-Environment = List[Tuple[List[Substitution], List[Substitution]]]
+Environment = list[tuple[list[Substitution], list[Substitution]]]
 
 _numbers = itertools.count(1)
 
 
-def _normalize_environment(environment: Optional[SomeEnvironment]) -> Optional[Environment]:
-    if environment is None:
-        return None
-    return [(normalize(name), normalize(value)) for name, value in environment.items()]
+def _normalize_environment(environment: dict[Any, Any] | None) -> Environment | None:
+    return None if environment is None else [
+        (normalize(name), normalize(value)) for name, value in environment.items()]
 
 
 class Executable:
@@ -42,11 +39,10 @@ class Executable:
 
     def __init__(
         self, *, cmd: Iterable[SomeSubstitutionsType],
-        prefix: Optional[SomeSubstitutionsType] = None,
-        name: Optional[SomeSubstitutionsType] = None,
-        cwd: Optional[SomeSubstitutionsType] = None,
-        env: Optional[SomeEnvironment] = None, additional_env: Optional[SomeEnvironment] = None,
-        arguments: Optional[Iterable[SomeSubstitutionsType]] = None
+        prefix: SomeSubstitutionsType | None = None, name: SomeSubstitutionsType | None = None,
+        cwd: SomeSubstitutionsType | None = None, env: dict[Any, Any] | None = None,
+        additional_env: dict[Any, Any] | None = None,
+        arguments: Iterable[SomeSubstitutionsType] | None = None
     ) -> None:
         self.cmd = [normalize(word) for word in (*cmd, *(arguments or ()))]
         self.prefix = normalize(
@@ -58,10 +54,10 @@ class Executable:
         self.env = _normalize_environment(env)
         self.additional_env = _normalize_environment(additional_env)
         self.arguments = arguments
-        self.final_cmd: Optional[List[str]] = None
-        self.final_cwd: Optional[str] = None
-        self.final_env: Optional[Dict[str, str]] = None
-        self.final_name: Optional[str] = None
+        self.final_cmd: list[str] | None = None
+        self.final_cwd: str | None = None
+        self.final_env: dict[str, str] | None = None
+        self.final_name: str | None = None
 
     def prepare(self, context: LaunchContext, action: Action) -> None:
         """Work out the final command, name, directory and environment."""
@@ -80,6 +76,3 @@ class Executable:
         self.final_name = f'{name}-{next(_numbers)}'
         self.final_cwd = None if self.cwd is None else perform_substitutions(context, self.cwd)
         self.final_env = env
-
-
-alias_submodules(__name__, __all__)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import collections.abc
-from typing import Any, Callable, cast, List, Optional, Tuple, Type, TYPE_CHECKING, Union
+from typing import Any, Callable, TYPE_CHECKING
 
-from .._aliases import alias_submodules
 from .._base import (
     Action,
     BaseEventHandler,
@@ -20,14 +19,12 @@ from ..events.process import ProcessExited, ProcessIO, ProcessStarted
 from ..utilities import is_a_subclass
 
 if TYPE_CHECKING:
-    from ..actions import ExecuteLocal
     from ..launch_context import LaunchContext
 
-__all__ = [
-    'event_named', 'OnExecutionComplete', 'OnIncludeLaunchDescription', 'OnProcessExit',
-    'OnProcessIO', 'OnProcessStart', 'OnShutdown']
-
-SomeTarget = Optional[Union[Callable[[Any], bool], Action]]
+SomeTarget = Callable[[Any], bool] | Action | None
+#: Entities to be visited, or what returns some for an event and the context.
+SomeReaction = SomeEntitiesType | Callable[[Any, Any], SomeEntitiesType | None] | None
+OnOutput = Callable[[ProcessIO], SomeEntitiesType | None] | None
 
 
 def event_named(name: str) -> Callable[[Event], bool]:
@@ -45,19 +42,13 @@ class OnActionEventBase(BaseEventHandler):
     """
 
     def __init__(
-        self, *, action_matcher: SomeTarget, on_event: Any, target_event_cls: Type[Event],
-        target_action_cls: Type[Action], **kwargs: Any
+        self, *, action_matcher: SomeTarget, on_event: Any, target_event_cls: type[Event],
+        target_action_cls: type[Action], **kwargs: Any
     ) -> None:
-        if not issubclass(target_event_cls, Event):
-            raise TypeError("'target_event_cls' must be a subclass of 'Event'")
         is_action = isinstance(action_matcher, target_action_cls)
         if not is_action and action_matcher is not None and not callable(action_matcher):
-            raise TypeError(
-                f"action_matcher must be an '{target_action_cls.__name__}' instance "
-                'or a callable')
-        self.__matcher_description = f'event == {target_event_cls.__name__}'
-        if action_matcher is not None:
-            self.__matcher_description += f' and {target_action_cls.__name__}(event.action)'
+            raise TypeError(f"action_matcher must be an '{target_action_cls.__name__}' instance "
+                            'or a callable')
 
         def matches(event: Event) -> bool:
             if not isinstance(event, target_event_cls):
@@ -68,47 +59,32 @@ class OnActionEventBase(BaseEventHandler):
             return action_matcher is None or action is action_matcher
 
         super().__init__(matcher=matches, **kwargs)
+        self.__on_event = on_event if callable(on_event) else None
         self.__entities: Entities = []
-        self.__on_event: Optional[Callable[[Event, LaunchContext], Any]] = None
-        if callable(on_event):
-            self.__on_event = on_event
-        elif isinstance(on_event, collections.abc.Iterable):
+        if isinstance(on_event, collections.abc.Iterable):
             self.__entities = list(on_event)
-            for entity in self.__entities:
-                if not isinstance(entity, LaunchDescriptionEntity):
-                    raise TypeError(
-                        "expected all items in 'on_event' iterable to be of type "
-                        f"'LaunchDescriptionEntity' but got '{type(entity)}'")
-        elif on_event is not None:
+        elif self.__on_event is None and on_event is not None:
             self.__entities = [on_event]
+        for entity in self.__entities:
+            if not isinstance(entity, LaunchDescriptionEntity):
+                raise TypeError("expected all items in 'on_event' iterable to be of type "
+                                f"'LaunchDescriptionEntity' but got '{type(entity)}'")
 
-    def handle(self, event: Event, context: LaunchContext) -> Optional[SomeEntitiesType]:
+    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
         super().handle(event, context)
         if self.__on_event is not None:
-            return cast(Optional[SomeEntitiesType], self.__on_event(event, context))
+            entities: SomeEntitiesType | None = self.__on_event(event, context)
+            return entities
         return self.__entities
 
-    def describe(self) -> Tuple[str, List[Any]]:
-        text, entities = super().describe()
-        return text, [*entities, *self.__entities]
-
-    @property
-    def handler_description(self) -> str:
-        return '<actions>' if self.__entities else str(self.__on_event)
-
-    @property
-    def matcher_description(self) -> str:
-        return self.__matcher_description
+    def describe(self) -> tuple[str, list[Any]]:
+        return super().describe()[0], [*self.__entities]
 
 
 class OnExecutionComplete(OnActionEventBase):
 
     def __init__(
-        self, *, target_action: SomeTarget = None,
-        on_completion: Union[
-            SomeEntitiesType,
-            Callable[[ExecutionComplete, LaunchContext], Optional[SomeEntitiesType]]],
-        **kwargs: Any
+        self, *, target_action: SomeTarget = None, on_completion: SomeReaction, **kwargs: Any
     ) -> None:
         super().__init__(
             action_matcher=target_action, on_event=on_completion,
@@ -118,20 +94,12 @@ class OnExecutionComplete(OnActionEventBase):
 class OnProcessExit(OnActionEventBase):
 
     def __init__(
-        self, *,
-        target_action: Optional[Union[Callable[[ExecuteLocal], bool], ExecuteLocal]] = None,
-        on_exit: Union[
-            SomeEntitiesType,
-            Callable[[ProcessExited, LaunchContext], Optional[SomeEntitiesType]], None],
-        **kwargs: Any
+        self, *, target_action: SomeTarget = None, on_exit: SomeReaction, **kwargs: Any
     ) -> None:
         from ..actions import ExecuteLocal
         super().__init__(
             action_matcher=target_action, on_event=on_exit,
             target_event_cls=ProcessExited, target_action_cls=ExecuteLocal, **kwargs)
-
-
-OnOutput = Optional[Callable[[ProcessIO], Optional[SomeEntitiesType]]]
 
 
 class OnProcessIO(OnActionEventBase):
@@ -142,7 +110,7 @@ class OnProcessIO(OnActionEventBase):
     ) -> None:
         from ..actions import ExecuteLocal
 
-        def handle(event: ProcessIO, _: LaunchContext) -> Optional[SomeEntitiesType]:
+        def handle(event: ProcessIO, _: LaunchContext) -> SomeEntitiesType | None:
             handler = (
                 on_stdout if event.from_stdout else on_stderr if event.from_stderr else on_stdin)
             return None if handler is None else handler(event)
@@ -155,11 +123,7 @@ class OnProcessIO(OnActionEventBase):
 class OnProcessStart(OnActionEventBase):
 
     def __init__(
-        self, *, target_action: SomeTarget = None,
-        on_start: Union[
-            SomeEntitiesType,
-            Callable[[ProcessStarted, LaunchContext], Optional[SomeEntitiesType]]],
-        **kwargs: Any
+        self, *, target_action: SomeTarget = None, on_start: SomeReaction, **kwargs: Any
     ) -> None:
         from ..actions import ExecuteProcess
         super().__init__(
@@ -181,24 +145,12 @@ class OnIncludeLaunchDescription(EventHandler):
 
 class OnShutdown(BaseEventHandler):
 
-    def __init__(
-        self, *,
-        on_shutdown: Union[
-            SomeEntitiesType, Callable[[Shutdown, LaunchContext], Optional[SomeEntitiesType]]],
-        **kwargs: Any
-    ) -> None:
+    def __init__(self, *, on_shutdown: SomeReaction, **kwargs: Any) -> None:
         super().__init__(matcher=lambda event: is_a_subclass(event, Shutdown), **kwargs)
         self.__on_shutdown = on_shutdown
 
-    def handle(self, event: Event, context: LaunchContext) -> Optional[SomeEntitiesType]:
+    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
         super().handle(event, context)
         if callable(self.__on_shutdown):
-            return self.__on_shutdown(cast(Shutdown, event), context)
+            return self.__on_shutdown(event, context)
         return self.__on_shutdown
-
-    @property
-    def handler_description(self) -> str:
-        return str(self.__on_shutdown)
-
-
-alias_submodules(__name__, __all__, on_action_event_base=('OnActionEventBase',))

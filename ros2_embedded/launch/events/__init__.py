@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Callable
 
-from .._aliases import alias_submodules
 from .._base import Action, Event
-from . import process
-
-__all__ = [
-    'matches_action', 'process', 'ExecutionComplete', 'IncludeLaunchDescription', 'Shutdown',
-    'TimerEvent']
+from . import process as process
 
 
 class ExecutionComplete(Event):
     """An action, and what its future stands for, has been executed."""
-
-    name = 'launch.events.ExecutionComplete'
 
     def __init__(self, *, action: Action) -> None:
         self.action = action
@@ -25,16 +18,12 @@ class ExecutionComplete(Event):
 class IncludeLaunchDescription(Event):
     """A launch description is to be visited."""
 
-    name = 'launch.events.IncludeLaunchDescription'
-
     def __init__(self, launch_description: Any) -> None:
         self.launch_description = launch_description
 
 
 class Shutdown(Event):
     """The launch is to end; a SIGINT, as a terminal sends it, reaches the processes too."""
-
-    name = 'launch.events.Shutdown'
 
     def __init__(self, *, reason: str = 'reason not given', due_to_sigint: bool = False) -> None:
         self.reason = reason
@@ -44,14 +33,9 @@ class Shutdown(Event):
 class TimerEvent(Event):
     """A timer's period has passed."""
 
-    name = 'launch.events.TimerEvent'
-
     def __init__(self, *, timer_action: Any) -> None:
         self.timer_action = timer_action
 
 
 def matches_action(target_action: Action) -> Callable[[Action], bool]:
     return lambda action: action == target_action
-
-
-alias_submodules(__name__, __all__, matchers=('matches_action',))

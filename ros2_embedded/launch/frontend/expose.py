@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import Any, Callable, Dict, Iterable, Optional, TYPE_CHECKING, TypeVar
+from typing import Any, Callable, Iterable, TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from .._base import Action, SomeSubstitutionsType, Substitution
@@ -13,31 +13,40 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-action_parse_methods: Dict[str, Callable[..., Any]] = {}
-substitution_parse_methods: Dict[str, Callable[..., Any]] = {}
+action_parse_methods: dict[str, Callable[..., Any]] = {}
+substitution_parse_methods: dict[str, Callable[..., Any]] = {}
+#: What ROS 2 has and this hasn't.
+_LACKING = {'action': 'ros_timer set_use_sim_time', 'substitution':
+            'all anon any if launch_log_dir log_dir param'}
+
+
+def _parse(kind: str, methods: dict[str, Any], name: str, unknown: str, *args: Any) -> Any:
+    if name in methods:
+        return methods[name](*args)
+    if name in _LACKING[kind].split():
+        from rclpy.exceptions import NotEmbeddedError
+        raise NotEmbeddedError(f"the {kind} '{name}' in launch files")
+    raise RuntimeError(f'{unknown}: {name}')
 
 
 def instantiate_action(entity: Entity, parser: Parser) -> Action:
-    if entity.type_name not in action_parse_methods:
-        raise RuntimeError(f'Unrecognized entity of the type: {entity.type_name}')
-    action_type, kwargs = action_parse_methods[entity.type_name](entity, parser)
+    action_type, kwargs = _parse(
+        'action', action_parse_methods, entity.type_name, 'Unrecognized entity of the type',
+        entity, parser)
     action: Action = action_type(**kwargs)
     return action
 
 
 def instantiate_substitution(
-    type_name: str, args: Optional[Iterable[SomeSubstitutionsType]] = None
+    type_name: str, args: Iterable[SomeSubstitutionsType] | None = None
 ) -> Substitution:
-    if type_name not in substitution_parse_methods:
-        raise RuntimeError(f'Unknown substitution: {type_name}')
-    substitution_type, kwargs = substitution_parse_methods[type_name](args or [])
-    # Substitutions of any number of arguments can't take them by keyword.
-    positional = kwargs.pop('args', ())
-    substitution: Substitution = substitution_type(*positional, **kwargs)
+    substitution_type, kwargs = _parse(
+        'substitution', substitution_parse_methods, type_name, 'Unknown substitution', args or [])
+    substitution: Substitution = substitution_type(**kwargs)
     return substitution
 
 
-def _expose(name: str, methods: Dict[str, Any], kind: str) -> Callable[[T], T]:
+def _expose(name: str, methods: dict[str, Any], kind: str) -> Callable[[T], T]:
     def decorate(exposed: T) -> T:
         parse: Any = exposed
         if inspect.isclass(exposed):
@@ -45,10 +54,6 @@ def _expose(name: str, methods: Dict[str, Any], kind: str) -> Callable[[T], T]:
             if not inspect.ismethod(parse):
                 raise RuntimeError(
                     "Did not find a class method called 'parse' in the class being decorated.")
-        elif not inspect.isfunction(exposed):
-            raise RuntimeError(
-                f'Exposed {kind} parser for {name} is not a callable or a class containing a '
-                'parse method')
         if name in methods and getattr(methods[name], '__wrapped__', methods[name]) != parse:
             raise RuntimeError(f'Two {kind} parsing methods exposed with the same name: [{name}].')
 

@@ -8,10 +8,9 @@ space; one in single or double quotes may contain spaces and parentheses.
 from __future__ import annotations
 
 import re
-from typing import Any, List, NoReturn, Optional
+from typing import Any, NoReturn
 
 from .._base import Substitution
-from ..utilities.type_utils import NormalizedValueType, StrSomeValueType
 from .expose import instantiate_substitution
 
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_-]*')
@@ -28,19 +27,19 @@ class _Reader:
         self.__text = text
         self.__at = 0
 
-    def read_all(self) -> List[Substitution]:
+    def read_all(self) -> list[Substitution]:
         parts = self.__parts(_TEXT, '')
         if self.__at < len(self.__text):
             self.__refuse()
         return parts
 
-    def __parts(self, pattern: str, quote: str) -> List[Substitution]:
-        parts: List[Substitution] = []
+    def __parts(self, pattern: str, quote: str) -> list[Substitution]:
+        parts: list[Substitution] = []
         while (part := self.__substitution(quote) or self.__plain(pattern, quote)) is not None:
             parts.append(part)
         return parts
 
-    def __substitution(self, quote: str) -> Optional[Substitution]:
+    def __substitution(self, quote: str) -> Substitution | None:
         if not self.__text.startswith('$(', self.__at):
             return None
         self.__at += 2
@@ -48,14 +47,14 @@ class _Reader:
         if name is None:
             self.__refuse()
         self.__at = name.end()
-        arguments: List[List[Substitution]] = []
+        arguments: list[list[Substitution]] = []
         while self.__skip(' '):
             arguments.append(self.__argument(quote))
         if not self.__skip(')'):
             self.__refuse()
         return instantiate_substitution(name.group(), arguments or None)
 
-    def __argument(self, quote: str) -> List[Substitution]:
+    def __argument(self, quote: str) -> list[Substitution]:
         for mark in '\'"' if not quote else '':
             if self.__skip(mark):
                 parts = self.__parts(_TEXT, mark)
@@ -64,7 +63,7 @@ class _Reader:
                 return parts
         return self.__parts(_WORD, quote) or self.__refuse()
 
-    def __plain(self, pattern: str, quote: str) -> Optional[Substitution]:
+    def __plain(self, pattern: str, quote: str) -> Substitution | None:
         from ..substitutions import TextSubstitution
         if quote:
             # The other quote is a character like any other in here.
@@ -91,7 +90,7 @@ def replace_escaped_characters(data: str) -> str:
     return re.sub(r'\\(.)', r'\1', data)
 
 
-def parse_substitution(string_value: str) -> List[Substitution]:
+def parse_substitution(string_value: str) -> list[Substitution]:
     """
     Return the substitutions that a text consists of.
 
@@ -104,7 +103,7 @@ def parse_substitution(string_value: str) -> List[Substitution]:
     return _Reader(string_value).read_all()
 
 
-def parse_if_substitutions(value: StrSomeValueType) -> NormalizedValueType:
+def parse_if_substitutions(value: Any) -> Any:
     """
     Return texts in the value as substitutions, unless they are plain.
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import traceback
-from typing import Any, Dict, Iterable, List, Optional, Set, Tuple, Type, TYPE_CHECKING
+from typing import Any, Iterable, TYPE_CHECKING
 import warnings
 
-from .._base import Action, InvalidLaunchFileError, Substitution
+from .._base import Action, InvalidLaunchFileError
 from .expose import instantiate_action
 from .parse_substitution import (
     parse_if_substitutions,
@@ -24,16 +24,15 @@ class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
     pass
 
 
-def _load_entry_points(group: str, kind: str) -> Dict[str, Any]:
-    from ros2cli.entry_points import get_entry_points
+def _load_entry_points(group: str, kind: str) -> dict[str, Any]:
+    from importlib.metadata import entry_points
     loaded = {}
-    for name, entry_point in get_entry_points(group).items():
+    for entry_point in entry_points(group=group):
         try:
-            loaded[name] = entry_point.load()
+            loaded[entry_point.name] = entry_point.load()
         except Exception:  # noqa: BLE001 - Another's module must not end this launch.
-            warnings.warn(
-                f'Failed to load the {kind} extension: {name}\n{traceback.format_exc()}',
-                stacklevel=2)
+            warnings.warn(f'Failed to load the {kind} extension: {entry_point.name}\n'
+                          f'{traceback.format_exc()}', stacklevel=2)
     return loaded
 
 
@@ -46,7 +45,7 @@ class Parser:
     """
 
     extensions_loaded = False
-    frontend_parsers: Optional[Dict[str, Type[Parser]]] = None
+    frontend_parsers: dict[str, type[Parser]] | None = None
 
     @classmethod
     def load_launch_extensions(cls) -> None:
@@ -57,12 +56,7 @@ class Parser:
             _load_entry_points('launch.frontend.launch_extension', 'launch')
 
     @classmethod
-    def load_parser_implementations(cls) -> None:
-        """Import, once, all parsers."""
-        cls._parsers()
-
-    @classmethod
-    def _parsers(cls) -> Dict[str, Type[Parser]]:
+    def _parsers(cls) -> dict[str, type[Parser]]:
         if Parser.frontend_parsers is None:
             import launch_xml
             import launch_yaml
@@ -75,14 +69,9 @@ class Parser:
         self.load_launch_extensions()
         return instantiate_action(entity, self)
 
-    def parse_substitution(self, value: str) -> List[Substitution]:
-        return parse_substitution(value)
-
-    def parse_if_substitutions(self, value: Any) -> Any:
-        return parse_if_substitutions(value)
-
-    def escape_characters(self, value: str) -> str:
-        return replace_escaped_characters(value)
+    parse_substitution = staticmethod(parse_substitution)
+    parse_if_substitutions = staticmethod(parse_if_substitutions)
+    escape_characters = staticmethod(replace_escaped_characters)
 
     def parse_description(self, entity: Entity) -> LaunchDescription:
         from ..launch_description import LaunchDescription
@@ -106,15 +95,11 @@ class Parser:
         return bool(cls.get_parsers_from_filename(filename))
 
     @classmethod
-    def get_parsers_from_filename(cls, filename: str) -> List[Type[Parser]]:
+    def get_parsers_from_filename(cls, filename: str) -> list[type[Parser]]:
         return [parser for parser in cls._parsers().values() if parser.may_parse(filename)]
 
     @classmethod
-    def get_file_extensions_from_parsers(cls) -> Set[str]:
-        return {end for parser in cls._parsers().values() for end in parser.get_file_extensions()}
-
-    @classmethod
-    def load(cls, file: Any) -> Tuple[Entity, Parser]:
+    def load(cls, file: Any) -> tuple[Entity, Parser]:
         """
         Read a file, by path or open, with the parsers that claim it, then with all others.
 
@@ -126,7 +111,7 @@ class Parser:
                 return cls.load(opened)
         name = getattr(file, 'name', '')
         claiming = cls.get_parsers_from_filename(name)
-        errors: List[Exception] = []
+        errors: list[Exception] = []
         for parser in [*claiming, *(p for p in cls._parsers().values() if p not in claiming)]:
             try:
                 return parser.load(file)
@@ -137,6 +122,6 @@ class Parser:
         raise InvalidFrontendLaunchFileError(extension, likely_errors=errors)
 
     @classmethod
-    def get_file_extensions(cls) -> Set[str]:
+    def get_file_extensions(cls) -> set[str]:
         """Return how the names of this parser's files end, without the dot."""
         return set()

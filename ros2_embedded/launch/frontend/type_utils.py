@@ -2,7 +2,7 @@
 """The elements of launch files, whatever the format, and types as they name them."""
 from __future__ import annotations
 
-from typing import Any, List, Optional
+from typing import Any, List
 
 from ..utilities.type_utils import is_typing_list
 
@@ -15,11 +15,11 @@ class Entity:
         raise NotImplementedError()
 
     @property
-    def parent(self) -> Optional[Entity]:
+    def parent(self) -> Entity | None:
         raise NotImplementedError()
 
     @property
-    def children(self) -> List[Entity]:
+    def children(self) -> list[Entity]:
         raise NotImplementedError()
 
     def get_attr(

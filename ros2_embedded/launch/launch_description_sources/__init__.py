@@ -5,20 +5,13 @@ from __future__ import annotations
 from importlib.machinery import SourceFileLoader
 import os
 from types import ModuleType
-from typing import Callable, cast, List, Type
+from typing import Callable
 
-from .._aliases import alias_submodules
-from .._base import InvalidLaunchFileError, SomeSubstitutionsType
-from ..frontend import InvalidFrontendLaunchFileError, Parser
+from .._base import InvalidLaunchFileError as InvalidLaunchFileError
+from .._base import SomeSubstitutionsType
+from ..frontend import InvalidFrontendLaunchFileError as InvalidFrontendLaunchFileError
+from ..frontend import Parser
 from ..launch_description import LaunchDescription, LaunchDescriptionSource
-
-__all__ = [
-    'get_launch_description_from_any_launch_file',
-    'get_launch_description_from_python_launch_file',
-    'get_launch_description_from_frontend_launch_file', 'InvalidFrontendLaunchFileError',
-    'InvalidLaunchFileError', 'InvalidPythonLaunchFileError',
-    'load_python_launch_file_as_module', 'AnyLaunchDescriptionSource',
-    'FrontendLaunchDescriptionSource', 'PythonLaunchDescriptionSource']
 
 
 class InvalidPythonLaunchFileError(Exception):
@@ -43,25 +36,26 @@ def get_launch_description_from_python_launch_file(
         raise InvalidPythonLaunchFileError(
             f"launch file at '{python_launch_file_path}' does not contain the required function "
             "'generate_launch_description()'")
-    return cast(LaunchDescription, module.generate_launch_description())
+    description: LaunchDescription = module.generate_launch_description()
+    return description
 
 
 def get_launch_description_from_frontend_launch_file(
-    frontend_launch_file_path: str, *, parser: Type[Parser] = Parser
+    frontend_launch_file_path: str, *, parser: type[Parser] = Parser
 ) -> LaunchDescription:
     entity, reader = parser.load(frontend_launch_file_path)
     return reader.parse_description(entity)
 
 
 def get_launch_description_from_any_launch_file(
-    launch_file_path: str, *, parser: Type[Parser] = Parser
+    launch_file_path: str, *, parser: type[Parser] = Parser
 ) -> LaunchDescription:
     """
     Return what a launch file describes.
 
     :raises InvalidLaunchFileError: if nothing can read it.
     """
-    loaders: List[Callable[[str], LaunchDescription]] = [
+    loaders: list[Callable[[str], LaunchDescription]] = [
         get_launch_description_from_frontend_launch_file,
         get_launch_description_from_python_launch_file]
     name = os.path.basename(launch_file_path)
@@ -70,7 +64,7 @@ def get_launch_description_from_any_launch_file(
         loaders.reverse()
     elif not Parser.is_filename_valid(name):
         extension = ''
-    errors: List[Exception] = []
+    errors: list[Exception] = []
     for load in loaders:
         try:
             return load(launch_file_path)
@@ -92,7 +86,7 @@ class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
 
     def __init__(
         self, launch_file_path: SomeSubstitutionsType, *,
-        method: str = 'interpreted frontend launch file', parser: Type[Parser] = Parser
+        method: str = 'interpreted frontend launch file', parser: type[Parser] = Parser
     ) -> None:
         super().__init__(None, launch_file_path, method)
         self._parser = parser
@@ -108,6 +102,3 @@ class PythonLaunchDescriptionSource(LaunchDescriptionSource):
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
         return get_launch_description_from_python_launch_file(location)
-
-
-alias_submodules(__name__, __all__[-3:])

@@ -10,19 +10,18 @@ import datetime
 import logging
 import os
 import sys
-from typing import Any, Dict, List, Mapping, Optional, Set, Tuple
+from typing import Any
 import warnings
 
 from . import handlers
 
 __all__ = ['get_logger', 'get_output_loggers', 'handlers', 'launch_config', 'reset']
 
-_SCREEN_FORMATS = {
-    'default': '[{levelname}] [{name}]: {msg}',
-    'default_with_timestamp': '{created:.7f} [{levelname}] [{name}]: {msg}',
+_FORMATS = {
+    'SCREEN': '[{levelname}] [{name}]: {msg}',
+    'LOG': '{created:.7f} [{levelname}] [{name}]: {msg}',
 }
-_LOG_FORMATS = {'default': _SCREEN_FORMATS['default_with_timestamp']}
-_OUTPUTS: Dict[str, Dict[str, Set[str]]] = {
+_OUTPUTS = {
     'screen': {'both': {'screen'}},
     'log': {'both': {'log'}, 'stderr': {'screen'}},
     'both': {'both': {'log', 'screen'}},
@@ -56,37 +55,26 @@ def _make_log_dir(base: str) -> str:
         return directory
 
 
-def _make_formatter(
-    text: Optional[str], style: Optional[str], named: Mapping[str, str], kind: str
-) -> Optional[logging.Formatter]:
-    override = os.environ.get(f'OVERRIDE_LAUNCH_{kind.upper()}_FORMAT')
-    if override:
-        text, style = override.encode('latin1').decode('unicode_escape'), '{'
-    elif text in named and text is not None:
-        if style is not None:
-            raise ValueError(
-                f'Cannot set a custom format style for the "{text}" {kind} format.')
-        text = named[text]
-    if text is None:
-        return None
-    return logging.Formatter(text, style=style or '{')  # type: ignore[arg-type]
+def _formatter(kind: str) -> logging.Formatter:
+    """Make the formatter for 'SCREEN' or 'LOG', as the environment wants it."""
+    override = os.environ.get(f'OVERRIDE_LAUNCH_{kind}_FORMAT', '')
+    text = override.encode('latin1').decode('unicode_escape') or _FORMATS[kind]
+    return logging.Formatter(text, style='{')
 
 
 class LaunchConfig:
-    """Where launch logs to, how, and from which level on."""
+    """Where launch logs to, and from which level on."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget directory, handlers and formats."""
-        self._log_dir: Optional[str] = None
-        self.file_handlers: Dict[str, Any] = {}
+        """Forget directory and handlers."""
+        self._log_dir: str | None = None
+        self.file_handlers: dict[str, Any] = {}
         self.screen_handler: Any = None
         self.log_handler_factory: Any = handlers.WatchedFileHandler
-        logging.root.setLevel(logging.INFO)
-        self.set_screen_format('default')
-        self.set_log_format('default')
+        self.level = logging.INFO
 
     @property
     def level(self) -> int:
@@ -104,39 +92,16 @@ class LaunchConfig:
         return self._log_dir
 
     @log_dir.setter
-    def log_dir(self, new_log_dir: Optional[str]) -> None:
-        if new_log_dir is not None:
-            if self.file_handlers:
-                warnings.warn(
-                    'Loggers have been already configured to output to log files below '
-                    f'{self._log_dir}. Proceed at your own risk.', stacklevel=2)
-            if not os.path.isdir(new_log_dir):
-                raise ValueError(f'{new_log_dir} is not a directory')
+    def log_dir(self, new_log_dir: str | None) -> None:
+        if new_log_dir is not None and not os.path.isdir(new_log_dir):
+            raise ValueError(f'{new_log_dir} is not a directory')
         self._log_dir = new_log_dir
-
-    def set_screen_format(
-        self, screen_format: Optional[str], *, screen_style: Optional[str] = None
-    ) -> None:
-        """Set the screen's format: 'default', 'default_with_timestamp' or a text."""
-        self.screen_formatter = _make_formatter(
-            screen_format, screen_style, _SCREEN_FORMATS, 'screen')
-        if self.screen_handler is not None and self.screen_formatter is not None:
-            self.screen_handler.setFormatter(self.screen_formatter)
 
     def get_screen_handler(self) -> Any:
         if self.screen_handler is None:
             self.screen_handler = handlers.StreamHandler(_Screen())
-            self.screen_handler.setFormatter(self.screen_formatter)
+            self.screen_handler.setFormatter(_formatter('SCREEN'))
         return self.screen_handler
-
-    def set_log_format(
-        self, log_format: Optional[str], *, log_style: Optional[str] = None
-    ) -> None:
-        """Set the log files' format: 'default' or a text."""
-        self.file_formatter = _make_formatter(log_format, log_style, _LOG_FORMATS, 'log')
-        if self.file_formatter is not None:
-            for handler in self.file_handlers.values():
-                handler.setFormatter(self.file_formatter)
 
     def get_log_file_path(self, file_name: str = 'launch.log') -> str:
         return os.path.join(self.log_dir, file_name)
@@ -145,7 +110,7 @@ class LaunchConfig:
         if file_name not in self.file_handlers:
             handler = self.log_handler_factory(
                 self.get_log_file_path(file_name), encoding='utf-8')
-            handler.setFormatter(self.file_formatter)
+            handler.setFormatter(_formatter('LOG'))
             self.file_handlers[file_name] = handler
         return self.file_handlers[file_name]
 
@@ -174,7 +139,7 @@ def log_launch_config(*, logger: logging.Logger = logging.root) -> None:
     logger.info(f'Default logging verbosity is set to {level}')
 
 
-def get_logger(name: Optional[str] = None) -> logging.Logger:
+def get_logger(name: str | None = None) -> logging.Logger:
     """Return the logger of that name, with the screen's and the main log file's handlers."""
     logger = logging.getLogger(name)
     _add(logger, launch_config.get_screen_handler())
@@ -182,15 +147,15 @@ def get_logger(name: Optional[str] = None) -> logging.Logger:
     return logger
 
 
-def _add(logger: logging.Logger, handler: Any, own_format: Optional[str] = None) -> None:
+def _add(logger: logging.Logger, handler: Any, own_format: str | None = None) -> None:
     if handler not in logger.handlers:
         logger.addHandler(handler)
         if own_format is not None:
             handler.setFormatterFor(logger, logging.Formatter(own_format, style='{'))
 
 
-def _normalize_output_configuration(config: Any) -> Dict[str, Set[str]]:
-    normalized: Dict[str, Set[str]] = {'both': set(), 'stdout': set(), 'stderr': set()}
+def _normalize_output_configuration(config: Any) -> dict[str, set[str]]:
+    normalized: dict[str, set[str]] = {'both': set(), 'stdout': set(), 'stderr': set()}
     if isinstance(config, str):
         if config not in _OUTPUTS:
             raise ValueError(
@@ -199,20 +164,18 @@ def _normalize_output_configuration(config: Any) -> Dict[str, Set[str]]:
     if not isinstance(config, dict):
         raise ValueError(f'{config} is not a valid output configuration')
     for source, destinations in config.items():
-        if source not in normalized:
+        wanted = {destinations} if isinstance(destinations, str) else set(destinations)
+        if source not in normalized or not wanted <= {'screen', 'log', 'own_log'}:
             raise ValueError(
-                f'{source} is not a valid output source i.e. "stdout", "stderr" or "both"')
-        normalized[source] = {destinations} if isinstance(destinations, str) else set(destinations)
-        for destination in normalized[source] - {'screen', 'log', 'own_log'}:
-            raise ValueError(
-                f'{destination} is not a valid output destination '
-                'i.e. "screen", "log" or "own_log"')
+                f'{source}: {destinations} is not a valid output source i.e. "stdout", "stderr" '
+                'or "both", with a valid output destination i.e. "screen", "log" or "own_log"')
+        normalized[source] = wanted
     return normalized
 
 
 def get_output_loggers(
     process_name: str, output_config: Any
-) -> Tuple[logging.Logger, logging.Logger]:
+) -> tuple[logging.Logger, logging.Logger]:
     """
     Return the loggers for a process's standard output and standard error.
 
@@ -221,7 +184,7 @@ def get_output_loggers(
     :raises ValueError: for anything else.
     """
     config = _normalize_output_configuration(output_config)
-    loggers: List[logging.Logger] = []
+    loggers: list[logging.Logger] = []
     for source in ('stdout', 'stderr'):
         logger = logging.getLogger(f'{process_name}-{source}')
         loggers.append(logger)
@@ -240,7 +203,7 @@ def get_output_loggers(
 class LaunchLogger(logging.getLoggerClass()):  # type: ignore[misc]
     """A logger that handles its own records only."""
 
-    all_loggers: List[logging.Logger] = []
+    all_loggers: list[logging.Logger] = []
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -2,26 +2,21 @@
 """The handlers of :mod:`logging`, each able to format some loggers' records differently."""
 import logging
 import logging.handlers
-from typing import Any, Dict, Type, Union
+from typing import Any
 
 
 class _PerLoggerFormatting:
 
-    def setFormatterFor(
-        self, logger: Union[str, logging.Logger], formatter: logging.Formatter
-    ) -> None:
+    def setFormatterFor(self, logger: Any, formatter: logging.Formatter) -> None:
         """Format records of this logger, and of no other, with this formatter."""
         self.__dict__.setdefault('_formatters', {})[getattr(logger, 'name', logger)] = formatter
-
-    def unsetFormatterFor(self, logger: Union[str, logging.Logger]) -> None:
-        self.__dict__.get('_formatters', {}).pop(getattr(logger, 'name', logger), None)
 
     def format(self, record: logging.LogRecord) -> str:
         own = self.__dict__.get('_formatters', {}).get(record.name)
         return str(own.format(record) if own else super().format(record))  # type: ignore[misc]
 
 
-_classes: Dict[Type[logging.Handler], Any] = {}
+_classes: dict[type[logging.Handler], Any] = {}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,45 +6,38 @@ import collections.abc
 import importlib
 import math
 import os
-from typing import Any, Dict, Iterable, List, Optional, Sequence, Tuple, Type, Union
+from typing import Any, Iterable, Sequence
 
 import launch.logging
 
-from .._aliases import alias_submodules
+from .._aliases import lacking
 from .._base import SomeSubstitutionsType, Substitution
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
-from ..utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
 from ..utilities.type_utils import is_substitution, perform_typed_substitution
 
 __all__ = [
-    'AllSubstitution', 'AndSubstitution', 'AnySubstitution', 'AnonName', 'Command',
-    'EqualsSubstitution', 'EnvironmentVariable', 'FileContent', 'FindExecutable',
-    'IfElseSubstitution', 'LaunchConfiguration', 'LaunchLogDir', 'LocalSubstitution',
-    'NotSubstitution', 'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution',
-    'PythonExpression', 'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile',
-    'ThisLaunchFileDir']
+    'AndSubstitution', 'Command', 'EqualsSubstitution', 'EnvironmentVariable', 'FileContent',
+    'FindExecutable', 'LaunchConfiguration', 'LocalSubstitution', 'NotSubstitution',
+    'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution', 'PythonExpression',
+    'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile', 'ThisLaunchFileDir']
+__getattr__ = lacking(__name__, 'AllSubstitution AnonName AnySubstitution BooleanSubstitution '
+                                'IfElseSubstitution LaunchLogDir')
 
-Parsed = Tuple[Type[Any], Dict[str, Any]]
-Substitutions = List[Substitution]
+Parsed = tuple[type[Any], dict[str, Any]]
+Substitutions = list[Substitution]
 
 
 class SubstitutionFailure(RuntimeError):
     """A substitution has no value in this context."""
-
-    def __init__(self, msg: Any) -> None:
-        super().__init__(msg)
 
 
 def described(substitutions: Iterable[Substitution]) -> str:
     return ' + '.join(sub.describe() for sub in substitutions)
 
 
-def normalized_default(default: Any) -> Optional[Substitutions]:
+def normalized_default(default: Any) -> Substitutions | None:
     """Return a default of any type as substitutions; None stays None."""
     if default is None:
         return None
@@ -58,7 +51,9 @@ class ParsedSubstitution(Substitution):
     """Base of those that launch files write as ``$(name argument ...)``."""
 
     #: The parameters that the arguments are for; a question mark where they may be absent.
-    _parameters: Tuple[str, ...] = ()
+    _parameters: tuple[str, ...] = ()
+    #: What it is called in descriptions, if not by its class's name.
+    _label = ''
 
     @classmethod
     def parse(cls, data: Sequence[SomeSubstitutionsType]) -> Parsed:
@@ -74,11 +69,14 @@ class ParsedSubstitution(Substitution):
                 f'arguments, got {len(data)}')
         return cls, {name.rstrip('?'): value for name, value in zip(cls._parameters, data)}
 
+    def describe(self) -> str:
+        shown = [described(getattr(self, name)) for name in self._parameters if name[-1] != '?']
+        return f"{self._label or type(self).__name__}({', '.join(shown)})"
+
 
 class TextSubstitution(Substitution):
 
     def __init__(self, *, text: str) -> None:
-        super().__init__()
         if not isinstance(text, str):
             raise TypeError(f"TextSubstitution expected Text object got '{type(text)}' instead.")
         self.text = text
@@ -95,14 +93,11 @@ class LaunchConfiguration(ParsedSubstitution):
     """The value of a launch configuration, or the default."""
 
     _parameters = ('variable_name', 'default?')
+    _label = 'LaunchConfig'
 
     def __init__(self, variable_name: SomeSubstitutionsType, *, default: Any = None) -> None:
-        super().__init__()
         self.variable_name = normalize_to_list_of_substitutions(variable_name)
         self.__default = normalized_default(default)
-
-    def describe(self) -> str:
-        return f'LaunchConfig({described(self.variable_name)})'
 
     def perform(self, context: LaunchContext) -> str:
         name = perform_substitutions(context, self.variable_name)
@@ -119,17 +114,14 @@ class EnvironmentVariable(ParsedSubstitution):
     """The value of an environment variable, or the default."""
 
     _parameters = ('name', 'default_value?')
+    _label = 'EnvVar'
 
     def __init__(
         self, name: SomeSubstitutionsType, *,
-        default_value: Optional[SomeSubstitutionsType] = None
+        default_value: SomeSubstitutionsType | None = None
     ) -> None:
-        super().__init__()
         self.name = normalize_to_list_of_substitutions(name)
         self.default_value = normalized_default(default_value)
-
-    def describe(self) -> str:
-        return f'EnvVar({described(self.name)})'
 
     def perform(self, context: LaunchContext) -> str:
         name = perform_substitutions(context, self.name)
@@ -143,9 +135,7 @@ class EnvironmentVariable(ParsedSubstitution):
 class LocalSubstitution(Substitution):
     """The value of an expression over the context's local variables."""
 
-    def __init__(self, expression: str, description: Optional[str] = None) -> None:
-        super().__init__()
-        ensure_argument_type(expression, str, 'expression', 'LocalSubstitution')
+    def __init__(self, expression: str, description: str | None = None) -> None:
         self.expression = expression
         self.description = description
 
@@ -159,7 +149,7 @@ class LocalSubstitution(Substitution):
 
 class PathJoinSubstitution(Substitution):
 
-    def __init__(self, substitutions: Iterable[Union[str, Substitution]]) -> None:
+    def __init__(self, substitutions: Iterable[str | Substitution]) -> None:
         self.substitutions = normalize_to_list_of_substitutions(substitutions)
 
     def describe(self) -> str:
@@ -169,52 +159,13 @@ class PathJoinSubstitution(Substitution):
         return os.path.join(*(sub.perform(context) for sub in self.substitutions))
 
 
-@expose_substitution('anon')
-class AnonName(ParsedSubstitution):
-    """The name with something unique behind it, the same throughout a launch."""
-
-    _parameters = ('name',)
-
-    def __init__(self, name: SomeSubstitutionsType) -> None:
-        super().__init__()
-        self.name = normalize_to_list_of_substitutions(name)
-
-    def describe(self) -> str:
-        return f'AnonName({described(self.name)})'
-
-    def perform(self, context: LaunchContext) -> str:
-        name = perform_substitutions(context, self.name)
-        value: str = context.launch_configurations.setdefault(
-            'anon' + name, self.compute_name(name))
-        return value
-
-    def compute_name(self, id_value: str) -> str:
-        import random
-        unique = f'{id_value}_{os.uname().nodename}_{os.getpid()}_{random.getrandbits(63)}'
-        return unique.translate(str.maketrans('.-:', '___'))
-
-
-@expose_substitution('launch_log_dir')
-@expose_substitution('log_dir')
-class LaunchLogDir(ParsedSubstitution):
-
-    def describe(self) -> str:
-        return 'LaunchLogDir()'
-
-    def perform(self, context: LaunchContext) -> str:
-        return launch.logging.launch_config.log_dir
-
-
 @expose_substitution('filename')
 class ThisLaunchFile(ParsedSubstitution):
 
     _local = 'current_launch_file_path'
 
-    def describe(self) -> str:
-        return f'{type(self).__name__}()'
-
     def perform(self, context: LaunchContext) -> str:
-        value: Optional[str] = context.get_locals_as_dict().get(self._local)
+        value: str | None = context.get_locals_as_dict().get(self._local)
         if value is None:
             raise SubstitutionFailure(
                 f'{type(self).__name__} used outside of a launch file (in a script)')
@@ -241,12 +192,8 @@ class Command(ParsedSubstitution):
     def __init__(
         self, command: SomeSubstitutionsType, *, on_stderr: SomeSubstitutionsType = 'fail'
     ) -> None:
-        super().__init__()
         self.command = normalize_to_list_of_substitutions(command)
         self.on_stderr = normalize_to_list_of_substitutions(on_stderr)
-
-    def describe(self) -> str:
-        return f'Command({described(self.command)})'
 
     def perform(self, context: LaunchContext) -> str:
         import shlex
@@ -279,11 +226,7 @@ class FileContent(ParsedSubstitution):
     _parameters = ('path',)
 
     def __init__(self, path: SomeSubstitutionsType) -> None:
-        super().__init__()
         self.path = normalize_to_list_of_substitutions(path)
-
-    def describe(self) -> str:
-        return f"FileContent({', '.join(sub.describe() for sub in self.path)})"
 
     def perform(self, context: LaunchContext) -> str:
         path = perform_substitutions(context, self.path)
@@ -298,13 +241,10 @@ class FileContent(ParsedSubstitution):
 class FindExecutable(ParsedSubstitution):
 
     _parameters = ('name',)
+    _label = 'FindExec'
 
     def __init__(self, *, name: SomeSubstitutionsType) -> None:
-        super().__init__()
         self.name = normalize_to_list_of_substitutions(name)
-
-    def describe(self) -> str:
-        return f'FindExec({described(self.name)})'
 
     def perform(self, context: LaunchContext) -> str:
         import shutil
@@ -319,14 +259,11 @@ class PythonExpression(ParsedSubstitution):
     """The value of a Python expression over modules; over ``math``, its content too."""
 
     _parameters = ('expression', 'python_modules?')
+    _label = 'PythonExpr'
 
     def __init__(
         self, expression: SomeSubstitutionsType, python_modules: SomeSubstitutionsType = ('math',)
     ) -> None:
-        super().__init__()
-        types = (str, Substitution, collections.abc.Iterable)
-        ensure_argument_type(expression, types, 'expression', 'PythonExpression')
-        ensure_argument_type(python_modules, types, 'python_modules', 'PythonExpression')
         self.expression = normalize_to_list_of_substitutions(expression)
         self.python_modules = normalize_to_list_of_substitutions(python_modules)
 
@@ -338,12 +275,8 @@ class PythonExpression(ParsedSubstitution):
             kwargs['python_modules'] = [name.strip() for name in names.split(',')]
         return cls, kwargs
 
-    def describe(self) -> str:
-        modules = ', '.join(sub.describe() for sub in self.python_modules)
-        return f'PythonExpr({described(self.expression)}, [{modules}])'
-
     def perform(self, context: LaunchContext) -> str:
-        names: Dict[str, Any] = {}
+        names: dict[str, Any] = {}
         for sub in self.python_modules:
             module = importlib.import_module(context.perform_substitution(sub))
             if module is math:
@@ -369,11 +302,7 @@ class NotSubstitution(ParsedSubstitution):
     _parameters = ('value',)
 
     def __init__(self, value: SomeSubstitutionsType) -> None:
-        super().__init__()
         self.value = normalize_to_list_of_substitutions(value)
-
-    def describe(self) -> str:
-        return f'NotSubstitution({self.value})'
 
     def perform(self, context: LaunchContext) -> str:
         return _text(not _truth(context, self.value))
@@ -384,52 +313,21 @@ class AndSubstitution(ParsedSubstitution):
     """Whether both sides are true; both are evaluated."""
 
     _parameters = ('left', 'right')
+    _combine = staticmethod(all)
 
     def __init__(self, left: Any, right: Any) -> None:
-        super().__init__()
         self.left = normalize_to_list_of_substitutions(left)
         self.right = normalize_to_list_of_substitutions(right)
 
-    def describe(self) -> str:
-        return f'{type(self).__name__}({self.left} {self.right})'
-
     def perform(self, context: LaunchContext) -> str:
-        return _text(_truth(context, self.left) & _truth(context, self.right))
+        return _text(self._combine([_truth(context, self.left), _truth(context, self.right)]))
 
 
 @expose_substitution('or')
 class OrSubstitution(AndSubstitution):
     """Whether a side is true; both are evaluated."""
 
-    def perform(self, context: LaunchContext) -> str:
-        return _text(_truth(context, self.left) | _truth(context, self.right))
-
-
-@expose_substitution('any')
-class AnySubstitution(Substitution):
-
-    def __init__(self, *args: SomeSubstitutionsType) -> None:
-        super().__init__()
-        self.args = [normalize_to_list_of_substitutions(arg) for arg in args]
-
-    @classmethod
-    def parse(cls, data: Iterable[SomeSubstitutionsType]) -> Parsed:
-        return cls, {'args': data}
-
-    def describe(self) -> str:
-        return f"{type(self).__name__}({' '.join(str(arg) for arg in self.args)})"
-
-    def perform(self, context: LaunchContext) -> str:
-        truths = [_truth(context, arg) for arg in self.args]
-        return _text(any(truths))
-
-
-@expose_substitution('all')
-class AllSubstitution(AnySubstitution):
-
-    def perform(self, context: LaunchContext) -> str:
-        truths = [_truth(context, arg) for arg in self.args]
-        return _text(all(truths))
+    _combine = staticmethod(any)
 
 
 def _comparable(side: Any) -> Any:
@@ -462,33 +360,3 @@ class NotEqualsSubstitution(EqualsSubstitution):
 
     def perform(self, context: LaunchContext) -> str:
         return _text(super().perform(context) != 'true')
-
-
-@expose_substitution('if')
-class IfElseSubstitution(ParsedSubstitution):
-    """One value if the condition is true, else the other."""
-
-    _parameters = ('condition', 'if_value', 'else_value?')
-
-    def __init__(
-        self, condition: SomeSubstitutionsType, if_value: SomeSubstitutionsType = '',
-        else_value: SomeSubstitutionsType = ''
-    ) -> None:
-        super().__init__()
-        if if_value == '' and else_value == '':
-            raise RuntimeError('One of if_value and else_value must be specified')
-        self.condition = normalize_to_list_of_substitutions(condition)
-        self.if_value = normalize_to_list_of_substitutions(if_value)
-        self.else_value = normalize_to_list_of_substitutions(else_value)
-
-    def describe(self) -> str:
-        return f'IfElseSubstitution({self.condition}, {self.if_value}, {self.else_value})'
-
-    def perform(self, context: LaunchContext) -> str:
-        chosen = self.if_value if _truth(context, self.condition) else self.else_value
-        return perform_substitutions(context, chosen)
-
-
-alias_submodules(__name__, __all__, boolean_substitution=(
-    'AllSubstitution', 'AndSubstitution', 'AnySubstitution', 'NotSubstitution',
-    'OrSubstitution'))

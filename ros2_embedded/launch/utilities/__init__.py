@@ -3,69 +3,43 @@
 from __future__ import annotations
 
 import asyncio
-import collections.abc
 import inspect
-from typing import Any, cast, Iterable, List, Optional, Tuple, TYPE_CHECKING, Union
+from typing import Any, Iterable, TYPE_CHECKING
 
-from .._aliases import alias_submodules
-from .._base import (
-    Entities,
-    LaunchDescriptionEntity,
-    SomeEntitiesType,
-    SomeSubstitutionsType,
-    Substitution,
-)
+from .._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType, Substitution
 from .signal_management import AsyncSafeSignalManager
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
 
 __all__ = [
-    'is_a', 'is_a_subclass', 'isclassinstance', 'ensure_argument_type', 'perform_substitutions',
-    'AsyncSafeSignalManager', 'normalize_to_list_of_substitutions',
-    'normalize_to_list_of_entities', 'visit_all_entities_and_collect_futures']
-
-
-def isclassinstance(obj: object) -> bool:
-    return hasattr(obj, '__class__')
-
-
-def is_a(obj: object, entity_type: type) -> bool:
-    if not inspect.isclass(entity_type):
-        raise RuntimeError(f"entity_type '{obj}' is not a class")
-    return isinstance(obj, entity_type)
+    'AsyncSafeSignalManager', 'ensure_argument_type', 'is_a_subclass',
+    'normalize_to_list_of_entities', 'normalize_to_list_of_substitutions',
+    'perform_substitutions', 'visit_all_entities_and_collect_futures']
 
 
 def is_a_subclass(obj: object, entity_type: type) -> bool:
     """Say whether the object is an instance, or a subclass, of the class."""
-    return is_a(obj, entity_type) or (inspect.isclass(obj) and issubclass(obj, entity_type))
+    return isinstance(obj, entity_type) or (inspect.isclass(obj) and issubclass(obj, entity_type))
 
 
 def ensure_argument_type(
-    argument: object, types: Union[type, Iterable[type]], argument_name: str,
-    caller: Optional[str] = None
+    argument: object, types: type | Iterable[type], argument_name: str, caller: str | None = None
 ) -> None:
     """
     Refuse an argument of a wrong type.
 
     :raises TypeError: naming the caller, the argument and what was expected.
     """
-    def check(value: object, allowed: Tuple[type, ...], who: str, name: str) -> None:
-        if not isinstance(value, allowed):
-            expected = ', '.join(str(one) for one in allowed)
-            raise TypeError(
-                f"{who}xpected '{name}' to be one of [{expected}], but got '{value}' of type "
-                f"'{type(value)}'")
-
-    myself = "'ensure_argument_type()' e"
-    check(types, (type, collections.abc.Iterable), myself, 'types')
-    check(argument_name, (str,), myself, 'argument_name')
-    check(caller, (str, type(None)), myself, 'caller')
-    check(argument, (types,) if isinstance(types, type) else tuple(types),
-          f"'{caller}' e" if caller else 'E', argument_name)
+    allowed = (types,) if isinstance(types, type) else tuple(types)
+    if not isinstance(argument, allowed):
+        who = f"'{caller}' e" if caller else 'E'
+        raise TypeError(
+            f"{who}xpected '{argument_name}' to be one of [{', '.join(map(str, allowed))}], but "
+            f"got '{argument}' of type '{type(argument)}'")
 
 
-def normalize_to_list_of_entities(entities: Iterable[SomeEntitiesType]) -> Entities:
+def normalize_to_list_of_entities(entities: Iterable[Any]) -> Entities:
     """Return the entities with iterables among them laid out flat, one level deep."""
     flat: Entities = []
     for entity in entities:
@@ -73,19 +47,15 @@ def normalize_to_list_of_entities(entities: Iterable[SomeEntitiesType]) -> Entit
     return flat
 
 
-def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> List[Substitution]:
+def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> list[Substitution]:
     """
     Return substitutions, texts as TextSubstitution.
 
     :raises TypeError: for an item that is neither.
     """
     from ..substitutions import TextSubstitution
-    if isinstance(subs, str):
-        return [TextSubstitution(text=subs)]
-    if is_a_subclass(subs, Substitution):
-        return [cast(Substitution, subs)]
-    normalized: List[Substitution] = []
-    for item in cast(Iterable[Union[str, Substitution]], subs):
+    normalized: list[Substitution] = []
+    for item in [subs] if isinstance(subs, (str, Substitution)) else subs:
         if isinstance(item, str):
             item = TextSubstitution(text=item)
         elif not isinstance(item, Substitution):
@@ -102,7 +72,7 @@ def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) 
 
 def visit_all_entities_and_collect_futures(
     entity: LaunchDescriptionEntity, context: LaunchContext
-) -> List[Tuple[LaunchDescriptionEntity, asyncio.Future[Any]]]:
+) -> list[tuple[LaunchDescriptionEntity, asyncio.Future[Any]]]:
     """Visit the entity and, depth first, all that it yields; return what is to be waited for."""
     sub_entities = entity.visit(context)
     future = entity.get_asyncio_future()
@@ -110,8 +80,3 @@ def visit_all_entities_and_collect_futures(
     for sub_entity in sub_entities or ():
         futures += visit_all_entities_and_collect_futures(sub_entity, context)
     return futures
-
-
-alias_submodules(
-    __name__, (), class_tools_impl=('is_a', 'is_a_subclass', 'isclassinstance'),
-    **{f'{name}_impl': (name,) for name in __all__[3:] if name.islower()})

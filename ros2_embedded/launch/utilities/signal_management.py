@@ -6,7 +6,7 @@ import asyncio
 import os
 import signal
 import socket
-from typing import Any, Callable, Dict, Optional, Union
+from typing import Any, Callable
 
 
 class AsyncSafeSignalManager:
@@ -21,13 +21,13 @@ class AsyncSafeSignalManager:
     :raises ValueError: on entering outside of the main thread.
     """
 
-    __current: Optional[AsyncSafeSignalManager] = None
+    __current: AsyncSafeSignalManager | None = None
     __real_set_wakeup_fd = staticmethod(signal.set_wakeup_fd)
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.__loop = loop
-        self.__handlers: Dict[signal.Signals, Callable[[int], None]] = {}
-        self.__outer: Optional[AsyncSafeSignalManager] = None
+        self.__handlers: dict[int, Callable[[int], None]] = {}
+        self.__outer: AsyncSafeSignalManager | None = None
         self.__next_fd = -1
 
     def __enter__(self) -> AsyncSafeSignalManager:
@@ -67,21 +67,17 @@ class AsyncSafeSignalManager:
         except (BlockingIOError, InterruptedError):
             return
         for number in received:
-            handler = self.__handlers.get(signal.Signals(number))
+            handler = self.__handlers.get(number)
             if handler is not None:
                 handler(number)
         if self.__next_fd != -1:
             os.write(self.__next_fd, received)
 
     def handle(
-        self, signum: Union[signal.Signals, int], handler: Optional[Callable[[int], None]]
-    ) -> Optional[Callable[[int], None]]:
+        self, signum: int, handler: Callable[[int], None] | None
+    ) -> Callable[[int], None] | None:
         """Set what is called for a signal, None for nothing; return what it was."""
-        signum = signal.Signals(signum)
-        if handler is None:
-            return self.__handlers.pop(signum, None)
-        if not callable(handler):
-            raise ValueError('signal handler must be a callable')
-        previous = self.__handlers.get(signum)
-        self.__handlers[signum] = handler
+        previous = self.__handlers.pop(signum, None)
+        if handler is not None:
+            self.__handlers[signum] = handler
         return previous

@@ -1,40 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do with nodes."""
-from typing import NoReturn
+from launch._aliases import lacking
 
-from launch._aliases import alias_submodules
+from ._composition import ComposableNodeContainer as ComposableNodeContainer
+from ._composition import get_composable_node_load_request as get_composable_node_load_request
+from ._composition import LoadComposableNodes as LoadComposableNodes
+from ._lifecycle import LifecycleNode as LifecycleNode
+from ._settings import *  # noqa: F403
+from ._settings import PushROSNamespace as PushROSNamespace
+from .node import Node as Node
 
-from ._composition import (
-    ComposableNodeContainer,
-    get_composable_node_load_request,
-    LoadComposableNodes,
-)
-from ._lifecycle import LifecycleNode
-from ._settings import (
-    PushROSNamespace,
-    SetParameter,
-    SetParametersFromFile,
-    SetRemap,
-    SetROSLogDir,
-)
-from .node import Node
-
-# Its name before Jazzy.
-PushRosNamespace = PushROSNamespace
-
-__all__ = [
-    'ComposableNodeContainer', 'get_composable_node_load_request', 'LifecycleNode',
-    'LoadComposableNodes', 'Node', 'PushROSNamespace', 'PushRosNamespace',
-    'SetParameter', 'SetParametersFromFile', 'SetRemap', 'SetROSLogDir']
-
-alias_submodules(__name__, __all__, load_composable_nodes=(
-    'LoadComposableNodes', 'get_composable_node_load_request'))
-
-
-def __getattr__(name: str) -> NoReturn:
-    if name in ('LifecycleTransition', 'ROSTimer', 'RosTimer', 'SetUseSimTime'):
-        # Of an AttributeError an import statement wouldn't show the text.
-        raise ImportError(
-            f'{__name__}.{name} is not part of the embedded default: install ROS 2 '
-            '(https://docs.ros.org/en/jazzy/Installation.html) and use that instead')
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+PushRosNamespace = PushROSNamespace  # its name before Jazzy
+__getattr__ = lacking(__name__, 'LifecycleTransition ROSTimer RosTimer SetUseSimTime')

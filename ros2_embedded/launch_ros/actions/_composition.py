@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, List, Optional, Union
+from typing import Any, List
 
 from launch import (
     Action,
@@ -24,19 +24,13 @@ from launch.utilities import (
 from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import call_service, get_ros_node
-from ..utilities import (
-    add_node_name,
-    evaluate_parameters,
-    get_node_name_count,
-    make_namespace_absolute,
-    prefix_namespace,
-    to_parameters_list,
-)
+from ..utilities import evaluate_parameters, to_parameters_list
+from ..utilities.names import count_node_name, make_namespace_absolute, prefix_namespace
 from ..utilities.normalize_parameters import normalize_parameter_dict
 from .node import Node
 
 
-def _parse_nodes(entities: List[Entity], parser: Parser) -> List[ComposableNode]:
+def _parse_nodes(entities: list[Entity], parser: Parser) -> list[ComposableNode]:
     parsed = [ComposableNode.parse(parser, entity) for entity in entities]
     return [cls(**kwargs) for cls, kwargs in parsed]
 
@@ -47,14 +41,14 @@ class ComposableNodeContainer(Node):
 
     def __init__(
         self, *, name: SomeSubstitutionsType, namespace: SomeSubstitutionsType,
-        composable_node_descriptions: Optional[List[ComposableNode]] = None, **kwargs: Any
+        composable_node_descriptions: list[ComposableNode] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(name=name, namespace=namespace, **kwargs)
         self.__composable_node_descriptions = composable_node_descriptions
 
     @classmethod
     def parse(
-        cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
+        cls, entity: Entity, parser: Parser, ignore: list[str] | None = None
     ) -> ParsedAction:
         _, kwargs = super().parse(entity, parser, ignore)
         nodes = entity.get_attr('composable_node', data_type=List[Entity], optional=True)
@@ -62,7 +56,7 @@ class ComposableNodeContainer(Node):
             kwargs['composable_node_descriptions'] = _parse_nodes(nodes, parser)
         return cls, kwargs
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
         nodes = [
             node for node in self.__composable_node_descriptions or ()
             if (condition := node.condition()) is None or condition.evaluate(context)]
@@ -82,8 +76,8 @@ class LoadComposableNodes(Action):
     """
 
     def __init__(
-        self, *, composable_node_descriptions: List[ComposableNode],
-        target_container: Union[SomeSubstitutionsType, ComposableNodeContainer], **kwargs: Any
+        self, *, composable_node_descriptions: list[ComposableNode],
+        target_container: SomeSubstitutionsType | ComposableNodeContainer, **kwargs: Any
     ) -> None:
         ensure_argument_type(
             target_container, (*SomeSubstitutionsType_types_tuple, ComposableNodeContainer),
@@ -91,7 +85,7 @@ class LoadComposableNodes(Action):
         super().__init__(**kwargs)
         self.__composable_node_descriptions = composable_node_descriptions
         self.__target_container = target_container
-        self.__final_target_container_name: Optional[str] = None
+        self.__final_target_container_name: str | None = None
         self.__rclpy_load_node_client: Any = None
         self.__logger = launch.logging.get_logger(__name__)
 
@@ -115,20 +109,16 @@ class LoadComposableNodes(Action):
                 f"Failed to load node '{name}' of type '{request.plugin_name}' in container "
                 f"'{container}': {response.error_message}")
             return
-        add_node_name(context, name)
-        count = get_node_name_count(context, name)
-        if count > 1:
-            launch.logging.get_logger(container).warning(
-                f'there are now at least {count} nodes with the name {name} created within '
-                'this launch context')
+        if warning := count_node_name(context, name):
+            launch.logging.get_logger(container).warning(warning)
         self.__logger.info(
             f"Loaded node '{response.full_node_name}' in container '{container}'")
 
-    def _load_in_sequence(self, load_node_requests: List[Any], context: LaunchContext) -> None:
+    def _load_in_sequence(self, load_node_requests: list[Any], context: LaunchContext) -> None:
         for request in load_node_requests:
             self._load_node(request, context)
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
         if isinstance(self.__target_container, ComposableNodeContainer):
             container = self.__target_container.node_name
         else:
@@ -177,11 +167,11 @@ def get_composable_node_load_request(
     if remappings:
         request.remap_rules = remappings
 
-    def messages(parameters: List[Any]) -> List[Any]:
+    def messages(parameters: list[Any]) -> list[Any]:
         return [parameter.to_parameter_msg() for parameter in to_parameters_list(
             context, request.node_name, namespace, evaluate_parameters(context, parameters))]
 
-    parameters: List[Any] = [
+    parameters: list[Any] = [
         normalize_parameter_dict({given[0]: given[1]}) if isinstance(given, tuple)
         else ParameterFile(Path(given).resolve())
         for given in configurations.get('global_params', ())]

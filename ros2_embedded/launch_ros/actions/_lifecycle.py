@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, cast, List, Optional
+from typing import Any
 
 from launch import EventHandler, LaunchContext, LaunchDescriptionEntity, SomeSubstitutionsType
 from launch.actions import OpaqueFunction
@@ -28,13 +28,10 @@ class LifecycleNode(Node):
         self.__logger = launch.logging.get_logger(__name__)
         self.__rclpy_subscription: Any = None
         self.__rclpy_change_state_client: Any = None
-        self.__current_state = ChangeState.valid_states[0]
 
     def _on_transition_event(self, context: LaunchContext, msg: Any) -> None:
         # Called in the ROS node's thread.
         event = StateTransition(action=self, msg=msg)
-        self.__current_state = ChangeState.valid_states.get(
-            msg.goal_state.id, self.__current_state)
         loop = context.asyncio_loop
         if loop is not None:
             loop.call_soon_threadsafe(context.emit_event_sync, event)
@@ -49,7 +46,7 @@ class LifecycleNode(Node):
                 f"'{self.node_name}'")
 
     def _on_change_state_event(self, context: LaunchContext) -> None:
-        event = cast(ChangeState, context.locals.event)
+        event = context.locals.event
         if not event.lifecycle_node_matcher(self):
             return
         import lifecycle_msgs.srv
@@ -58,7 +55,7 @@ class LifecycleNode(Node):
         context.add_completion_future(context.asyncio_loop.run_in_executor(
             None, self._call_change_state, request, context))
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
         self._perform_substitutions(context)
         if self.UNSPECIFIED_NODE_NAME in self.node_name:
             raise RuntimeError('node_name unexpectedly incomplete for lifecycle node')

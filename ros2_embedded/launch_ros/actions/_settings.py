@@ -12,11 +12,12 @@ from launch.logging import _get_logging_directory
 from launch.substitutions import SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
-from ..parameters_type import ParameterName, ParameterValue, SomeParameterValue
-from ..utilities import make_namespace_absolute, prefix_namespace
 from ..utilities.evaluate_parameters import evaluate_parameter_dict
-from ..utilities.namespace_utils import check_namespace
+from ..utilities.names import check_namespace, make_namespace_absolute, prefix_namespace
 from ..utilities.normalize_parameters import normalize_parameter_dict
+
+__all__ = [
+    'PushROSNamespace', 'SetParameter', 'SetParametersFromFile', 'SetRemap', 'SetROSLogDir']
 
 
 @expose_action('push_ros_namespace')
@@ -57,20 +58,10 @@ class SetParameter(Action):
 
     _texts = {'name': 'name', 'value': 'value'}
 
-    def __init__(
-        self, name: SomeSubstitutionsType, value: SomeParameterValue, **kwargs: Any
-    ) -> None:
+    def __init__(self, name: SomeSubstitutionsType, value: Any, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.__param_dict = normalize_parameter_dict(
             {tuple(normalize_to_list_of_substitutions(name)): value})
-
-    @property
-    def name(self) -> ParameterName:
-        return next(iter(self.__param_dict))
-
-    @property
-    def value(self) -> ParameterValue:
-        return next(iter(self.__param_dict.values()))
 
     def execute(self, context: LaunchContext) -> None:
         values = evaluate_parameter_dict(context, self.__param_dict)

@@ -6,7 +6,7 @@ import atexit
 import os
 import pathlib
 from tempfile import NamedTemporaryFile
-from typing import Any, Dict, Iterable, List, Optional, Tuple
+from typing import Any, Iterable, List
 
 from launch import LaunchDescriptionEntity, SomeSubstitutionsType
 from launch._base import ParsedAction
@@ -25,40 +25,10 @@ from launch.utilities import (
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
 from ..parameters_type import Parameters, SomeParameters
-from ..remap_rule_type import RemapRule, SomeRemapRules
 from ..substitutions import ExecutableInPackage
-from ..utilities import (
-    add_node_name,
-    evaluate_parameters,
-    get_node_name_count,
-    make_namespace_absolute,
-    normalize_parameters,
-    normalize_remap_rules,
-    plugin_support,
-    prefix_namespace,
-)
-from ..utilities.namespace_utils import check_namespace, check_node_name
-
-
-class NodeActionExtension:
-    """Changes how nodes are executed; entry point group ``launch_ros.node_action``."""
-
-    NAME: Optional[str] = None
-    EXTENSION_POINT_VERSION = '0.1'
-
-    def __init__(self) -> None:
-        plugin_support.satisfies_version(self.EXTENSION_POINT_VERSION, '^0.1')
-
-    def prepare_for_execute(
-        self, context: LaunchContext, ros_specific_arguments: Dict[str, Any], node_action: Node
-    ) -> Tuple[List[Any], Dict[str, Any]]:
-        """Return further words for the command, and the arguments, changed at will."""
-        return [], ros_specific_arguments
-
-
-def _as_yaml(value: Any) -> str:
-    import yaml
-    return str(yaml.dump(value))
+from ..utilities import names
+from ..utilities.evaluate_parameters import evaluate_parameters
+from ..utilities.normalize_parameters import as_yaml, normalize_parameters
 
 
 @expose_action('node')
@@ -80,17 +50,14 @@ class Node(ExecuteProcess):
     UNSPECIFIED_NODE_NAMESPACE = '<node_namespace_unspecified>'
 
     def __init__(
-        self, *, executable: SomeSubstitutionsType,
-        package: Optional[SomeSubstitutionsType] = None,
-        name: Optional[SomeSubstitutionsType] = None,
-        namespace: Optional[SomeSubstitutionsType] = None,
-        exec_name: Optional[SomeSubstitutionsType] = None,
-        parameters: Optional[SomeParameters] = None,
-        remappings: Optional[SomeRemapRules] = None,
-        ros_arguments: Optional[Iterable[SomeSubstitutionsType]] = None,
-        arguments: Optional[Iterable[SomeSubstitutionsType]] = None, **kwargs: Any
+        self, *, executable: SomeSubstitutionsType, package: SomeSubstitutionsType | None = None,
+        name: SomeSubstitutionsType | None = None, namespace: SomeSubstitutionsType | None = None,
+        exec_name: SomeSubstitutionsType | None = None, parameters: SomeParameters | None = None,
+        remappings: Iterable[Any] | None = None,
+        ros_arguments: Iterable[SomeSubstitutionsType] | None = None,
+        arguments: Iterable[SomeSubstitutionsType] | None = None, **kwargs: Any
     ) -> None:
-        cmd: List[SomeSubstitutionsType] = [
+        cmd: list[SomeSubstitutionsType] = [
             executable if package is None else
             ExecutableInPackage(package=package, executable=executable)]
         cmd += arguments or ()
@@ -109,24 +76,18 @@ class Node(ExecuteProcess):
         self.__node_executable = executable
         self.__node_name = name
         self.__node_namespace = namespace
-        self.__remappings: List[RemapRule] = list(normalize_remap_rules(remappings or ()))
-        self.__ros_arguments = ros_arguments
-        self.__arguments = arguments
+        self.__remappings = list(names.normalize_remap_rules(remappings or ()))
         self.__expanded_node_name = self.UNSPECIFIED_NODE_NAME
         self.__expanded_node_namespace = self.UNSPECIFIED_NODE_NAMESPACE
-        self.__expanded_parameter_arguments: Optional[List[Tuple[str, bool]]] = None
-        self.__final_node_name: Optional[str] = None
-        self.__expanded_remappings: Optional[List[Tuple[str, str]]] = None
-        self.__substitutions_performed = False
+        self.__final_node_name: str | None = None
+        self.__expanded_remappings: list[tuple[str, str]] | None = None
         self.__logger = launch.logging.get_logger(__name__)
-        self.__extensions = plugin_support.get_extensions(
-            'launch_ros.node_action', self.__logger)
 
     @staticmethod
-    def parse_nested_parameters(params: List[Entity], parser: Parser) -> List[Any]:
+    def parse_nested_parameters(params: list[Entity], parser: Parser) -> list[Any]:
         """Return ``parameters`` from ``<param name= value=/>`` and ``<param from=/>``."""
-        def read_named(elements: List[Entity]) -> Dict[Any, Any]:
-            values: Dict[Any, Any] = {}
+        def read_named(elements: list[Entity]) -> dict[Any, Any]:
+            values: dict[Any, Any] = {}
             for element in elements:
                 name = tuple(parser.parse_substitution(element.get_attr('name')))
                 identifier = element.get_attr('type', data_type=None, optional=True)
@@ -149,7 +110,7 @@ class Node(ExecuteProcess):
                     raise RuntimeError('either a value attribute or nested params are needed')
             return values
 
-        parameters: List[Any] = []
+        parameters: list[Any] = []
         for param in params:
             file = param.get_attr('from', optional=True)
             allow_substs = param.get_attr('allow_substs', data_type=bool, optional=True)
@@ -171,7 +132,7 @@ class Node(ExecuteProcess):
 
     @classmethod
     def parse(
-        cls, entity: Entity, parser: Parser, ignore: Optional[List[str]] = None
+        cls, entity: Entity, parser: Parser, ignore: list[str] | None = None
     ) -> ParsedAction:
         _, kwargs = super().parse(entity, parser, ignore=['cmd', 'name', *(ignore or ())])
         for name, attribute in (('arguments', 'args'), ('ros_arguments', 'ros_args')):
@@ -185,7 +146,7 @@ class Node(ExecuteProcess):
         return cls, kwargs
 
     @property
-    def node_package(self) -> Optional[SomeSubstitutionsType]:
+    def node_package(self) -> SomeSubstitutionsType | None:
         return self.__package
 
     @property
@@ -203,7 +164,7 @@ class Node(ExecuteProcess):
         return self.__expanded_node_namespace
 
     @property
-    def expanded_remapping_rules(self) -> Optional[List[Tuple[str, str]]]:
+    def expanded_remapping_rules(self) -> list[tuple[str, str]] | None:
         """The pairs of names, global ones first, once substitutions are performed."""
         return self.__expanded_remappings
 
@@ -211,7 +172,7 @@ class Node(ExecuteProcess):
         return (self.UNSPECIFIED_NODE_NAME not in self.node_name
                 and self.UNSPECIFIED_NODE_NAMESPACE not in self.node_name)
 
-    def _create_params_file_from_dict(self, params: Dict[str, Any]) -> str:
+    def _create_params_file_from_dict(self, params: dict[str, Any]) -> str:
         import yaml
         node = self.node_name if self.is_node_name_fully_specified() else '/**'
         with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
@@ -223,10 +184,6 @@ class Node(ExecuteProcess):
         atexit.register(pathlib.Path(file.name).unlink, missing_ok=True)
         return file.name
 
-    def _get_parameter_rule(self, param: Parameter, context: LaunchContext) -> str:
-        name, value = param.evaluate(context)
-        return f'{name}:={_as_yaml(value)}'
-
     def __extend_cmd(self, *words: SomeSubstitutionsType) -> None:
         self.cmd.extend(normalize_to_list_of_substitutions(word) for word in words)
 
@@ -234,43 +191,37 @@ class Node(ExecuteProcess):
         if self.__node_name is not None:
             self.__expanded_node_name = perform_substitutions(
                 context, normalize_to_list_of_substitutions(self.__node_name))
-            check_node_name(self.__expanded_node_name)
-        namespace: Optional[str] = None
+            names.check_node_name(self.__expanded_node_name)
+        namespace: str | None = None
         if self.__node_namespace is not None:
             namespace = perform_substitutions(
                 context, normalize_to_list_of_substitutions(self.__node_namespace))
-        namespace = prefix_namespace(
+        namespace = names.prefix_namespace(
             context.launch_configurations.get('ros_namespace'), namespace)
         if namespace is not None:
-            self.__expanded_node_namespace = make_namespace_absolute(namespace)
+            self.__expanded_node_namespace = names.make_namespace_absolute(namespace)
             self.__extend_cmd('-r', LocalSubstitution("ros_specific_arguments['ns']"))
-            check_namespace(self.__expanded_node_namespace)
+            names.check_namespace(self.__expanded_node_namespace)
 
     def __expand_parameters(self, context: LaunchContext) -> None:
-        self.__expanded_parameter_arguments = []
         for given in context.launch_configurations.get('global_params', ()):
             if isinstance(given, tuple):
-                name, value = given
-                self.__extend_cmd('-p', f'{name}:={value}')
-            else:
-                path = os.path.abspath(given)
-                self.__expanded_parameter_arguments.append((path, True))
-                if not os.path.isfile(path):
-                    raise AssertionError(f'Parameter file path is not a file: {path}')
-                self.__extend_cmd('--params-file', path)
+                self.__extend_cmd('-p', f'{given[0]}:={given[1]}')
+                continue
+            path = os.path.abspath(given)
+            if not os.path.isfile(path):
+                raise AssertionError(f'Parameter file path is not a file: {path}')
+            self.__extend_cmd('--params-file', path)
         for parameter in evaluate_parameters(context, self.__parameters):
-            is_file = not isinstance(parameter, Parameter)
             if isinstance(parameter, Parameter):
-                argument = self._get_parameter_rule(parameter, context)
-            elif isinstance(parameter, pathlib.Path):
-                argument = str(parameter)
-                if not os.path.isfile(argument):
-                    self.__logger.warning(f'Parameter file path is not a file: {argument}')
-                    continue
+                name, value = parameter.evaluate(context)
+                self.__extend_cmd('-p', f'{name}:={as_yaml(value)}')
+            elif isinstance(parameter, dict):
+                self.__extend_cmd('--params-file', self._create_params_file_from_dict(parameter))
+            elif os.path.isfile(parameter):
+                self.__extend_cmd('--params-file', str(parameter))
             else:
-                argument = self._create_params_file_from_dict(parameter)
-            self.__expanded_parameter_arguments.append((argument, is_file))
-            self.__extend_cmd('--params-file' if is_file else '-p', argument)
+                self.__logger.warning(f'Parameter file path is not a file: {parameter}')
 
     def __expand_remappings(self, context: LaunchContext) -> None:
         rules = list(context.launch_configurations.get('ros_remaps') or ())
@@ -283,10 +234,9 @@ class Node(ExecuteProcess):
             self.__extend_cmd('-r', f'{source}:={target}')
 
     def _perform_substitutions(self, context: LaunchContext) -> None:
-        if self.__substitutions_performed:
+        if self.__final_node_name is not None:
             # Derived classes need the name before this class executes.
             return
-        self.__substitutions_performed = True
         try:
             self.__expand_name(context)
         except Exception:
@@ -295,34 +245,24 @@ class Node(ExecuteProcess):
                 f"'package={self.__package}, executable={self.__node_executable}, "
                 f"name={self.__node_name}, namespace={self.__node_namespace}':")
             raise
-        self.__final_node_name = prefix_namespace(
+        self.__final_node_name = names.prefix_namespace(
             self.__expanded_node_namespace, self.__expanded_node_name)
         self.__expand_parameters(context)
         self.__expand_remappings(context)
 
-    def execute(self, context: LaunchContext) -> Optional[List[LaunchDescriptionEntity]]:
+    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
         self._perform_substitutions(context)
-        arguments: Dict[str, Any] = {}
-        if self.__node_name is not None:
-            arguments['name'] = f'__node:={self.__expanded_node_name}'
-        if self.__expanded_node_namespace != '':
-            arguments['ns'] = f'__ns:={self.__expanded_node_namespace}'
-        for extension in self.__extensions.values():
-            words, arguments = extension.prepare_for_execute(context, arguments, self)
-            self.cmd.extend(words)
-        context.extend_locals({'ros_specific_arguments': arguments})
+        context.extend_locals({'ros_specific_arguments': {
+            'name': f'__node:={self.__expanded_node_name}',
+            'ns': f'__ns:={self.__expanded_node_namespace}'}})
         entities = super().execute(context)
         if self.is_node_name_fully_specified():
-            add_node_name(context, self.node_name)
-            count = get_node_name_count(context, self.node_name)
-            if count > 1:
-                launch.logging.get_logger(self.name).warning(
-                    f'there are now at least {count} nodes with the name {self.node_name} '
-                    'created within this launch context')
+            if warning := names.count_node_name(context, self.node_name):
+                launch.logging.get_logger(self.name).warning(warning)
         return entities
 
 
-def parse_remappings(entity: Entity, parser: Parser) -> Optional[List[Any]]:
+def parse_remappings(entity: Entity, parser: Parser) -> list[Any] | None:
     """Return ``remappings`` from ``<remap from= to=/>`` elements, if there are any."""
     pairs = parse_pairs(entity, parser, 'remap', 'from', 'to')
     return None if pairs is None else list(pairs.items())

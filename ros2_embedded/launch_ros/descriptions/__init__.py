@@ -2,20 +2,18 @@
 """What nodes are made of."""
 from __future__ import annotations
 
-from typing import Any, Dict, List, Optional, Tuple, Type
+from typing import Any, List
 
 from launch import Action, Condition, SomeSubstitutionsType
-from launch._aliases import alias_submodules
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
 
-from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from ..parameter_descriptions import Parameter as Parameter
+from ..parameter_descriptions import ParameterFile as ParameterFile
+from ..parameter_descriptions import ParameterValue as ParameterValue
 from ..parameters_type import SomeParameters
-from ..remap_rule_type import SomeRemapRules
 from ..utilities import normalize_parameters, normalize_remap_rules
-
-__all__ = ['ComposableNode', 'Parameter', 'ParameterFile', 'ParameterValue']
 
 
 class ComposableNode:
@@ -28,12 +26,9 @@ class ComposableNode:
 
     def __init__(
         self, *, package: SomeSubstitutionsType, plugin: SomeSubstitutionsType,
-        name: Optional[SomeSubstitutionsType] = None,
-        namespace: Optional[SomeSubstitutionsType] = None,
-        parameters: Optional[SomeParameters] = None,
-        remappings: Optional[SomeRemapRules] = None,
-        extra_arguments: Optional[SomeParameters] = None,
-        condition: Optional[Condition] = None
+        name: SomeSubstitutionsType | None = None, namespace: SomeSubstitutionsType | None = None,
+        parameters: SomeParameters | None = None, remappings: Any = None,
+        extra_arguments: SomeParameters | None = None, condition: Condition | None = None
     ) -> None:
         self.package = normalize_to_list_of_substitutions(package)
         self.node_plugin = normalize_to_list_of_substitutions(plugin)
@@ -45,9 +40,7 @@ class ComposableNode:
         self.__condition = condition
 
     @classmethod
-    def parse(
-        cls, parser: Parser, entity: Entity
-    ) -> Tuple[Type[ComposableNode], Dict[str, Any]]:
+    def parse(cls, parser: Parser, entity: Entity) -> tuple[type[ComposableNode], dict[str, Any]]:
         from ..actions import Node
         from ..actions.node import parse_remappings
         _, kwargs = Action.parse(entity, parser)
@@ -69,8 +62,5 @@ class ComposableNode:
         entity.assert_entity_completely_parsed()
         return cls, kwargs
 
-    def condition(self) -> Optional[Condition]:
+    def condition(self) -> Condition | None:
         return self.__condition
-
-
-alias_submodules(__name__, ('ComposableNode',))

@@ -2,15 +2,12 @@
 """Handlers of launch_ros's events."""
 from __future__ import annotations
 
-from typing import Any, Callable, Optional
+from typing import Any, Callable
 
 from launch import Event, EventHandler, SomeEntitiesType
-from launch._aliases import alias_submodules
 
 from ..actions import LifecycleNode
 from ..events.lifecycle import StateTransition
-
-__all__ = ['OnStateTransition']
 
 
 class OnStateTransition(EventHandler):
@@ -23,9 +20,9 @@ class OnStateTransition(EventHandler):
 
     def __init__(
         self, *, entities: SomeEntitiesType,
-        target_lifecycle_node: Optional[LifecycleNode] = None,
-        transition: Optional[str] = None, start_state: Optional[str] = None,
-        goal_state: Optional[str] = None, matcher: Optional[Callable[[Event], bool]] = None,
+        target_lifecycle_node: LifecycleNode | None = None,
+        transition: str | None = None, start_state: str | None = None,
+        goal_state: str | None = None, matcher: Callable[[Event], bool] | None = None,
         **kwargs: Any
     ) -> None:
         if not isinstance(target_lifecycle_node, (LifecycleNode, type(None))):
@@ -41,18 +38,3 @@ class OnStateTransition(EventHandler):
                 and goal_state in (None, event.goal_state))
 
         super().__init__(matcher=matcher or fits, entities=entities, **kwargs)
-        self.__target_lifecycle_node = target_lifecycle_node
-
-    @property
-    def handler_description(self) -> str:
-        return '<actions>'
-
-    @property
-    def matcher_description(self) -> str:
-        if self.__target_lifecycle_node is None:
-            return 'event == StateTransition'
-        return ('event == StateTransition and event.action == '
-                f'LifecycleNode({hex(id(self.__target_lifecycle_node))})')
-
-
-alias_submodules(__name__, __all__)

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import Any, Tuple
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from launch import SomeSubstitutionsType
-from launch._aliases import alias_submodules
+from launch._aliases import lacking
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
-from launch.substitutions import (
-    described,
-    normalized_default,
-    ParsedSubstitution,
-    SubstitutionFailure,
-)
+from launch.substitutions import described, ParsedSubstitution, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
-__all__ = [
-    'ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare', 'Parameter']
+__all__ = ['ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare']
+__getattr__ = lacking(__name__, 'Parameter')
 
 
 class FindPackage(ParsedSubstitution):
     """Base of those that find a package; PackageNotFoundError if there is no such."""
 
-    _parameters: Tuple[str, ...] = ('package',)
+    _parameters: tuple[str, ...] = ('package',)
 
     def __init__(self, package: SomeSubstitutionsType) -> None:
         super().__init__()
@@ -82,31 +76,3 @@ class ExecutableInPackage(FindPackagePrefix):
             raise SubstitutionFailure(
                 f"executable '{executable}' not found on the libexec directory '{libexec}' ")
         return path
-
-
-@expose_substitution('param')
-class Parameter(ParsedSubstitution):
-    """The value that SetParameter gave a parameter for all nodes, or the default."""
-
-    _parameters = ('name', 'default?')
-
-    def __init__(self, name: SomeSubstitutionsType, *, default: Any = None) -> None:
-        super().__init__()
-        self.name = normalize_to_list_of_substitutions(name)
-        self.__default = normalized_default(default)
-
-    def describe(self) -> str:
-        return f'Parameter(name={described(self.name)})'
-
-    def perform(self, context: LaunchContext) -> str:
-        name = perform_substitutions(context, self.name)
-        for parameter in context.launch_configurations.get('global_params', ()):
-            if isinstance(parameter, tuple) and parameter[0] == name:
-                return str(parameter[1])
-        if self.__default is None:
-            raise SubstitutionFailure(f"parameter '{name}' not found")
-        return perform_substitutions(context, self.__default)
-
-
-alias_submodules(__name__, __all__, find_package=(
-    'FindPackage', 'FindPackagePrefix', 'FindPackageShare'))

@@ -2,22 +2,15 @@
 """The values of normalized parameters in a launch's context."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Dict, List
+from collections.abc import Sequence
+from typing import Any
 
 from launch import Substitution
 from launch.launch_context import LaunchContext
 from launch.utilities import ensure_argument_type, perform_substitutions
 
-from ..parameter_descriptions import Parameter as ParameterDescription
-from ..parameter_descriptions import ParameterFile
-from ..parameter_descriptions import ParameterValue as ParameterValueDescription
-from ..parameters_type import (
-    EvaluatedParameters,
-    EvaluatedParameterValue,
-    Parameters,
-    ParametersDict,
-)
+from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from ..parameters_type import EvaluatedParameters, Parameters, ParametersDict
 
 _WRAP = ('If the parameter is meant to be a string, try wrapping it in '
          'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')
@@ -50,7 +43,7 @@ def _from_text(name: str, text: str) -> Any:
 
 
 def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
-    if isinstance(value, ParameterValueDescription):
+    if isinstance(value, ParameterValue):
         return value.evaluate(context)
     if not isinstance(value, tuple) or not value:
         ensure_argument_type(value, (float, int, str, bool, bytes), 'value')
@@ -66,33 +59,27 @@ def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
 
 def evaluate_parameter_dict(
     context: LaunchContext, parameters: ParametersDict
-) -> Dict[str, EvaluatedParameterValue]:
+) -> dict[str, Any]:
     """
     Return the values by name; what substitutions become is read as YAML.
 
-    :raises TypeError: for what isn't normalized, or becomes nothing a parameter can be.
+    :raises TypeError: for what becomes nothing a parameter can be.
     """
-    if not isinstance(parameters, Mapping):
-        raise TypeError('expected dict')
     evaluated = {}
     for substitutions, value in parameters.items():
-        if not isinstance(substitutions, tuple):
-            raise TypeError(f'Expecting tuple of substitutions got {substitutions!r}')
         name = perform_substitutions(context, substitutions)
         evaluated[name] = _evaluate(context, name, value)
     return evaluated
 
 
-def evaluate_parameters(
-    context: LaunchContext, parameters: Parameters
-) -> EvaluatedParameters:
+def evaluate_parameters(context: LaunchContext, parameters: Parameters) -> EvaluatedParameters:
     """Return dictionaries by value and files by path; single parameters stay as they are."""
-    evaluated: List[Any] = []
+    evaluated: list[Any] = []
     for parameter in parameters:
         if isinstance(parameter, ParameterFile):
             evaluated.append(parameter.evaluate(context))
-        elif isinstance(parameter, ParameterDescription):
+        elif isinstance(parameter, Parameter):
             evaluated.append(parameter)
-        elif isinstance(parameter, Mapping):
+        elif isinstance(parameter, dict):
             evaluated.append(evaluate_parameter_dict(context, parameter))
     return tuple(evaluated)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from typing import Any, Dict, Iterator, List, Optional, Tuple, TYPE_CHECKING
+from typing import Any, Iterator
 
 from launch.launch_context import LaunchContext
 
@@ -11,11 +11,8 @@ from ..parameters_type import EvaluatedParameters
 from .evaluate_parameters import evaluate_parameter_dict
 from .normalize_parameters import normalize_parameter_dict
 
-if TYPE_CHECKING:
-    import rclpy.parameter
 
-
-def _nodes_of(content: Dict[str, Any], names: Tuple[str, ...] = ()) -> Iterator[Tuple[str, Any]]:
+def _nodes_of(content: dict[str, Any], names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     for key, value in content.items():
         if key == 'ros__parameters':
             yield '/'.join(names), value
@@ -23,7 +20,7 @@ def _nodes_of(content: Dict[str, Any], names: Tuple[str, ...] = ()) -> Iterator[
             yield from _nodes_of(value, (*names, key.strip('/')))
 
 
-def _read(path: pathlib.Path, node: str) -> Dict[str, Any]:
+def _read(path: pathlib.Path, node: str) -> dict[str, Any]:
     import yaml
     content = yaml.safe_load(path.read_text()) or {}
     nodes = dict(_nodes_of(content))
@@ -33,9 +30,9 @@ def _read(path: pathlib.Path, node: str) -> Dict[str, Any]:
 
 
 def to_parameters_list(
-    context: LaunchContext, node_name: str, namespace: Optional[str],
+    context: LaunchContext, node_name: str, namespace: str | None,
     evaluated_parameters: EvaluatedParameters
-) -> List[rclpy.parameter.Parameter]:
+) -> list[Any]:
     """
     Return the node's parameters; of files, what stands there for all nodes or this one.
 
@@ -45,13 +42,8 @@ def to_parameters_list(
     node = '/'.join(part.strip('/') for part in (namespace or '', node_name) if part.strip('/'))
     parameters = []
     for given in evaluated_parameters:
-        if isinstance(given, pathlib.Path):
-            values: Any = evaluate_parameter_dict(
-                context, normalize_parameter_dict(_read(given, node)))
-        else:
-            values = given
-        if not isinstance(values, dict):
-            raise RuntimeError(f'invalid evaluated parameters {values!r}')
+        values = given if isinstance(given, dict) else evaluate_parameter_dict(
+            context, normalize_parameter_dict(_read(given, node)))
         for name, value in values.items():
             kind = next((kind for kind in Parameter.Type if kind.check(value)), None)
             if kind is None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 from ros2cli.command import CommandExtension
+from ros2cli.plugin_system import instantiate_extensions
 
 
 def _find(package: str, name: str) -> str:
@@ -77,6 +78,9 @@ class LaunchCommand(CommandExtension):
         add('launch_file_name', nargs='?', help='Name of the launch file')
         add('launch_arguments', nargs='*',
             help="Arguments '<name>:=<value>'; for duplicates, last one wins")
+        self._options = instantiate_extensions('ros2launch.option').values()
+        for option in self._options:
+            option.add_arguments(parser, cli_name)
 
     def main(self, *, parser: Any, args: Any) -> int | str | None:
         words = list(args.launch_arguments)
@@ -103,8 +107,16 @@ class LaunchCommand(CommandExtension):
         if args.show_args:
             _print_arguments(get_launch_description_from_any_launch_file(path))
             return None
+        for option in self._options:
+            option.prestart(args)
         service = launch.LaunchService(
             argv=words, noninteractive=args.noninteractive, debug=args.debug)
-        service.include_launch_description(launch.LaunchDescription([
-            IncludeLaunchDescription(path, launch_arguments=_parse(words).items())]))
-        return service.run()
+        description = launch.LaunchDescription([
+            IncludeLaunchDescription(path, launch_arguments=_parse(words).items())])
+        for option in self._options:
+            description = option.prelaunch(description, args)[0]
+        service.include_launch_description(description)
+        status = service.run()
+        for option in self._options:
+            option.postlaunch(status, args)
+        return status
