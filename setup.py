@@ -29,6 +29,7 @@ def data_files():
         yield f'share/{package}/launch', sorted(
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
+    yield 'lib/fogros2', ['fogros2/scripts/bridge']
 
 
 #: What pods as machines need.
@@ -105,6 +106,9 @@ setup(
         'launch.frontend.launch_extension': [
             'fogros2 = fogros2.actions.frontend',
         ],
+        'ros2launch.option': [
+            'machine = ros2fog_cli.option.machine:MachineOption',
+        ],
         'ros2cli.command': [
             'fog = ros2fog_cli.command.fog:FogCommand',
         ],
@@ -120,6 +124,7 @@ setup(
             'image = ros2fog_cli.verb.image:ImageVerb',
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
+            'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',

@@ -95,6 +95,8 @@ class Coordinator:
         self._console: Optional[Console] = None
         self._instances: dict[str, CloudInstance] = {}
         self._overrides: Optional[Overrides] = None
+        self._mentioned: list[SomeMachine] = []
+        self._whole = False
         self._sessions: dict[str, Session] = {}
         self._new: list[Session] = []
         self._begun = True
@@ -142,6 +144,7 @@ class Coordinator:
         """
         if self._launch is not None:
             return
+        self._check_overrides(early=True)
         context = self._context
         self.base_environment = _environment_at_start(context)
         self._console = Console()
@@ -157,11 +160,38 @@ class Coordinator:
         if isinstance(machine, CloudInstance):
             self._instances[machine.name] = machine
 
-    def override(self, overrides: Overrides) -> None:
-        """Have machines made elsewhere than the launch file says."""
+    def override(
+        self, overrides: Overrides, machines: Iterable[SomeMachine], *, whole: bool,
+    ) -> None:
+        """
+        Have machines made elsewhere than the launch file says.
+
+        :param machines: those that the launch is known to have; ``whole`` if there are no others.
+        """
         self._overrides = overrides
+        self._mentioned += machines
+        self._whole = whole
         # what there is no machine for is refused in any case
         self.begin()
+
+    def mention(self, machine: Optional[SomeMachine]) -> None:
+        """Remember that the launch has a machine, whether or not it will be asked for."""
+        if machine is not None:
+            self._mentioned.append(machine)
+
+    def _check_overrides(self, *, early: bool) -> None:
+        """
+        Hold the overrides against the machines there are.
+
+        :param early: as far as all of them are known already.
+        """
+        if self._overrides is None or (early and not self._whole):
+            return
+        names = [self._resolved(
+            known.own_name if isinstance(known, CloudInstance) else known)
+            for known in (*self._instances.values(), *self._mentioned)]
+        if not early or None not in names:
+            self._overrides.check([name for name in names if name is not None])
 
     def resolve(self, machine: SomeMachine) -> Union[CloudInstance, str]:
         """Return a machine, or its name resolved."""
@@ -325,9 +355,7 @@ class Coordinator:
         self._begun = True
         if context.is_shutdown:
             return
-        if self._overrides is not None:
-            names = [self._resolved(known.own_name) for known in self._instances.values()]
-            self._overrides.check([name for name in names if name is not None])
+        self._check_overrides(early=False)
         new, self._new = self._new, []
         if new:
             task = context.asyncio_loop.create_task(self._bring_up(new))

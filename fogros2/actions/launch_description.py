@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 import functools
-from typing import get_args, Optional, TYPE_CHECKING, Union
+from typing import get_args, Optional, TYPE_CHECKING, TypeGuard, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
@@ -97,6 +97,13 @@ class FogROSLaunchDescription(LaunchDescription):
         return wrap(entities, functools.partial(_hold, coordinator))
 
 
+def has_machine(
+    entity: LaunchDescriptionEntity,
+) -> TypeGuard[Union[RemoteProcess, CloudGroup, FogMachine]]:
+    """Return whether an entity is for a machine, or is one."""
+    return isinstance(entity, (RemoteProcess, CloudGroup, FogMachine))
+
+
 def cloud_entities(
     entities: Iterable[LaunchDescriptionEntity], certain: bool = True,
 ) -> Iterator[tuple[Union[RemoteProcess, CloudGroup, FogMachine], bool]]:
@@ -107,7 +114,7 @@ def cloud_entities(
     """
     for entity in entities:
         sure = certain and getattr(entity, 'condition', None) is None
-        if isinstance(entity, (RemoteProcess, CloudGroup, FogMachine)):
+        if has_machine(entity):
             yield entity, sure
         if not isinstance(entity, IncludeLaunchDescription):
             below = [entity.describe_sub_entities(), *(

@@ -9,12 +9,14 @@ import fnmatch
 from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
+from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
 from fogros2.actions import keywords
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from fogros2.actions.coordinator import SomeMachine
     from fogros2.actions.machines import CloudInstance
     from fogros2.model import MachineSpec
 
@@ -88,17 +90,18 @@ class Overrides:
         override = self.of(spec.name)
         return spec if override is None else override.instead(spec, context)
 
-    def check(self, names: Sequence[str]) -> None:
+    def check(self, names: Iterable[str]) -> None:
         """
         Hold them against the machines that the launch has.
 
         :raises ConfigurationError: one is for a machine that there isn't.
         """
+        names = sorted(set(names))
         for override in self._overrides:
             if not any(fnmatch.fnmatchcase(name, override.pattern) for name in names):
                 raise ConfigurationError(
                     f'--machine {override.pattern}=...: no machine of this launch is called so',
-                    keywords.near(override.pattern, sorted(names), all_too=True)
+                    keywords.near(override.pattern, names, all_too=True)
                     or 'it has no machine at all')
 
 
@@ -125,18 +128,41 @@ class OverrideMachines(Action):
         """Execute the action: yields the content, looked through for the machines it mentions."""
         from fogros2.actions.coordinator import Coordinator
         coordinator = Coordinator.of(context)
-        coordinator.override(self._overrides)
+        machines: list[SomeMachine] = []
+        whole = _look_through(self._entities, machines)
+        coordinator.override(self._overrides, machines, whole=whole)
         return wrap(self._entities, _mention)
+
+
+def _look_through(
+    entities: Iterable[LaunchDescriptionEntity], machines: list[SomeMachine],
+) -> bool:
+    """
+    Add the machines that entities have, at any depth, in included files as well.
+
+    :return: whether that is all: neither a function nor an unread file may bring more.
+    """
+    from fogros2.actions.launch_description import has_machine
+    whole = True
+    for entity in entities:
+        if has_machine(entity) and entity.machine is not None:
+            machines.append(entity.machine)
+        below = [entity.describe_sub_entities(), *(
+            some for _, some in entity.describe_conditional_sub_entities())]
+        for some in below:
+            whole = _look_through(some, machines) and whole
+        if isinstance(entity, OpaqueFunction) or (
+                isinstance(entity, IncludeLaunchDescription) and not below[0]):
+            whole = False
+    return whole
 
 
 def _mention(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
     """Remember the machines that an entity has, those that come with a timer or an event too."""
     from fogros2.actions.coordinator import Coordinator
-    from fogros2.actions.fog_machine import FogMachine
     from fogros2.actions.launch_description import cloud_entities
-    for found, certain in cloud_entities([entity]):
-        if certain or not isinstance(found, FogMachine):
-            Coordinator.of(context).know(found.machine)
+    for found, _ in cloud_entities([entity]):
+        Coordinator.of(context).mention(found.machine)
 
 
 def parse(text: str) -> Override:

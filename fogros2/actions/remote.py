@@ -74,7 +74,7 @@ class RemoteProcess(ExecuteLocal):
         private.set_transport(self, run)
         context.register_event_handler(OnProcessIO(target_action=self, on_stdin=run.on_stdin))
         self._fogros2_session.submit(run)
-        return [*(entities or ()), *self._carriers(context)]
+        return [*(entities or ()), *self._carriers(context), *self._monitor()]
 
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return the processes that carry the streams asked for here and nowhere before."""
@@ -82,6 +82,15 @@ class RemoteProcess(ExecuteLocal):
         if isinstance(self, carriers.Carrier) or session.interrupted:
             return []
         return self._carry(context, self._fogros2_streams, session)
+
+    def _monitor(self) -> list[LaunchDescriptionEntity]:
+        """Return what serves the machine's topics, if it was to and nothing does yet."""
+        session = self._fogros2_session
+        if not session.spec.launch_foxglove or session.served:
+            return []
+        from fogros2.actions.foxglove import Foxglove
+        session.served = True
+        return [Foxglove(session.spec.name)]
 
     def _carriers_here(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return those that bring what a machine publishes for this process to the robot."""

@@ -40,7 +40,9 @@ def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") 
     argument.completer = complete_names  # type: ignore[attr-defined]
 
 
-def complete_names(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
+def complete_names(
+    prefix: str, parsed_args: Optional[argparse.Namespace] = None, **_: object,
+) -> list[str]:
     """Return the names of machines that begin with ``prefix``; asks no provider."""
     from fogros2.store import Store
     return [record.name for record in Store().machines() if record.name.startswith(prefix)]
