@@ -96,69 +96,55 @@ def _load() -> ct.CDLL:
 _lib = _load()
 _E, _P, _U32, _I32, _I64, _Z = (
     ct.c_int32, ct.c_void_p, ct.c_uint32, ct.c_int32, ct.c_int64, ct.c_size_t)
-_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
-    'dds_create_domain': (_E, [_U32, ct.c_char_p]),
-    'dds_create_participant': (_E, [_U32, _P, _P]),
-    'dds_create_topic': (_E, [_E, _P, ct.c_char_p, _P, _P]),
-    'dds_create_reader': (_E, [_E, _E, _P, _P]),
-    'dds_create_writer': (_E, [_E, _E, _P, _P]),
-    'dds_create_readcondition': (_E, [_E, _U32]),
-    'dds_create_guardcondition': (_E, [_E]),
-    'dds_set_guardcondition': (_I32, [_E, ct.c_bool]),
-    'dds_take_guardcondition': (_I32, [_E, _P]),
-    'dds_create_waitset': (_E, [_E]),
-    'dds_waitset_attach': (_I32, [_E, _E, ct.c_ssize_t]),
-    'dds_waitset_detach': (_I32, [_E, _E]),
-    'dds_waitset_wait': (_I32, [_E, _P, _Z, _I64]),
-    'dds_delete': (_I32, [_E]),
-    'dds_set_status_mask': (_I32, [_E, _U32]),
-    'dds_get_status_changes': (_I32, [_E, _P]),
-    'dds_get_guid': (_I32, [_E, _P]),
-    'dds_get_instance_handle': (_I32, [_E, _P]),
-    'dds_get_entity_sertype': (_I32, [_E, _P]),
-    'dds_get_qos': (_I32, [_E, _P]),
-    'dds_writecdr': (_I32, [_E, _P]),
-    'dds_takecdr': (_I32, [_E, _P, _U32, _P, _U32]),
-    'dds_take_mask': (_I32, [_E, _P, _P, _Z, _U32, _U32]),
-    'dds_return_loan': (_I32, [_E, _P, _I32]),
-    'dds_wait_for_acks': (_I32, [_E, _I64]),
-    'dds_assert_liveliness': (_I32, [_E]),
-    'dds_get_matched_subscriptions': (_I32, [_E, _P, _Z]),
-    'dds_get_matched_publications': (_I32, [_E, _P, _Z]),
-    'dds_get_matched_subscription_data': (ct.POINTER(_Endpoint), [_E, ct.c_uint64]),
-    'dds_get_matched_publication_data': (ct.POINTER(_Endpoint), [_E, ct.c_uint64]),
-    'dds_builtintopic_free_endpoint': (None, [_P]),
-    'dds_strretcode': (ct.c_char_p, [_I32]),
-    'dds_free': (None, [_P]),
-    'dds_create_qos': (_P, []),
-    'dds_delete_qos': (None, [_P]),
-    'dds_qset_userdata': (None, [_P, ct.c_char_p, _Z]),
-    'dds_qset_history': (None, [_P, ct.c_int, _I32]),
-    'dds_qset_reliability': (None, [_P, ct.c_int, _I64]),
-    'dds_qset_durability': (None, [_P, ct.c_int]),
-    'dds_qset_durability_service': (None, [_P, _I64, ct.c_int, _I32, _I32, _I32, _I32]),
-    'dds_qset_lifespan': (None, [_P, _I64]),
-    'dds_qset_deadline': (None, [_P, _I64]),
-    'dds_qset_liveliness': (None, [_P, ct.c_int, _I64]),
-    'dds_qset_ignorelocal': (None, [_P, ct.c_int]),
-    'dds_qset_writer_data_lifecycle': (None, [_P, ct.c_bool]),
-    'dds_qset_data_representation': (None, [_P, _U32, _P]),
-    'dds_qget_userdata': (ct.c_bool, [_P, _P, _P]),
-    'dds_qget_history': (ct.c_bool, [_P, _P, _P]),
-    'dds_qget_reliability': (ct.c_bool, [_P, _P, _P]),
-    'dds_qget_durability': (ct.c_bool, [_P, _P]),
-    'dds_qget_lifespan': (ct.c_bool, [_P, _P]),
-    'dds_qget_deadline': (ct.c_bool, [_P, _P]),
-    'dds_qget_liveliness': (ct.c_bool, [_P, _P, _P]),
-    'ddsi_serdata_from_ser_iov': (_P, [_P, ct.c_int, _Z, _P, _Z]),
-    'ddsi_serdata_size': (_U32, [_P]),
-    'ddsi_serdata_to_ser_ref': (_P, [_P, _Z, _Z, _P]),
-    'ddsi_serdata_to_ser_unref': (None, [_P, _P]),
-    'ddsi_serdata_unref': (None, [_P]),
-}
-for _name, (_result, _arguments) in _SIGNATURES.items():
-    _function = getattr(_lib, _name)
-    _function.restype, _function.argtypes = _result, _arguments
+_ENDPOINT = ct.POINTER(_Endpoint)
+_SIGNATURES: list[tuple[str, Any, list[Any]]] = [  # functions, what they return and take
+    ('dds_create_domain', _E, [_U32, ct.c_char_p]),
+    ('dds_create_participant', _E, [_U32, _P, _P]),
+    ('dds_create_topic', _E, [_E, _P, ct.c_char_p, _P, _P]),
+    ('dds_create_reader dds_create_writer', _E, [_E, _E, _P, _P]),
+    ('dds_create_readcondition', _E, [_E, _U32]),
+    ('dds_create_guardcondition dds_create_waitset dds_delete dds_assert_liveliness', _E, [_E]),
+    ('dds_set_guardcondition', _I32, [_E, ct.c_bool]),
+    ('dds_take_guardcondition dds_get_status_changes dds_get_guid dds_get_instance_handle '
+     'dds_get_entity_sertype dds_get_qos dds_writecdr dds_get_publication_matched_status '
+     'dds_get_subscription_matched_status dds_get_offered_deadline_missed_status '
+     'dds_get_requested_deadline_missed_status dds_get_liveliness_lost_status '
+     'dds_get_liveliness_changed_status dds_get_offered_incompatible_qos_status '
+     'dds_get_requested_incompatible_qos_status dds_get_sample_lost_status', _I32, [_E, _P]),
+    ('dds_waitset_attach', _I32, [_E, _E, ct.c_ssize_t]),
+    ('dds_waitset_detach', _I32, [_E, _E]),
+    ('dds_waitset_wait', _I32, [_E, _P, _Z, _I64]),
+    ('dds_set_status_mask', _I32, [_E, _U32]),
+    ('dds_takecdr', _I32, [_E, _P, _U32, _P, _U32]),
+    ('dds_take_mask', _I32, [_E, _P, _P, _Z, _U32, _U32]),
+    ('dds_return_loan', _I32, [_E, _P, _I32]),
+    ('dds_wait_for_acks', _I32, [_E, _I64]),
+    ('dds_get_matched_subscriptions dds_get_matched_publications', _I32, [_E, _P, _Z]),
+    ('dds_get_matched_subscription_data dds_get_matched_publication_data', _ENDPOINT,
+     [_E, ct.c_uint64]),
+    ('dds_builtintopic_free_endpoint dds_free dds_delete_qos ddsi_serdata_unref', None, [_P]),
+    ('dds_strretcode', ct.c_char_p, [_I32]),
+    ('dds_create_qos', _P, []),
+    ('dds_qset_userdata', None, [_P, ct.c_char_p, _Z]),
+    ('dds_qset_history', None, [_P, ct.c_int, _I32]),
+    ('dds_qset_reliability dds_qset_liveliness', None, [_P, ct.c_int, _I64]),
+    ('dds_qset_durability dds_qset_ignorelocal', None, [_P, ct.c_int]),
+    ('dds_qset_durability_service', None, [_P, _I64, ct.c_int, _I32, _I32, _I32, _I32]),
+    ('dds_qset_lifespan dds_qset_deadline', None, [_P, _I64]),
+    ('dds_qset_writer_data_lifecycle', None, [_P, ct.c_bool]),
+    ('dds_qset_data_representation', None, [_P, _U32, _P]),
+    ('dds_qget_userdata dds_qget_history dds_qget_reliability dds_qget_liveliness', ct.c_bool,
+     [_P, _P, _P]),
+    ('dds_qget_durability dds_qget_lifespan dds_qget_deadline', ct.c_bool, [_P, _P]),
+    ('ddsi_serdata_from_ser_iov', _P, [_P, ct.c_int, _Z, _P, _Z]),
+    ('ddsi_serdata_size', _U32, [_P]),
+    ('ddsi_serdata_to_ser_ref', _P, [_P, _Z, _Z, _P]),
+    ('ddsi_serdata_to_ser_unref', None, [_P, _P]),
+]
+for _names, _result, _arguments in _SIGNATURES:
+    for _name in _names.split():
+        _function = getattr(_lib, _name)
+        _function.restype, _function.argtypes = _result, _arguments
 _view = ct.pythonapi.PyMemoryView_FromMemory
 _view.restype, _view.argtypes = ct.py_object, [_P, ct.c_ssize_t, ct.c_int]
 _READ_ONLY = 0x100
@@ -373,7 +359,6 @@ class _Entity:
         """Take status ``name``: its numbers in dds.h's order, and its handle if it has one."""
         value = _Status()
         function = getattr(_lib, f'dds_get_{name}_status')
-        function.restype, function.argtypes = _I32, [_E, _P]
         _checked(function(self.handle, ct.byref(value)), f'get status {name}')
         first, second, third, fourth = value.numbers
         return (first, second, third, fourth), value.handle
