@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     )
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.cloud_node import CloudNode
+    from fogros2.actions.foxglove import Foxglove
     from fogros2.actions.interruption import MachineInterrupted
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.machines import CloudInstance, ContainerInstance, SSHInstance
@@ -34,6 +35,7 @@ __all__ = [
     'ContainerInstance',
     'FogError',
     'FogROSLaunchDescription',
+    'Foxglove',
     'KubeInstance',
     'MachineInterrupted',
     'SSHInstance',
@@ -53,6 +55,7 @@ _MODULES = {
     'ContainerInstance': 'fogros2.actions.machines',
     'FogError': 'fogros2.errors',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
+    'Foxglove': 'fogros2.actions.foxglove',
     'KubeInstance': 'fogros2.actions.machines_cloud',
     'MachineInterrupted': 'fogros2.actions.interruption',
     'SSHInstance': 'fogros2.actions.machines',

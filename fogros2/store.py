@@ -103,6 +103,7 @@ class Record:
     :param robot_vpn: the robot's side of it.
     :param agent: the agent's folder on the machine.
     :param python: interpreter on the machine that runs the agent.
+    :param monitor: TCP port of its bridge to Foxglove, 0 for none.
     :param damage: why the record can't be read, '' when it can.
     """
 
@@ -127,6 +128,7 @@ class Record:
     agent: str = ''
     agent_program: str = ''
     python: str = 'python3'
+    monitor: int = 0
     damage: str = ''
 
     @property

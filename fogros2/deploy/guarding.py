@@ -175,7 +175,9 @@ class Guard:
                 'configure', timeout=job.timeouts.agent, launch=job.launch.id, again=True,
                 heartbeat={'bind': interface.address, 'port': plan.HEARTBEAT_PORT,
                            'peer': robot.address},
-                environment={**ros.environment, **dds, **job.spec.environment},
+                environment={
+                    'FOGROS2_VPN_ADDRESS': interface.address,
+                    **ros.environment, **dds, **job.spec.environment},
                 setup=list(ros.setup), ros_command=list(ros.command))
         except AgentError as error:
             if 'in use' in str(error):

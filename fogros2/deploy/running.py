@@ -89,6 +89,10 @@ class RunningMachine:
         """Return how long a request may take: at the end nobody out of reach is waited for."""
         return self._job.patience(30.0) if self._launch.cancel.is_set() else 30.0
 
+    def serves(self, port: int) -> None:
+        """Remember the TCP port of the bridge to Foxglove that runs there."""
+        self._job.save(monitor=port)
+
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """
         Hand every event of the machine since this launch has it to ``callback``.

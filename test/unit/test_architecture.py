@@ -23,16 +23,16 @@ LAYERS = [
      'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',
      'kubernetes_cancel', 'kubernetes_config', 'kubernetes_watch', 'workspace', 'wheels',
      'modules', 'bootstrap'},
-    {'deploy', 'testing'},
+    {'deploy', 'monitor', 'testing'},
     {'actions'},
 ]
 SEAMS = ('provider', 'shell', 'vpn', 'dds', 'image_transport')
-#: Only these may import launch or rclpy.
-ROS_ALLOWED = ('actions', 'cloud_launch')
+#: Only these may import launch or rclpy; those of the last two run on the machine.
+ROS_ALLOWED = ('actions', 'cloud_launch', 'monitor')
 ROS = ('launch', 'launch_ros', 'rclpy', 'ros2cli', 'ament_index_python')
 #: SDKs belong to one plugin each.
 SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_config',
-        'paramiko': 'shell', 'av': 'image_transport'}
+        'paramiko': 'shell', 'av': 'image_transport', 'foxglove': 'monitor'}
 
 
 def python_files(folder: Path) -> list[Path]:
@@ -148,7 +148,7 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_no_process_is_started_but_by_its_module() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    allowed = {'process.py', 'agent.py', 'cloud_launch.py'}
+    allowed = {'process.py', 'agent.py', 'cloud_launch.py', 'serve.py'}
     for path in python_files(CORE):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}
