@@ -9,7 +9,7 @@
 # The source is Debian's own package (1.20.2, with everything it needs), the compiler Debian's.
 # That takes ten minutes and 6 GB of disk for that time, once; later runs find the programs in the
 # user's cache folder, under a checksum of how they were built. What the cluster runs beside them
-# (etcd, containerd, runc, CNI plugins) comes as packages, installed here if they are missing.
+# (etcd, containerd, runc, CNI plugins, a registry) comes as packages, installed here if they are missing.
 set -eu
 cd "$(dirname "$0")/.."
 . tools/common.sh
@@ -35,6 +35,7 @@ debootstrap debootstrap
 iptables iptables
 conntrack conntrack
 busybox busybox-static
+docker-registry docker-registry
 ip iproute2
 unshare util-linux
 LIST
@@ -146,10 +147,10 @@ reason=$(why_not)
 : >"$log"
 
 install_packages() {
-    # etcd and containerd are wanted as programs alone: no service of theirs may start
+    # they are wanted as programs alone: no service of theirs may start
     services=
     if [ -d /run/systemd/system ]; then
-        for service in etcd containerd; do
+        for service in etcd containerd docker-registry; do
             case " $packages " in *" $service"*) services="$services $service.service" ;; esac
         done
         [ -z "$services" ] || as_root systemctl mask --runtime --quiet $services

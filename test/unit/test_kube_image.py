@@ -108,3 +108,5 @@ def test_a_program_that_is_not_there_is_told(monkeypatch):
     raised(ConfigurationError, lambda: image.engine('kaniko'))
     monkeypatch.setattr(process, 'which', lambda name: name == 'docker')
     assert image.engine() == 'docker'
+    monkeypatch.setattr(process, 'which', lambda name: None)
+    assert raised(PrerequisiteError, lambda: image.engine('docker')).hint.endswith(' docker.io')

@@ -29,6 +29,7 @@ from fogros2.provider.kubernetes import (
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
+from fogros2.provider.kubernetes.pods import Trouble
 from fogros2.testing.shell_contract import raised
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -315,6 +316,14 @@ def test_an_image_that_can_not_be_had_is_told(reason, message, final, word):
     assert trouble.what == f'{reason}: {message}'
     assert trouble.final is final
     assert word in trouble.hint
+
+
+def test_a_pull_that_is_tried_again_keeps_its_reason():
+    """The kubelet says why once, and from then on that it waits for the next try."""
+    why = Trouble('ErrImagePull: dial tcp 1.2.3.4:443: i/o timeout')
+    waiting = Trouble('ImagePullBackOff: Back-off pulling image "x"')
+    assert waiting.less_than(why)
+    assert not why.less_than(waiting) and not waiting.less_than(Trouble('FailedScheduling: x'))
 
 
 def test_a_container_that_is_being_made_is_no_trouble():

@@ -24,8 +24,9 @@ from fogros2.model import Command
 from fogros2.provider.kubernetes.boot import UID
 from fogros2.provider.kubernetes.options import IMAGE
 
-#: Programs that build and push images, in the order in which they are looked for.
-ENGINES = ('podman', 'docker', 'buildah')
+#: Programs that build and push images, in the order in which they are looked for, each with its
+#: Debian package.
+ENGINES = {'podman': 'podman', 'docker': 'docker.io', 'buildah': 'buildah'}
 NAME = 'fogros2'
 CONTAINERFILE = 'Containerfile'
 MANIFEST = 'package.xml'
@@ -40,10 +41,12 @@ class Recipe:
     How an image is built.
 
     :param reference: its name, registry and tag included.
+    :param base: the image that it begins with.
     :param files: texts by name, the Containerfile among them: all that goes into the build.
     """
 
     reference: str
+    base: str
     files: tuple[tuple[str, str], ...]
 
 
@@ -73,7 +76,7 @@ def recipe(
     files = [(CONTAINERFILE, _containerfile(dependencies, packages, keys, base, user, distro))]
     if keys:
         files.append((MANIFEST, _manifest(keys)))
-    return Recipe(f'{registry}/{NAME}:{dependencies}', tuple(files))
+    return Recipe(f'{registry}/{NAME}:{dependencies}', base, tuple(files))
 
 
 def _containerfile(
@@ -143,8 +146,9 @@ def engine(wanted: str = 'auto') -> str:
         if process.which(name):
             return name
     names = ', '.join(ENGINES) if wanted == 'auto' else wanted
+    package = ENGINES['podman' if wanted == 'auto' else wanted]
     raise PrerequisiteError(f'{names} not found on this computer',
-                            f'sudo apt-get install {ENGINES[0] if wanted == "auto" else wanted}')
+                            f'sudo apt-get install {package}')
 
 
 def commands(what: Recipe, folder: Path, program: str, *, push: bool = True) -> list[Command]:
@@ -178,8 +182,10 @@ def build(
             process.run(dataclasses.replace(command, environment=_login()), timeout=timeout,
                         cancel=cancel, on_output=on_output)
         except CommandError as error:
-            raise ProviderError(str(error.args[0]), _hint(error.result.stderr, what, program)) \
-                from error
+            said = error.result.stderr
+            image = what.reference if command.argv[1] == 'push' else what.base
+            raise ProviderError(f'{command.what} failed: {_reason(said)}',
+                                _hint(said, image, program, command.argv[1])) from error
     return what.reference
 
 
@@ -189,15 +195,35 @@ def _login() -> dict[str, str]:
             if os.environ.get(name)}
 
 
-def _hint(said: str, what: Recipe, program: str) -> str:
-    registry = what.reference.partition('/')[0]
-    text = said.lower()
-    if re.search(r'unauthorized|denied|authentication required|forbidden', text):
-        return f'{program} login {registry}'
+def _reason(said: str) -> str:
+    """Return the last error among a program's words: those before are of tries that it made."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    errors = [line for line in lines if re.match(r'error\b', line, re.I)]
+    return (errors or lines or ['it says nothing'])[-1]
+
+
+def _hint(said: str, image: str, program: str, step: str) -> str:
+    """
+    Return what to do about a failure.
+
+    :param image: what was to be had from its registry, or brought there.
+    :param step: 'build' or 'push'.
+    """
+    registry = image.partition('/')[0] if re.match(r'[^/]*[.:][^/]*/|localhost/', image) \
+        else 'docker.io'
+    text = _reason(said).lower()
+    pushes = step == 'push'
+    if re.search(r'unauthorized|denied|authentication required|no basic auth|forbidden', text) \
+            and 'permission denied' not in text:
+        return f'{program} login {registry}' if pushes else \
+            f'is there an image {image}? If it takes a login: {program} login {registry}'
     if re.search(r'connection refused|no such host|timeout|network is unreachable|lookup ', text):
-        return f'is {registry} right, and reachable from here?'
+        return f'is {registry} right, and reachable from here?' if pushes else \
+            f'is there an image {image}, and is {registry} reachable? --base names another'
     if 'server gave http response' in text:
         return f'{registry} speaks no TLS: let {program} know that it is an insecure registry'
     if 'permission denied' in text:
         return f'let this user use {program}, or run this as root'
+    if not pushes and re.search(r'manifest unknown|not found|no such image', text):
+        return f'is there an image {image}? --base names another'
     return ''

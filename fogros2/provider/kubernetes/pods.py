@@ -33,6 +33,10 @@ class Trouble:
     hint: str = ''
     final: bool = False
 
+    def less_than(self, before: Trouble) -> bool:
+        """Return whether this says less than what was said before: only that it goes on."""
+        return self.what.startswith('ImagePullBackOff') and before.what.startswith('ErrImagePull')
+
 
 def timestamp(text: str) -> float:
     """Return a time of the API's in seconds since the epoch."""

@@ -89,6 +89,8 @@ class Start:
             raise self._error(trouble)
         if trouble is None or self._trouble is None:
             self._since = time.monotonic()
+        elif trouble.less_than(self._trouble):
+            return
         self._trouble = trouble
 
     def _error(self, trouble: Trouble) -> ProviderError:

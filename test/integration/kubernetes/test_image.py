@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog image create`` with a real builder and a real registry, where the pod gets it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import os
+from pathlib import Path
+import shutil
+import socket
+import subprocess
+import tarfile
+import threading
+
+import bcrypt
+import pytest
+
+from fogros2.model import Command, MachineSpec
+from fogros2.process import run
+from fogros2.provider.kubernetes import KubernetesProvider
+from fogros2.testing import request_for
+from fogros2.testing.cluster import services
+from fogros2.testing.launched import ros2
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+    pytest.mark.skipif(os.geteuid() != 0, reason='builds images as root'),
+]
+
+BASE = 'localhost/fogt-base:1'
+APPLETS = ('cat chmod chown cp date echo grep kill ls mkdir rm sh sleep test true').split()
+#: Stands for the packages, which nobody has here: notes which were asked for.
+APT = '#!/bin/sh\necho "$*" >>/asked\n'
+
+
+def base_layer(target):
+    """Write a system that consists of one program, as an archive."""
+    with tarfile.open(target, 'w') as layer:
+        def put(name, data, mode=0o755, **more):
+            info = tarfile.TarInfo(name)
+            info.size, info.mode = len(data), mode
+            for key, value in more.items():
+                setattr(info, key, value)
+            layer.addfile(info, io.BytesIO(data))
+
+        put('bin/busybox', Path(shutil.which('busybox')).read_bytes())
+        for name in APPLETS:
+            put(f'bin/{name}', b'', type=tarfile.SYMTYPE, linkname='busybox')
+        put('bin/apt-get', APT.encode())
+        put('etc/passwd', b'root:x:0:0::/root:/bin/sh\nfog:x:1729:1729::/root:/bin/sh\n', 0o644)
+
+
+class Registry:
+    """A registry on this computer's end of the cluster's cable."""
+
+    def __init__(self, folder, cluster, stack, *, password=''):
+        self.host = cluster.layout.host
+        with socket.socket() as probe:
+            probe.bind((self.host, 0))
+            self.name = f'{self.host}:{probe.getsockname()[1]}'
+        folder.mkdir()
+        config = folder / 'config.yml'
+        auth = ''
+        if password:
+            hashed = bcrypt.hashpw(password.encode(), bcrypt.gensalt(4)).decode()
+            (folder / 'users').write_text(f'robot:{hashed}\n')
+            auth = f'auth: {{htpasswd: {{realm: test, path: {folder}/users}}}}\n'
+        config.write_text(
+            f'version: 0.1\nstorage: {{filesystem: {{rootdirectory: {folder}/data}}}}\n'
+            f"http: {{addr: '{self.name}', secret: none}}\n{auth}")
+        self.child = subprocess.Popen(['docker-registry', 'serve', str(config)],
+                                      stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        stack.callback(self.child.wait)
+        stack.callback(self.child.kill)
+        wait_until(self.listens, timeout=30.0, what='the registry')
+        known = cluster.folder / services.REGISTRIES / self.name
+        known.mkdir(parents=True)
+        stack.callback(shutil.rmtree, known)
+        (known / 'hosts.toml').write_text(
+            f'[host."http://{self.name}"]\n  capabilities = ["pull", "resolve"]\n')
+
+    def listens(self):
+        host, port = self.name.split(':')
+        with socket.socket() as probe:
+            return probe.connect_ex((host, int(port))) == 0
+
+
+@pytest.fixture(scope='module')
+def builder(engine, kubernetes, tmp_path_factory):
+    """Return what makes an image, with a store and settings of the test's own, and a registry."""
+    folder = tmp_path_factory.mktemp('builder')
+    settings = {'CONTAINERS_STORAGE_CONF': folder / 'storage.conf',
+                'CONTAINERS_REGISTRIES_CONF': folder / 'registries.conf'}
+    settings['CONTAINERS_STORAGE_CONF'].write_text(
+        f'[storage]\ndriver = "vfs"\ngraphroot = "{folder}/store"\nrunroot = "{folder}/run"\n')
+    base_layer(folder / 'base.tar')
+    with contextlib.ExitStack() as stack:
+        registry = Registry(folder / 'open', kubernetes, stack)
+        closed = Registry(folder / 'closed', kubernetes, stack, password='secret')
+        settings['CONTAINERS_REGISTRIES_CONF'].write_text(''.join(
+            f'[[registry]]\nlocation = "{name}"\ninsecure = true\n'
+            for name in (registry.name, closed.name)))
+        environment = {name: str(path) for name, path in settings.items()}
+        run(Command((engine, 'import', '-q', '-c', 'ENV PATH=/bin', f'{folder}/base.tar', BASE),
+                    environment=environment), timeout=60.0)
+
+        def create(*words, base=BASE, **more):
+            return ros2('fog', 'image', 'create', '--base', base, '--workspace', '',
+                        '--engine', engine, '--folder', str(folder / 'context'), *words,
+                        environment={**os.environ, **environment, **more})
+
+        create.registry, create.closed, create.folder = registry, closed, folder
+        yield create
+
+
+def test_an_image_is_built_and_pushed_and_a_pod_runs_it(builder, namespace):
+    made = builder('--registry', f'{builder.registry.name}/robots')
+    assert made.returncode == 0, made
+    reference = made.stdout.splitlines()[0].removeprefix('pushed ')
+    assert reference.startswith(f'{builder.registry.name}/robots/fogros2:'), made
+    tag = reference.rpartition(':')[2]
+    assert f"container_image='{builder.registry.name}/robots/fogros2:{{dependencies}}'" \
+        in made.stdout
+    provider = KubernetesProvider()
+    # no Python in it, so nobody there could answer the question for a node's port
+    spec = MachineSpec('built', provider.name, {
+        'container_image': reference.replace(tag, '{dependencies}'), 'expose': 'pod_dials_robot'})
+    machine_id = provider.create(
+        spec, dataclasses.replace(request_for(spec), dependencies=tag))
+    try:
+        provider.reachable(machine_id, name='built', timeout=60.0, cancel=threading.Event())
+        (pod,) = namespace.all('pods')
+        status, = pod['status']['containerStatuses']
+        assert status['image'] == reference and 'running' in status['state']
+    finally:
+        provider.destroy(machine_id)
+
+
+def test_the_image_holds_what_was_asked_for(builder):
+    made = builder('--registry', 'localhost/fogt', '--no-push')
+    assert made.returncode == 0 and made.stdout.startswith('built localhost/fogt/fogros2:'), made
+    asked = [line for layer in (builder.folder / 'store').rglob('asked')
+             for line in layer.read_text().splitlines()]
+    assert 'update' in asked
+    installs = next(line for line in asked if line.startswith('install -y'))
+    assert {'ros-jazzy-ros-base', 'ros-jazzy-rmw-cyclonedds-cpp', 'rsync', 'wireguard-tools',
+            'wireguard-go'} <= set(installs.split())
+
+
+def test_a_registry_that_wants_a_login(builder):
+    made = builder('--registry', f'{builder.closed.name}/robots')
+    assert made.returncode == 1, made
+    assert f'pushing {builder.closed.name}/robots/fogros2:' in made.stderr, made
+    assert f'login {builder.closed.name}' in made.stderr, made
+
+
+def test_a_registry_that_is_not_there(builder):
+    with socket.socket() as taken:
+        taken.bind((builder.registry.host, 0))
+        name = f'{builder.registry.host}:{taken.getsockname()[1]}'
+        made = builder('--registry', f'{name}/robots')
+    assert made.returncode == 1, made
+    assert 'connection refused' in made.stderr, made
+    assert f'is {name} right, and reachable from here?' in made.stderr, made
+
+
+def test_a_registry_without_tls_that_nobody_has_allowed(builder):
+    made = builder('--registry', f'{builder.registry.name}/robots',
+                   CONTAINERS_REGISTRIES_CONF='/dev/null')
+    assert made.returncode == 1, made
+    assert 'speaks no TLS' in made.stderr, made
+
+
+def test_an_image_to_begin_with_that_is_not_there(builder):
+    missing = f'{builder.registry.name}/nothing:1'
+    made = builder('--registry', f'{builder.registry.name}/robots', base=missing)
+    assert made.returncode == 1, made
+    assert f'is there an image {missing}? --base names another' in made.stderr, made
+
+
+def test_a_builder_that_is_not_there(builder, tmp_path):
+    made = builder('--registry', 'localhost/fogt', '--engine', 'docker', PATH=os.path.dirname(
+        shutil.which('ros2')))
+    assert made.returncode == 1, made
+    assert 'docker not found' in made.stderr and 'apt-get install docker.io' in made.stderr, made
