@@ -19,11 +19,12 @@ ID=unknown VERSION_ID= VERSION_CODENAME=
 [ ! -r /etc/os-release ] || . /etc/os-release
 echo "os $ID ${VERSION_ID:--} ${VERSION_CODENAME:--}"
 echo "arch $(uname -m)"
-echo "user $(id -u) $(id -un)"
+u=$(id -u)
+echo "user $u $(id -un)"
 echo "home $HOME"
 echo "libc $(getconf GNU_LIBC_VERSION 2>/dev/null || echo other 0)"
 # in a pod the shell runs as root what asks for it, without sudo
-if [ "$(id -u)" = 0 ] || [ -n "$FOGROS2_ROOT" ] || sudo -n true 2>/dev/null; then echo root; fi
+if [ "$u" = 0 ] || [ -n "$FOGROS2_ROOT" ] || sudo -n true 2>/dev/null; then echo root; fi
 seen=
 for x in /usr/bin/python3 "$(command -v python3)" /usr/bin/python3.1[0-9] \
         /usr/local/bin/python3.1[0-9]; do
@@ -55,12 +56,15 @@ done
 for e in "$@"; do
     [ -d "$e" ] || continue
     if [ -e "$e/pyvenv.cfg" ]; then
-        "$e/bin/python" -ISc '' 2>/dev/null || continue
-        # a glob costs nothing; only a development install has it elsewhere
+        # only a development install has it elsewhere; each start of Python is what takes long here
         for w in "$e"/lib/python3*/site-packages/fogros2; do
-            [ -d "$w" ] || w=$("$e/bin/python" -c 'import importlib.util as u
+            if [ -d "$w" ]; then
+                "$e/bin/python" -ISc '' 2>/dev/null || continue 2
+            else
+                w=$("$e/bin/python" -c 'import importlib.util as u
 s = u.find_spec("fogros2")
 print(*s.submodule_search_locations if s else ())' 2>/dev/null) || continue 2
+            fi
             [ -z "$w" ] || [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
         done
     else

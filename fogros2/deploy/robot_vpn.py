@@ -149,6 +149,8 @@ class RobotVpn:
             with self._lock:
                 if self._stop.is_set():
                     return
+                if self._launch.ending:
+                    continue  # with the machines go the networks that lead to them
                 try:
                     alive = process.run(self.vpn.alive(self.interface), check=False,
                                         timeout=self._launch.timeouts.vpn)

@@ -35,13 +35,11 @@ PORTS_PER_DOMAIN = 250
 DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
 
-#: Shell text that defines ``from``: for addresses, one a line, the ones of this computer that
-#: packets to them leave from.
-_FROM = """\
-from() { sed 's/^/route get /' | ip -force -batch - 2>/dev/null | \
-sed -n 's/.* src \\([^ ]*\\).*/\\1/p'; }"""
-#: Shell text that prints the hosts of ``wg show ... endpoints`` that are known.
-_HOSTS = r"sed -n 's/^[^[:space:]]*[[:space:]]*\[*\([^][]*\)\]*:[0-9]*$/\1/p'"
+#: Shell text that makes of ``wg show ... endpoints`` questions to ``ip -batch``, one for each host
+#: that is known.
+_ASK = r"sed -n 's/^[^[:space:]]*[[:space:]]*\[*\([^][]*\)\]*:[0-9]*$/route get \1/p'"
+#: Shell text that makes of the answers the addresses of this computer that packets leave from.
+_FROM = r"ip -force -batch - 2>/dev/null | sed -n 's/.* src \([^ ]*\).*/\1/p'"
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
 _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
 
@@ -114,8 +112,8 @@ class WireGuard(Vpn):
             '[ "$carrier" = 1 ]']
         if interface.guarded:
             noted = _noted(interface)
-            lines += [_FROM, f'[ ! -e {noted} ] || '
-                             f'{{ read -r before; [ "$(echo $(from))" = "$before" ]; }} <{noted}']
+            lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
+                         f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
@@ -320,8 +318,8 @@ def _configure(
     lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
     if interface.guarded:
         # for ``alive``, which isn't root
-        lines += [_FROM, f'hosts=$(wg show {_name(interface)} endpoints | {_HOSTS})',
-                  f'(umask 022; {{ echo $(echo "$hosts" | from); echo "$hosts"; }} '
+        lines += [f'ask=$(wg show {_name(interface)} endpoints | {_ASK})',
+                  f'(umask 022; {{ echo "#" $(echo "$ask" | {_FROM}); echo "$ask"; }} '
                   f'>{_noted(interface)})']
     return '\n'.join(lines)
 
