@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What nodes that handle images import beyond ROS 2, and how a machine gets what it lacks of it.
+What some of our programs import beyond ROS 2, and how a machine gets what it lacks of it.
 
-That goes into a folder which these nodes alone look into, so that nothing else on the machine
+That goes into a folder which these programs alone look into, so that nothing else on the machine
 finds another NumPy than it was built for. The robot's own modules travel where they run on the
 machine as they are; else the machine asks its package index. Not apt: Ubuntu 24.04 has PyAV 11,
 which can't be told a colour range.
@@ -33,35 +33,63 @@ class Module:
     A Python module that isn't ROS 2's.
 
     :param distributions: those that have it; the first is the one to install.
-    :param oldest: first number of the version that is needed at least.
+    :param oldest: the version that is needed at least, its first numbers.
+    :param replaced_by: a ROS package in whose place it is; nobody who has that one needs it.
     """
 
     name: str
     distributions: tuple[str, ...]
-    oldest: int = 0
+    oldest: tuple[int, ...] = ()
+    replaced_by: str = ''
+
+    @property
+    def requirement(self) -> str:
+        """As pip takes it."""
+        version = '.'.join(map(str, self.oldest))
+        return f'{self.distributions[0]}>={version}' if version else self.distributions[0]
 
 
-MODULES = (
+MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('numpy', ('numpy',)),
     # 14 makes nothing of depth images of a few pixels, and 11 knows no colour range
-    Module('av', ('av',), 15),
+    Module('av', ('av',), (15,)),
     Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
                    'opencv-contrib-python')),
-)
-#: Executables that need them, by package.
-NEEDING: Mapping[str, frozenset[str]] = {
-    'image_transport_h264': frozenset({'encoder', 'decoder'}),
-    'fogros2_examples': frozenset({'camera', 'image_processor'}),
+    Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),
+)}
+IMAGES = ('numpy', 'av', 'cv2')
+#: What (package, executable) pairs need.
+NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ('image_transport_h264', 'encoder'): IMAGES,
+    ('image_transport_h264', 'decoder'): IMAGES,
+    ('fogros2_examples', 'camera'): ('numpy', 'cv2'),
+    ('fogros2_examples', 'image_processor'): ('numpy', 'cv2'),
+    ('fogros2', 'bridge'): ('foxglove',),
 }
 
 #: Imports each, as what is only found may lack a library.
 _ASK = """\
-import importlib, json, platform, sys
+import importlib, json, os, platform, re, sys
+from importlib import metadata
+def version(module, names):
+    if hasattr(module, '__version__'):
+        return module.__version__
+    for name in names:
+        try:
+            return metadata.version(name)
+        except metadata.PackageNotFoundError:
+            pass
+    return ''
 missing = []
-for name, oldest in json.loads(sys.argv[1]):
+for name, names, oldest, package in json.loads(sys.argv[1]):
+    if package and any(
+            os.path.exists(prefix + '/share/ament_index/resource_index/packages/' + package)
+            for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix):
+        continue
     try:
         module = importlib.import_module(name)
-        if oldest and int(module.__version__.split('.')[0]) < oldest:
+        if oldest and [int(n) for n in re.findall(
+                '[0-9]+', version(module, names))[:len(oldest)]] < oldest:
             missing.append(name)
     except Exception:
         missing.append(name)
@@ -113,36 +141,42 @@ class Copy:
     versions: tuple[str, ...]
 
 
-def needed_by(programs: Iterable[tuple[str, str]]) -> bool:
-    """Return whether one of these (package, executable) pairs handles images."""
-    return any(executable in NEEDING.get(package, ()) for package, executable in programs)
+def needed_by(programs: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the names of all that (package, executable) pairs need."""
+    return tuple(dict.fromkeys(
+        name for program in programs for name in NEEDS.get(program, ())))
 
 
-def lacking_here() -> list[Module]:
-    """Return the modules that this Python hasn't got, or too old; imports none of them."""
-    return [module for module in MODULES
-            if importlib.util.find_spec(module.name) is None or _too_old(module)]
+def lacking_here(names: Iterable[str]) -> list[Module]:
+    """Return those modules that this Python hasn't got, or too old; imports none of them."""
+    return [MODULES[name] for name in names
+            if importlib.util.find_spec(name) is None or _too_old(MODULES[name])]
 
 
 def _too_old(module: Module) -> bool:
-    try:
-        return module.oldest > 0 and int(
-            metadata.version(module.distributions[0]).split('.')[0]) < module.oldest
-    except (metadata.PackageNotFoundError, ValueError):
+    found = next(filter(None, map(_installed, module.distributions)), None)
+    if found is None:
         return False  # it is there, in a way that says no version
+    numbers = map(int, re.findall('[0-9]+', found.version)[:len(module.oldest)])
+    return tuple(numbers) < module.oldest
 
 
-def ask(environment: Mapping[str, str], setup: Sequence[str], site: str = '') -> Command:
+def ask(
+    names: Iterable[str], environment: Mapping[str, str], setup: Sequence[str], site: str = '',
+) -> Command:
     """
     Return the command whose output ``answer`` reads.
 
+    :param names: of modules.
     :param environment: of nodes on the machine, ``setup`` the scripts sourced before they run.
     :param site: a folder to look into as well, before all others.
     """
-    words = ['python3', '-c', _ASK, json.dumps([(m.name, m.oldest) for m in MODULES])]
+    words = ['python3', '-c', _ASK, json.dumps([
+        (name, MODULES[name].distributions, MODULES[name].oldest, MODULES[name].replaced_by)
+        for name in names])]
     return _among_nodes(
-        environment, setup, f'{_path(site)}exec {shlex.join(words)}' if site else
-        f'exec {shlex.join(words)}', 'look for what images take')
+        environment, setup, f'{_path([site]) if site else ""}exec {shlex.join(words)}',
+        'look for Python modules')
 
 
 def answer(output: str) -> Answer:
@@ -161,20 +195,19 @@ def answer(output: str) -> Answer:
 
 def copy(there: Answer) -> Optional[Copy]:
     """Return what a machine lacks, from this Python; None where it wouldn't run there."""
-    if (there.python, there.architecture) != (sys.version_info[:2], platform.machine()):
+    if there.architecture != platform.machine():
         return None
     folder, entries, versions = '', set(), []
-    for module in MODULES:
-        if module.name in there.missing:
-            found = next(filter(None, map(_installed, module.distributions)), None)
-            if found is None or not runs_on(libc_for(_wheel_names(found)), there.libc):
-                return None
-            if folder not in ('', str(found.locate_file(''))):
-                return None
-            folder = str(found.locate_file(''))
-            # the rest are programs, in a bin beside it
-            entries |= {file.parts[0] for file in found.files or () if file.parts[0] != '..'}
-            versions.append(f'{found.name} {found.version}')
+    for name in there.missing:
+        found = next(filter(None, map(_installed, MODULES[name].distributions)), None)
+        if found is None or not _runs(found, there):
+            return None
+        if folder not in ('', str(found.locate_file(''))):
+            return None
+        folder = str(found.locate_file(''))
+        # the rest are programs, in a bin beside it
+        entries |= {file.parts[0] for file in found.files or () if file.parts[0] != '..'}
+        versions.append(f'{found.name} {found.version}')
     return Copy(folder, tuple(sorted(entries)), tuple(versions))
 
 
@@ -185,11 +218,20 @@ def _installed(name: str) -> Optional[metadata.Distribution]:
         return None
 
 
-def _wheel_names(found: metadata.Distribution) -> list[str]:
-    """Return names of wheels that this was installed from, or one that runs here alone."""
-    tags = re.findall(r'^Tag: (\S+)$', found.read_text('WHEEL') or '', re.MULTILINE)
-    return ['-'.join(tags[0].split('-')[:2]) + '-' + '.'.join(t.split('-')[2] for t in tags)
-            ] if tags else ['py3-none-linux']
+def _runs(found: metadata.Distribution, there: Answer) -> bool:
+    """Return whether a machine of this processor runs it as it is installed here."""
+    tags = [tag.split('-') for tag in re.findall(
+        r'^Tag: (\S+)$', found.read_text('WHEEL') or '', re.MULTILINE)]
+    if not tags:
+        return False  # not pip's: it may need libraries of this computer's
+    # compiled for this very Python; for that of its tag and later ones; or not at all
+    least = re.fullmatch(r'(?:cp|py)(\d)(\d*)', tags[0][0])
+    stable = tags[0][1] in ('abi3', 'none') and least is not None and there.python >= (
+        int(least[1]), int(least[2] or 0))
+    if not stable and there.python != sys.version_info[:2]:
+        return False
+    wheel = f"x-{'.'.join(tag[2] for tag in tags)}.whl"
+    return runs_on(libc_for([wheel]), there.libc)
 
 
 def folder(home: str, there: Answer, versions: Sequence[str]) -> str:
@@ -208,22 +250,29 @@ def install(
     environment: Mapping[str, str], setup: Sequence[str], target: str, missing: Sequence[str],
 ) -> Command:
     """Return what installs them from the machine's index, into ``target``/site."""
-    names = [f'{m.distributions[0]}>={m.oldest}' for m in MODULES if m.name in missing]
+    names = [MODULES[name].requirement for name in missing]
     return _among_nodes(environment, setup, 'set -e\n' + _INSTALL.format(
-        folder=shlex.quote(target), names=shlex.join(names)), 'install what images take')
+        folder=shlex.quote(target), names=shlex.join(names)), 'install Python modules')
 
 
-def fitted(node: NodeSpec, target: str) -> NodeSpec:
-    """Return a node that finds what is in ``target``/site, if it is one that handles images."""
-    if not target or node.shell or not needed_by([(node.package, node.executable)]):
+def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:
+    """
+    Return a node that finds what it needs.
+
+    :param places: folders of modules, '' for those that are found without.
+    """
+    needed = needed_by([(node.package, node.executable)])
+    sites = dict.fromkeys(f'{places[name]}/site' for name in needed if places.get(name))
+    if not sites or node.shell:
         return node
     # in front of what is there: that may be there and too old
     return dataclasses.replace(node, prefix=(
-        *node.prefix, 'sh', '-c', _path(f'{target}/site') + 'exec "$@"', 'sh'))
+        *node.prefix, 'sh', '-c', _path(sites) + 'exec "$@"', 'sh'))
 
 
-def _path(site: str) -> str:
-    return f'export PYTHONPATH={shlex.quote(site)}${{PYTHONPATH:+:$PYTHONPATH}}\n'
+def _path(sites: Iterable[str]) -> str:
+    path = shlex.quote(':'.join(sites))
+    return f'export PYTHONPATH={path}${{PYTHONPATH:+:$PYTHONPATH}}\n'
 
 
 def _among_nodes(

@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from fogros2 import bootstrap, modules, workspace
+from fogros2 import bootstrap, workspace
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.equipping import Equipment
@@ -91,9 +91,8 @@ class Deployment:
             return ros
 
     def equip(self, equipment: Equipment) -> None:
-        """Bring what nodes import that are known to come; later ones bring theirs."""
-        if modules.needed_by(self.launch.programs(self.job.name)):
-            equipment.ensure()
+        """Bring what programs import that are known to come; later ones bring theirs."""
+        equipment.ensure(self.launch.programs(self.job.name))
 
     # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Brings what nodes that handle images import to a machine without it, once, when it is needed."""
+"""Brings Python modules that programs need to a machine without them, when they are needed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 from pathlib import Path
 import threading
+from typing import Optional
 
 from fogros2 import bootstrap, modules
 from fogros2.deploy.job import Job
@@ -29,9 +30,8 @@ class Equipment:
         self._setup = ros.setup
         self._home = ros.facts.home
         self._lock = threading.Lock()
-        self._complete = False
-        #: Where the modules lie that the machine lacked.
-        self._folder = ''
+        #: Where modules lie, '' for those that the machine has itself.
+        self._places: dict[str, str] = {}
 
     def fitted(self, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
         """
@@ -39,33 +39,38 @@ class Equipment:
 
         :raises PrerequisiteError: the machine can't have it.
         """
-        if not modules.needed_by((node.package, node.executable) for node in nodes):
-            return list(nodes)
-        self.ensure()
-        return [modules.fitted(node, self._folder) for node in nodes]
+        self.ensure((node.package, node.executable) for node in nodes)
+        return [modules.fitted(node, self._places) for node in nodes]
 
-    def ensure(self) -> None:
+    def ensure(self, programs: Iterable[tuple[str, str]]) -> None:
         """
-        Bring what is missing, in the first call.
+        Bring what (package, executable) pairs need and the machine lacks.
 
         :raises PrerequisiteError: the machine can't have it.
         """
         with self._lock:
-            if self._complete:
-                return
-            with self._job.step('modules for images') as detail:
-                detail.append(self._bring())
-            self._complete = True
+            names = [name for name in modules.needed_by(programs) if name not in self._places]
+            if names:
+                with self._job.step('Python modules') as detail:
+                    detail.append(self._bring(names))
 
-    def _bring(self) -> str:
-        there = self._ask()
-        if not there.missing:
-            return 'there already'
-        copy = modules.copy(there)
-        target = modules.folder(self._home, there, copy.versions if copy else ())
-        if self._has(target):
-            self._folder = target
-            return 'there from before'
+    def _bring(self, names: Sequence[str]) -> str:
+        there = self._ask(names)
+        target, how = '', 'there already'
+        if there.missing:
+            copy = modules.copy(there)
+            target = modules.folder(self._home, there, copy.versions if copy else ())
+            how = 'there from before'
+            if not self._has(target):
+                self._fill(target, there, copy)
+                how = f"{', '.join(there.missing)} {'installed' if copy is None else 'sent'}"
+        self._places |= {name: target if name in there.missing else '' for name in names}
+        return how
+
+    def _fill(
+        self, target: str, there: modules.Answer, copy: Optional[modules.Copy],
+    ) -> None:
+        """Put what is missing into a folder there."""
         if copy is not None:
             self._shell.sync(
                 Path(copy.folder), f'{target}/site', excludes=('/*',),
@@ -77,32 +82,31 @@ class Equipment:
                     self._environment, self._setup, target, there.missing))
             except CommandError as error:
                 raise self._without(there, str(error)) from error
-        left = self._ask(f'{target}/site').missing
+        left = self._ask(there.missing, f'{target}/site').missing
         if left:
             raise self._without(dataclasses.replace(there, missing=left),
                                 'they were installed, and can not be imported')
         self._run(Command(('touch', f'{target}/complete'), what='note what is there'))
-        self._folder = target
-        return f"{', '.join(there.missing)} {'installed' if copy is None else 'sent'}"
 
     def _has(self, target: str) -> bool:
         done = self._shell.run(
-            Command(('test', '-e', f'{target}/complete'), what='look for modules'),
+            Command(('test', '-e', f'{target}/complete'), what='look for what was brought before'),
             timeout=self._job.timeouts.command, check=False, cancel=self._job.cancel)
         return done.returncode == 0
 
-    def _ask(self, site: str = '') -> modules.Answer:
-        return modules.answer(self._run(modules.ask(self._environment, self._setup, site)))
+    def _ask(self, names: Sequence[str], site: str = '') -> modules.Answer:
+        return modules.answer(self._run(
+            modules.ask(names, self._environment, self._setup, site)))
 
     def _run(self, command: Command) -> str:
         return self._shell.run(
             command, timeout=self._job.timeouts.install, cancel=self._job.cancel).stdout
 
     def _without(self, there: modules.Answer, why: str) -> PrerequisiteError:
-        names = ' '.join(m.distributions[0] for m in modules.MODULES if m.name in there.missing)
+        names = ' '.join(modules.MODULES[name].distributions[0] for name in there.missing)
         version = '.'.join(map(str, there.python))
         return PrerequisiteError(
-            f"'{self._job.name}' can't get {', '.join(there.missing)}, which streams of images "
-            f'take: {why}',
+            f"'{self._job.name}' can't get {', '.join(there.missing)}, which programs there "
+            f'import: {why}',
             f'take an image with them (pip install {names}), or a robot with Python {version} as '
             'there, whose modules can be sent')

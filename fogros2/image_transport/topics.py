@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 import json
 import re
+import shlex
 from typing import Any, Optional
 
 from fogros2 import modules
@@ -83,15 +84,11 @@ def check_modules() -> None:
 
     :raises PrerequisiteError: it can't.
     """
-    lacking = modules.lacking_here()
+    lacking = [module.requirement for module in modules.lacking_here(modules.IMAGES)]
     if lacking:
-        names = [f'{m.distributions[0]} {m.oldest} or newer' if m.oldest else m.distributions[0]
-                 for m in lacking]
-        wanted = ' '.join(f"'{m.distributions[0]}>={m.oldest}'" if m.oldest
-                          else m.distributions[0] for m in lacking)
         raise PrerequisiteError(
-            f"streams of images need {', '.join(names)}, which this Python does not have",
-            f'pip install {wanted}')
+            f"streams of images need {', '.join(lacking)}, which this Python does not have",
+            f'pip install {shlex.join(lacking)}')
 
 
 def remappings(

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What nodes that handle images import: looked for, brought, and found by them alone."""
+"""Modules that programs import: looked for, brought, and found by these programs alone."""
 
 from __future__ import annotations
 
 import dataclasses
-from importlib import metadata
 import os
 from pathlib import Path
 import platform
@@ -33,20 +32,23 @@ HERE = modules.Answer(
 
 
 @pytest.mark.parametrize('programs, needed', [
-    ([], False), ([('fogros2_examples', 'talker')], False), ([('my_robot', 'encoder')], False),
-    ([('fogros2_examples', 'talker'), ('image_transport_h264', 'decoder')], True),
-    ([('fogros2_examples', 'image_processor')], True)])
-def test_who_needs_them(programs: list[tuple[str, str]], needed: bool) -> None:
-    assert modules.needed_by(programs) is needed
+    ([], ()), ([('fogros2_examples', 'talker')], ()), ([('my_robot', 'encoder')], ()),
+    ([('fogros2_examples', 'talker'), ('image_transport_h264', 'decoder')],
+     ('numpy', 'av', 'cv2')),
+    ([('fogros2_examples', 'image_processor')], ('numpy', 'cv2')),
+    ([('fogros2_examples', 'camera'), ('fogros2', 'bridge')], ('numpy', 'cv2', 'foxglove'))])
+def test_who_needs_what(programs: list[tuple[str, str]], needed: tuple[str, ...]) -> None:
+    assert modules.needed_by(programs) == needed
 
 
 def test_nodes_that_need_them_find_them_first_and_no_other_does(tmp_path: Path) -> None:
     decoder = NodeSpec('1', 'decoder', 'image_transport_h264', 'decoder', ('--ros-args',))
     talker = NodeSpec('2', 'talker', 'fogros2_examples', 'talker')
     place = tmp_path / 'a folder'
-    assert modules.fitted(talker, str(place)) is talker
-    assert modules.fitted(decoder, '') is decoder
-    prefix = modules.fitted(decoder, str(place)).prefix
+    places = {'numpy': '', 'av': str(place), 'cv2': str(place), 'foxglove': '/else'}
+    assert modules.fitted(talker, places) is talker
+    assert modules.fitted(decoder, {'numpy': '', 'av': '', 'cv2': ''}) is decoder
+    prefix = modules.fitted(decoder, places).prefix
     for before, after in ((None, f'{place}/site'), ('/a:/b', f'{place}/site:/a:/b')):
         environment = {'PATH': os.environ['PATH'], **({'PYTHONPATH': before} if before else {})}
         said = subprocess.run(
@@ -63,6 +65,12 @@ def test_what_is_here_can_be_copied_where_it_runs() -> None:
     assert Path(copy.folder, 'av', '__init__.py').is_file()
     some = modules.copy(dataclasses.replace(HERE, missing=('av',)))
     assert some is not None and 'av' in some.entries and 'cv2' not in some.entries
+
+
+def test_what_is_compiled_for_later_pythons_too_can_be_copied_to_those() -> None:
+    later = dataclasses.replace(HERE, python=(3, 99), missing=('cv2',))
+    assert modules.copy(later) is not None
+    assert modules.copy(dataclasses.replace(later, missing=('numpy',))) is None
 
 
 @pytest.mark.parametrize('changes', [
@@ -87,9 +95,28 @@ def test_a_machine_without_python_says_so(output: str) -> None:
 
 
 def test_one_that_is_too_old_is_lacking(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert modules.lacking_here() == []
-    monkeypatch.setattr(metadata, 'version', lambda name: '11.0.0')
-    assert [module.name for module in modules.lacking_here()] == ['av']
+    assert modules.lacking_here(modules.IMAGES) == []
+    monkeypatch.setattr(modules, '_installed', lambda name: SimpleNamespace(version='11.0.0'))
+    assert [module.name for module in modules.lacking_here(modules.IMAGES)] == ['av']
+
+
+@pytest.mark.parametrize('version, package, missing', [
+    ('0.29.9', '', ('foxglove',)), ('0.30.0', '', ()), ('1.0', '', ()), ('', '', ('foxglove',)),
+    ('', 'foxglove_bridge', ())])
+def test_a_ros_package_may_stand_in_its_place(
+    tmp_path: Path, version: str, package: str, missing: tuple[str, ...],
+) -> None:
+    if version:
+        (tmp_path / 'foxglove.py').write_text(f'__version__ = {version!r}\n')
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    if package:
+        (index / package).touch()
+    variables = {'AMENT_PREFIX_PATH': f'/elsewhere:{tmp_path}', 'PYTHONPATH': str(tmp_path),
+                 'PATH': '/usr/bin:/bin'}
+    command = modules.ask(['foxglove'], variables, [])
+    said = subprocess.run(command.argv, check=True, text=True, stdout=subprocess.PIPE).stdout
+    assert modules.answer(said).missing == missing
 
 
 # --- on a machine: this computer, by its own shell ----------------------------------------------
