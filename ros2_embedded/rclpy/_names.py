@@ -102,9 +102,6 @@ def topic_name_fault(name: str) -> Fault | None:
                     "'_', '~', '{', or '}'", place)
     if opened >= 0:
         return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
-    if len(name) > 1 and name[0] == '~' and name[1] != '/':
-        return ("topic name must not have a tilde '~' that is not followed by a "
-                "forward slash '/'", 1)
     if (digit := _digit_after_slash(name)) is not None:
         return 'topic name token must not start with a number', digit
     return None
@@ -169,16 +166,16 @@ def expand(name: str, node: str, namespace: str) -> str:
     for part, fault in ((name, topic_name_fault(name)), (node, node_name_fault(node)),
                         (namespace, namespace_fault(namespace))):
         if fault is not None:
-            raise ValueError(f"'{part}' is invalid: {fault[0]}")
+            raise ValueError(f"topic name '{part}' is invalid: {fault[0]}")
     values = {'node': node, 'ns': namespace, 'namespace': namespace}
 
     def value(found: 're.Match[str]') -> str:
         if found[1] not in values:
-            raise ValueError(f'unknown substitution: {found[0]}')
+            raise ValueError(f"topic name '{name}' is invalid: unknown substitution: {found[0]}")
         return values[found[1]]
 
     if name[0] == '~':
-        name = join(join(namespace, node), name[2:]) if len(name) > 1 else join(namespace, node)
+        name = join(namespace, node) + name[1:]
     name = _SUBSTITUTION.sub(value, name)
     return name if name.startswith('/') else join(namespace, name)
 

@@ -157,7 +157,3 @@ class ROSInterruptException(Exception):
 
     def __init__(self) -> None:
         super().__init__('rclpy.shutdown() has been called')
-
-
-class TimerCancelledError(RCLError):
-    """A cancelled timer has no next call."""

@@ -42,9 +42,11 @@ from rclpy.event_handler import (
     SubscriptionEventCallbacks,
 )
 from rclpy.exceptions import (
+    NameValidationException,
     NodeNameNonExistentError,
     NotEmbeddedError,
     NotInitializedException,
+    RCLError,
 )
 from rclpy.executors import Executor
 from rclpy.guard_condition import GuardCondition
@@ -63,6 +65,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.service import Service
+from rclpy.service_introspection import Introspected
 from rclpy.subscription import Subscription
 from rclpy.time_source import TimeSource
 from rclpy.timer import Rate, Timer
@@ -272,17 +275,23 @@ class Node(NodeParameters, NodeGraph):
         """
         Expand and remap a topic's name.
 
-        :raises InvalidTopicNameException: if it is invalid.
+        :raises RCLError: if it is invalid.
         """
-        return self._resolve(topic, only_expand, False)
+        try:
+            return self._resolve(topic, only_expand, False)
+        except (NameValidationException, ValueError) as error:
+            raise RCLError(f'failed to resolve name: {error}') from error
 
     def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
         """
         Expand and remap a service's name.
 
-        :raises InvalidServiceNameException: if it is invalid.
+        :raises RCLError: if it is invalid.
         """
-        return self._resolve(service, only_expand, True)
+        try:
+            return self._resolve(service, only_expand, True)
+        except (NameValidationException, ValueError) as error:
+            raise RCLError(f'failed to resolve name: {error}') from error
 
     # --- creating ---
 
@@ -337,7 +346,7 @@ class Node(NodeParameters, NodeGraph):
             raise NotEmbeddedError('qos_overriding_options')
         check_is_valid_msg_type(msg_type)
         publishes = kind is Writer
-        full = self.resolve_topic_name(topic)
+        full = self._resolve(topic, False, False)
         name = topic if profile.avoid_ros_namespace_conventions else TOPIC_PREFIX + full
         profile = self._available(profile, name, publishes)
         type_name = msg_type._definition.name
@@ -394,7 +403,7 @@ class Node(NodeParameters, NodeGraph):
     def _service_entity(self, srv_type: Any, name: str, profile: QoSProfile,
                         serves: bool) -> tuple[Reader, Writer]:
         check_is_valid_srv_type(srv_type)
-        full = self.resolve_service_name(name)
+        full = self._resolve(name, False, True)
         topics = {'Request': f'{REQUEST_PREFIX}{full}Request',
                   'Response': f'{RESPONSE_PREFIX}{full}Reply'}
         identity = f"{'serviceid' if serves else 'clientid'}={self._graph.service_id()};".encode()
@@ -407,12 +416,10 @@ class Node(NodeParameters, NodeGraph):
         self._graph.add_endpoints(self._record, *made)
         return made[0], made[1]
 
-    def _event_writer(self, srv_type: Any, name: str) -> Callable[[QoSProfile], Writer]:
-        def make(profile: QoSProfile) -> Writer:
-            topic = self.resolve_service_name(name) + '/_service_event'
-            writer: Writer = self._topic_entity(Writer, srv_type.Event, topic, profile, None)[0]
-            return writer
-        return make
+    def _event_writer(self, of: Introspected, profile: QoSProfile) -> Writer:
+        topic = self.resolve_service_name(of.srv_name) + '/_service_event'
+        writer: Writer = self._topic_entity(Writer, of.srv_type.Event, topic, profile, None)[0]
+        return writer
 
     def create_client(self, srv_type: Any, srv_name: str, *,
                       qos_profile: QoSProfile = qos_profile_services_default,
@@ -422,7 +429,7 @@ class Node(NodeParameters, NodeGraph):
         client = Client(
             self._context, self._service_entity(srv_type, srv_name, qos_profile, False),
             srv_type, srv_name, qos_profile, group, self._logger_name)
-        client._make_event_writer = self._event_writer(srv_type, srv_name)
+        client._node = weakref.ref(self)
         return self._add(self._clients, client)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any],
@@ -437,7 +444,7 @@ class Node(NodeParameters, NodeGraph):
         service = Service(
             self._service_entity(srv_type, srv_name, qos_profile, True), srv_type, srv_name,
             callback, group, qos_profile, self._logger_name)
-        service._make_event_writer = self._event_writer(srv_type, srv_name)
+        service._node = weakref.ref(self)
         return self._add(self._services, service)
 
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any] | None,

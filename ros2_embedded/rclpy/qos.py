@@ -6,7 +6,7 @@ from typing import Any
 import warnings
 
 from rclpy._dds import Policies
-from rclpy.duration import Duration, Infinite
+from rclpy.duration import Duration
 
 
 class QoSPolicyKind(IntEnum):
@@ -264,31 +264,44 @@ def qos_check_compatible(
 
     :returns: the verdict and the reasons; WARNING where it depends on the middleware.
     """
-    errors, warned = [], []
-    publisher, subscription = publisher_qos, subscription_qos
-    if publisher.reliability == ReliabilityPolicy.BEST_EFFORT \
-            and subscription.reliability == ReliabilityPolicy.RELIABLE:
-        errors.append('ERROR: Best effort publisher and reliable subscription;')
-    if publisher.durability == DurabilityPolicy.VOLATILE \
-            and subscription.durability == DurabilityPolicy.TRANSIENT_LOCAL:
-        errors.append('ERROR: Volatile publisher and transient local subscription;')
-    for name, offered, requested in (
-            ('Deadline', publisher.deadline, subscription.deadline),
-            ('Liveliness lease duration', publisher.liveliness_lease_duration,
-             subscription.liveliness_lease_duration)):
-        if requested not in (_UNSPECIFIED, Infinite) and (
-                offered == _UNSPECIFIED or offered > requested):
-            errors.append(
-                f"ERROR: Subscription's {name.lower()} is shorter than the publisher's;")
-    if publisher.liveliness == LivelinessPolicy.AUTOMATIC \
-            and subscription.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
-        errors.append("ERROR: Publisher's liveliness is automatic and subscription's is "
-                      'manual by topic;')
-    unsure = ('SYSTEM_DEFAULT', 'UNKNOWN')
-    for name in ('reliability', 'durability', 'liveliness'):
-        for who, profile in (('Publisher', publisher), ('Subscription', subscription)):
-            if getattr(profile, name).name in unsure:
-                warned.append(f"WARNING: {who}'s {name} is {getattr(profile, name).name};")
+    offered, requested = publisher_qos, subscription_qos
+    errors = []
+    if offered.reliability == ReliabilityPolicy.BEST_EFFORT \
+            and requested.reliability == ReliabilityPolicy.RELIABLE:
+        errors.append('Best effort publisher and reliable subscription')
+    if offered.durability == DurabilityPolicy.VOLATILE \
+            and requested.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        errors.append('Volatile publisher and transient local subscription')
+    if offered.liveliness == LivelinessPolicy.AUTOMATIC \
+            and requested.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
+        errors.append("Publisher's liveliness is automatic and subscription's is manual by topic")
+    for name, end in (('deadline', ' deadline'), ('liveliness_lease_duration', '')):
+        ours, theirs, words = getattr(offered, name), getattr(requested, name), \
+            name.replace('_', ' ')
+        if ours == _UNSPECIFIED != theirs:
+            errors.append(f'Subscription has a {words}, but publisher does not')
+        elif ours != _UNSPECIFIED != theirs and theirs < ours:
+            errors.append(f'Subscription {words} is less than publisher{end}')
     if errors:
-        return QoSCompatibility.ERROR, ''.join(errors + warned)
-    return (QoSCompatibility.WARNING if warned else QoSCompatibility.OK), ''.join(warned)
+        return QoSCompatibility.ERROR, ''.join(f'ERROR: {error};' for error in errors)
+    warned = []
+    for name, weak, weak_words, strong, strong_words in (
+            ('reliability', ReliabilityPolicy.BEST_EFFORT, 'Best effort publisher',
+             ReliabilityPolicy.RELIABLE, 'Reliable subscription'),
+            ('durability', DurabilityPolicy.VOLATILE, 'Volatile publisher',
+             DurabilityPolicy.TRANSIENT_LOCAL, 'Transient local subscription'),
+            ('liveliness', LivelinessPolicy.AUTOMATIC, "Publisher's liveliness is automatic",
+             LivelinessPolicy.MANUAL_BY_TOPIC, "Subscription's liveliness is manual by topic")):
+        ours, theirs = getattr(offered, name), getattr(requested, name)
+        unsure, unsure_too = (one.name in ('SYSTEM_DEFAULT', 'UNKNOWN') for one in (ours, theirs))
+        whose = "'s" if name == 'liveliness' else ''
+        if unsure and unsure_too:
+            warned.append(f'Publisher {name} is {ours.short_key} and subscription {name} is '
+                          f'{theirs.short_key}')
+        elif unsure and theirs == strong:
+            warned.append(f'{strong_words}, but publisher{whose} is {ours.short_key}')
+        elif ours == weak and unsure_too:
+            warned.append(f'{weak_words}, but subscription{whose} is {theirs.short_key}')
+    if warned:
+        return QoSCompatibility.WARNING, ''.join(f'WARNING: {one};' for one in warned)
+    return QoSCompatibility.OK, ''

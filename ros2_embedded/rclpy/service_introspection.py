@@ -3,13 +3,16 @@
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from rclpy._dds import Writer
 from rclpy._entity import Entity
 from rclpy.clock import Clock
 from rclpy.qos import QoSProfile
 from rosidl_embedded import cdr
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 class ServiceIntrospectionState(IntEnum):
@@ -24,7 +27,8 @@ class Introspected(Entity):
     """The base of services and clients: publishes what they send and receive."""
 
     srv_type: Any
-    _make_event_writer: Callable[[QoSProfile], Writer]
+    srv_name: str
+    _node: 'Callable[[], Node | None]'
     _events: Writer | None = None
     _clock: Clock
     _state = ServiceIntrospectionState.OFF
@@ -36,8 +40,9 @@ class Introspected(Entity):
             self._ends.remove(self._events)
             self._events.close()
         self._events, self._clock, self._state = None, clock, introspection_state
-        if introspection_state != ServiceIntrospectionState.OFF:
-            self._events = self._make_event_writer(service_event_qos_profile)
+        node = self._node()
+        if introspection_state != ServiceIntrospectionState.OFF and node is not None:
+            self._events = node._event_writer(self, service_event_qos_profile)
             self._ends.append(self._events)
 
     def _tell(self, kind: int, client: bytes, number: int, request: Any = None,

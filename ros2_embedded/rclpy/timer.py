@@ -11,7 +11,7 @@ from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidHandle, ROSInterruptException, TimerCancelledError
+from rclpy.exceptions import InvalidHandle, RCLError, ROSInterruptException
 
 
 class Timer(Entity):
@@ -21,7 +21,7 @@ class Timer(Entity):
                  timer_period_ns: int, clock: Clock, *, context: Context | None = None,
                  autostart: bool = True, wake: Callable[[], None] | None = None) -> None:
         if timer_period_ns < 0:
-            raise ValueError('timer period must be non-negative')
+            raise RCLError('failed to create timer: timer period must be non-negative')
         super().__init__()
         self.callback = callback
         self.callback_group = callback_group
@@ -103,15 +103,8 @@ class Timer(Entity):
         return self._clock._now() - self._last
 
     def time_until_next_call(self) -> int | None:
-        """
-        Give the nanoseconds until the next call; negative ones if it is late.
-
-        :raises TimerCancelledError: if it was cancelled.
-        """
-        if self._cancelled:
-            raise TimerCancelledError('failed to get time until next timer call: timer is '
-                                      'canceled')
-        return self._next - self._clock._now()
+        """Give the nanoseconds until the next call, negative if it is late; None if cancelled."""
+        return None if self._cancelled else self._next - self._clock._now()
 
     def _left(self) -> int | None:
         """Nanoseconds an executor may sleep; None: this timer doesn't end it."""

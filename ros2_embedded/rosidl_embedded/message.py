@@ -199,6 +199,7 @@ def _constructor(described: Definition) -> Callable[..., None]:
             setattr(self, slot, default())
         if kwargs:
             _assign(self, kwargs)
+    __init__.__qualname__ = f"{described.name.rpartition('/')[2]}.__init__"
     return __init__
 
 

@@ -33,6 +33,7 @@ from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
     InvalidQoSProfileException,
+    LivelinessPolicy,
     qos_check_compatible,
     qos_profile_sensor_data,
     QoSCompatibility,
@@ -168,6 +169,12 @@ def test_topic_names(world):
             node.create_publisher(String, name, 1)
     with pytest.raises(InvalidServiceNameException):
         node.create_client(Trigger, 'a b')
+    assert node.resolve_topic_name('~tail') == '/here/metail'
+    for name in ('a b', '{nothing}'):
+        with pytest.raises(RuntimeError, match='failed to resolve name'):
+            node.resolve_topic_name(name)
+    with pytest.raises(ValueError, match="topic name 'a b' is invalid"):
+        node.count_publishers('a b')
 
 
 def test_remappings(context):
@@ -300,6 +307,29 @@ def test_profiles():
     assert qos_check_compatible(strict, sensor)[0] != QoSCompatibility.ERROR
 
 
+def test_profiles_that_do_not_go_together_are_told_so():
+    def said(publisher, subscription):
+        return qos_check_compatible(QoSProfile(depth=1, **publisher),
+                                    QoSProfile(depth=1, **subscription))
+
+    automatic, second = {'liveliness': LivelinessPolicy.AUTOMATIC}, Duration(seconds=1)
+    assert said(automatic, automatic) == (QoSCompatibility.OK, '')
+    assert said({}, {}) == (
+        QoSCompatibility.WARNING, 'WARNING: Publisher liveliness is system_default and '
+        'subscription liveliness is system_default;')
+    assert said({'reliability': ReliabilityPolicy.BEST_EFFORT}, {'deadline': second}) == (
+        QoSCompatibility.ERROR, 'ERROR: Best effort publisher and reliable subscription;'
+        'ERROR: Subscription has a deadline, but publisher does not;')
+    assert said({'liveliness_lease_duration': Duration(seconds=2)},
+                {'liveliness_lease_duration': second}) == (
+        QoSCompatibility.ERROR,
+        'ERROR: Subscription liveliness lease duration is less than publisher;')
+    assert said({'reliability': ReliabilityPolicy.SYSTEM_DEFAULT, **automatic},
+                {'durability': DurabilityPolicy.SYSTEM_DEFAULT, **automatic}) == (
+        QoSCompatibility.WARNING, 'WARNING: Reliable subscription, but publisher is '
+        'system_default;WARNING: Volatile publisher, but subscription is system_default;')
+
+
 def test_a_wrong_class_is_refused(world):
     node = world.node()
     for wrong in (int, Trigger):
@@ -393,8 +423,11 @@ def test_timers(world):
     count = len(ticks)
     world.spin(0.1)
     assert len(ticks) == count and timer.is_canceled()
+    assert timer.time_until_next_call() is None
     timer.reset()
     world.until(lambda: len(ticks) > count)
+    with pytest.raises(RuntimeError, match='timer period must be non-negative'):
+        node.create_timer(-1.0, None)
     waiting = node.create_timer(0.01, lambda: ticks.append(0.0), autostart=False)
     world.spin(0.05)
     assert 0.0 not in ticks
