@@ -63,6 +63,9 @@ class CloudGroup(GroupAction):
         return wrap(super().execute(context), self._send)
 
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+        if isinstance(entity, Action) and entity.condition is not None and (
+                not entity.condition.evaluate(context)):
+            return  # launch leaves it out
         if isinstance(entity, ExecuteLocal) and not isinstance(
                 entity, (RemoteProcess, RobotCarrier)):
             # before the action's own execution, which may make a ROS node in this process
