@@ -20,6 +20,8 @@ class DdsVendor(abc.ABC):
 
     #: Value of RMW_IMPLEMENTATION.
     rmw: ClassVar[str]
+    #: Ranges of UDP ports, first and last, that the robot's nodes listen at beside the domain's.
+    ports: ClassVar[Sequence[tuple[int, int]]] = ()
 
     @abc.abstractmethod
     def ask_lan(self) -> Command:

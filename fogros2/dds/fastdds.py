@@ -2,8 +2,7 @@
 """
 Fast DDS, ROS 2's ``rmw_fastrtps_cpp``: its profile for a robot with a VPN.
 
-Written for 2.14 (ROS 2 Jazzy). 2.9 reads it too, but knows interfaces by address alone, and no
-``netmask_filter``.
+Written for 2.14 (ROS 2 Jazzy). 2.9 reads it too, but knows no ``netmask_filter``.
 
 A process announces every address it has, and others send to all of them. So the robot keeps what
 it has without us, every interface, and the VPN's is one of them: other computers on its LAN go on.
@@ -47,6 +46,9 @@ ANNOUNCEMENT = 1
 LEASE_DURATION = 60
 #: Bytes of receive buffer asked for; the kernel gives what its rmem_max allows.
 RECEIVE_BUFFER = 4 * 1024 * 1024
+#: Addresses of another participant that are kept. The default is 4, and a robot with containers
+#: easily has more: the VPN's, one of its newest, would be left out.
+KEPT_ADDRESSES = 32
 LOOPBACK = '127.0.0.1'
 #: FASTDDS_BUILTIN_TRANSPORTS with which nodes reach those that have UDP alone.
 _REACHABLE = ('', 'DEFAULT', 'UDPV4')
@@ -62,6 +64,9 @@ class FastDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
+    #: Where each process hears which nodes others have (``ros_discovery_info``), in every domain:
+    #: the middleware asks for a port of its own for that.
+    ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
 
     def __init__(self, domain: int = 0) -> None:
         if not 0 <= domain <= MAX_DOMAIN:
@@ -119,6 +124,9 @@ class FastDds(DdsVendor):
         root, profiles = _profiles(user.get(VARIABLE, ''))
         participant = _default_participant(profiles)
         rtps = _child(participant, 'rtps')
+        limit = _child(_child(_child(rtps, 'allocation'), 'remote_locators'),
+                       'max_unicast_locators')
+        limit.text = limit.text or str(KEPT_ADDRESSES)
         builtin = _child(rtps, 'builtin')
         discovery = _child(builtin, 'discovery_config')
         for name, seconds in (('leaseDuration', LEASE_DURATION),

@@ -40,7 +40,7 @@ class RobotVpn:
         self._public_key = ''
         self._stop = threading.Event()
         self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-            domain=launch.domain)
+            domain=launch.domain, ports=launch.dds().ports)
         used = addresses.parse_used(launch.robot([addresses.used_networks()]))
         network = addresses.choose_subnet(
             used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))

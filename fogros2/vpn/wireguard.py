@@ -57,12 +57,14 @@ class WireGuard(Vpn):
     The commands of a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
     :param domain: ROS_DOMAIN_ID, whose DDS ports a guarded interface lets in.
+    :param ports: ranges of UDP ports that it lets in besides, first and last.
     """
 
-    def __init__(self, domain: int = 0) -> None:
+    def __init__(self, domain: int = 0, ports: Sequence[tuple[int, int]] = ()) -> None:
         if not 0 <= domain <= (65535 - PORT_BASE) // PORTS_PER_DOMAIN:
             raise ConfigurationError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
+        self.ports = (dds_ports(domain), *ports)
 
     def keys(self, interface: VpnInterface) -> Command:
         """Return the command that prints the public key; the private one is root's alone."""
@@ -170,7 +172,7 @@ class WireGuard(Vpn):
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
     ) -> list[_Step]:
-        guard = [_guard(interface, self.domain)] if interface.guarded else []
+        guard = [_guard(interface, self.ports)] if interface.guarded else []
         return [
             *guard, _link(interface), _Step(_configure(interface, peers, recall=recall)),
             _address(interface, peers)]
@@ -199,7 +201,7 @@ def _name(interface: VpnInterface) -> str:
     return name
 
 
-def _guard(interface: VpnInterface, domain: int) -> _Step:
+def _guard(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
     Return the step that keeps a hijacked machine from everything but DDS and ping.
 
@@ -208,7 +210,7 @@ def _guard(interface: VpnInterface, domain: int) -> _Step:
     an accept here over a drop there (a firewall of the user's own has to let the VPN in).
     """
     name = _name(interface)
-    first, last = dds_ports(domain)
+    let_in = ', '.join(f'{first}-{last}' for first, last in ports)
     # an address check, as a peer may send to any address of this computer, a LAN's too
     rules = [
         f'table inet {name}',
@@ -219,7 +221,7 @@ def _guard(interface: VpnInterface, domain: int) -> _Step:
         f'    iifname != "{name}" accept',
         f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
         '    ct state established,related accept',
-        f'    udp dport {first}-{last} accept',
+        f'    udp dport {{ {let_in} }} accept',
         '    icmp type echo-request accept',
         '    drop',
         '  }',

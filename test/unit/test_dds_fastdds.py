@@ -34,6 +34,13 @@ def test_the_robot_keeps_all_its_interfaces_and_asks_as_ever() -> None:
     assert root.findtext('.//leaseDuration/sec', '', NS) == '60'
 
 
+def test_more_addresses_are_kept_than_a_robot_has() -> None:
+    dds = FastDds()
+    for interfaces in ([], dds.machine_interfaces('fog1m0')):
+        limit = parsed(dds.render(interfaces, ())).findtext('.//max_unicast_locators', '', NS)
+        assert int(limit) >= 32
+
+
 def test_a_machine_uses_the_vpn_alone_and_sends_nowhere_else() -> None:
     dds = FastDds(2)
     text = dds.render(dds.machine_interfaces('fog1m0'), ['198.18.7.3', '198.18.7.3'])

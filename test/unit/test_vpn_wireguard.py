@@ -77,7 +77,9 @@ def test_a_machine_is_not_filtered() -> None:
 @pytest.mark.parametrize('domain, ports', [(0, '7400-7649'), (5, '8650-8899')])
 def test_the_filter_lets_in_the_ports_of_the_ros_domain(domain: int, ports: str) -> None:
     text = script(*WireGuard(domain).up(ROBOT, []))
-    assert f'udp dport {ports} accept' in text
+    assert f'udp dport {{ {ports} }} accept' in text
+    text = next(WireGuard(domain, [(7000, 7119)]).up(ROBOT, [])).argv[-1]
+    assert f'udp dport {{ {ports}, 7000-7119 }} accept' in text
     assert '-'.join(map(str, dds_ports(domain))) == ports
 
 
