@@ -63,15 +63,23 @@ def call_service(
 
     Blocks: call it in an executor's thread.
     """
-    def given_up(what: str) -> bool:
+    from rclpy.exceptions import InvalidHandle, RCLError
+
+    def given_up(what: str = '') -> bool:
         if context.is_shutdown:
             logger.warning(
                 f"Abandoning wait for the '{client.srv_name}' service{what}, due to shutdown.")
         return context.is_shutdown
 
-    while not client.wait_for_service(timeout_sec=1.0):
-        if given_up(''):
+    try:
+        while not client.wait_for_service(timeout_sec=1.0):
+            if given_up():
+                return None
+    except (InvalidHandle, RCLError):
+        # The shutdown has taken the node away meanwhile.
+        if given_up():
             return None
+        raise
     answered = threading.Event()
     future = client.call_async(request)
     future.add_done_callback(lambda _: answered.set())

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The launch files of ROS 2's demonstrations and of launch_ros's examples, unmodified.
+
+ROS2_SOURCES names a folder that holds the repositories ``demos`` and ``launch_ros`` of
+github.com/ros2, branch jazzy. Nothing of theirs is here. What they launch is mostly C++: programs
+that say what they were called with stand in for it.
+"""
+
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+SOURCES = Path(os.environ.get('ROS2_SOURCES', '/nowhere'))
+FILES = sorted(str(path.relative_to(SOURCES)) for pattern in (
+    'demos/**/launch/**/*launch.py', 'demos/**/launch/**/*launch.xml',
+    'demos/**/launch/**/*launch.yaml', 'launch_ros/ros2launch/examples/*.launch.py')
+    for path in SOURCES.glob(pattern))
+EXECUTABLE = r'''\bexec(?:utable)?\s*[=:]\s*['"]?([a-z]\w*)'''
+PACKAGE = r'''\b(?:pkg|package)\s*[=:]\s*['"]?([a-z]\w*)'''
+STAND_IN = '''#!/bin/sh
+trap '' INT
+echo "I am $0 $*"
+'''
+CONTAINER = '''#!/bin/sh
+trap 'exit 0' INT
+echo "I am $0 $*"
+n=0
+while [ $((n += 1)) -lt 300 ]; do sleep 0.1; done
+'''
+NODE = '''#!{python}
+import sys
+sys.path.insert(0, {folder!r})
+from {module} import main
+sys.exit(main())
+'''
+
+pytestmark = pytest.mark.skipif(
+    not FILES, reason="the sources of ROS 2's demos and of launch_ros are not here (ROS2_SOURCES)")
+
+
+def named(pattern, *files):
+    return {name for file in files for name in re.findall(pattern, (SOURCES / file).read_text())}
+
+
+@pytest.fixture(scope='module')
+def prefix(tmp_path_factory):
+    """Install a stand-in for each executable of each package that a launch file names."""
+    root = tmp_path_factory.mktemp('prefix')
+    index = root / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    for package in named(PACKAGE, *FILES) | {'dummy_robot_bringup'}:
+        (index / package).write_text('')
+        lib = root / 'lib' / package
+        lib.mkdir(parents=True)
+        for name in named(EXECUTABLE, *FILES):
+            write(lib / name, CONTAINER if name == 'component_container' else STAND_IN)
+    share = root / 'share' / 'dummy_robot_bringup'
+    share.mkdir()
+    (share / 'launch').symlink_to(SOURCES / 'demos/dummy_robot/dummy_robot_bringup/launch')
+    return root
+
+
+def write(path, text):
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def launched(prefix, tmp_path, *command, until=None):
+    """Run a launch, interrupted once it has said something; return status and output."""
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, start_new_session=True, env={
+            **os.environ, 'ROS_LOG_DIR': str(tmp_path), 'USER': 'me', 'PYTHONUNBUFFERED': '1',
+            'AMENT_PREFIX_PATH': f"{prefix}:{os.environ.get('AMENT_PREFIX_PATH', '')}"})
+    watchdog = threading.Timer(60, os.killpg, [process.pid, signal.SIGKILL])
+    watchdog.start()
+    lines = []
+    try:
+        for line in process.stdout:
+            lines.append(line)
+            if until is not None and until in line:
+                os.killpg(process.pid, signal.SIGINT)
+                until = None
+        return process.wait(), ''.join(lines)
+    finally:
+        watchdog.cancel()
+        process.stdout.close()
+
+
+def ros2():
+    return shutil.which('ros2', path=os.pathsep.join(
+        [os.path.dirname(sys.executable), os.environ['PATH']]))
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_launch_files(prefix, tmp_path, file):
+    container = 'component_container' in named(EXECUTABLE, file)
+    status, out = launched(prefix, tmp_path, ros2(), 'launch', str(SOURCES / file),
+                           until='I am ' if container else None)
+    # ROS 2's own launch_ros stumbles where it is interrupted while it waits for a container
+    stumbled = container and 'InvalidHandle' in out
+    assert status == (1 if stumbled else 0), out
+    started = set(re.findall(r'\[(\w+)-\d+\]: process started', out))
+    assert started == (named(EXECUTABLE, file) or {'talker', 'listener'}), out
+    assert ('Abandoning wait' in out) == (container and not stumbled)
+
+
+def example(tmp_path, name):
+    """Copy an example away from launch_ros itself, which it puts on its path."""
+    path = tmp_path / 'examples' / name
+    path.parent.mkdir()
+    shutil.copy(SOURCES / 'launch_ros/launch_ros/examples' / name, path)
+    return str(path)
+
+
+def test_talker_and_listener(prefix, tmp_path):
+    status, out = launched(
+        prefix, tmp_path, sys.executable, example(tmp_path, 'pub_sub_launch.py'))
+    assert status == 0 and 'Starting introspection of launch description' in out
+    for name in ('talker', 'listener'):
+        assert f'/{name} --ros-args -r chatter:=my_chatter' in out
+
+
+def test_lifecycle_talker_and_listener(prefix, tmp_path):
+    write(prefix / 'lib/lifecycle/lifecycle_talker', NODE.format(
+        python=sys.executable, folder=str(SOURCES / 'demos/lifecycle_py'),
+        module='lifecycle_py.talker'))
+    status, out = launched(
+        prefix, tmp_path, sys.executable, example(tmp_path, 'lifecycle_pub_sub_launch.py'),
+        until='lifecycle_listener --ros-args')
+    assert status == 0, out
+    for text in ("node 'talker' reached the 'inactive' state, 'activating'.",
+                 "node 'talker' reached the 'active' state, launching 'listener'."):
+        assert f'[launch.user]: {text}' in out
