@@ -102,6 +102,9 @@ def topic_name_fault(name: str) -> Fault | None:
                     "'_', '~', '{', or '}'", place)
     if opened >= 0:
         return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
+    if len(name) > 2 and name[0] == '~' and name[1] != '/':
+        return ("topic name must not have a tilde '~' that is not followed by a "
+                "forward slash '/'", 1)
     if (digit := _digit_after_slash(name)) is not None:
         return 'topic name token must not start with a number', digit
     return None

@@ -169,8 +169,7 @@ def test_topic_names(world):
             node.create_publisher(String, name, 1)
     with pytest.raises(InvalidServiceNameException):
         node.create_client(Trigger, 'a b')
-    assert node.resolve_topic_name('~tail') == '/here/metail'
-    for name in ('a b', '{nothing}'):
+    for name in ('a b', '{nothing}', '~tail'):
         with pytest.raises(RuntimeError, match='failed to resolve name'):
             node.resolve_topic_name(name)
     with pytest.raises(ValueError, match="topic name 'a b' is invalid"):
