@@ -92,18 +92,19 @@ class Creation:
         raise first
 
     def _in_region(self, region: str, types: list[str]) -> MachineId:
-        with ThreadPoolExecutor(4, 'fog-aws') as pool:
+        with ThreadPoolExecutor(5, 'fog-aws') as pool:
             # all of it before anything is made; side by side, since each is a way there and back
             there = pool.submit(self._existing, region)
             asked = pool.submit(images.kinds, self.account, region, types)
             sources = pool.submit(self._sources)
+            data = pool.submit(self._user_data)
             vpc = pool.submit(network.vpc_of, self.account, region, self.options.subnet) \
                 if self.options.subnet else None
             found = there.result()
             if found is not None:
                 return found
             chosen = [(kind, self._image(region, kind)) for kind in asked.result()]
-            return self._make(region, chosen, sources.result(), _done(vpc))
+            return self._make(region, chosen, sources.result(), _done(vpc), data.result())
 
     def _existing(self, region: str) -> Optional[MachineId]:
         """Return the machine that an earlier call with this token made, None for none."""
@@ -140,16 +141,17 @@ class Creation:
                 self.account, region, kind, self.options, self.request.dependencies)
         return self._images[key]
 
+    def _user_data(self) -> bytes:
+        return user_data(
+            name=self.spec.name, user=self.options.user,
+            authorized_key=self.request.authorized_key, host_key=one_time(self.request.token),
+            agent_config=self.request.agent_config)
+
     def _make(
         self, region: str, chosen: list[tuple[Kind, Mapping[str, Any]]], sources: list[str],
-        vpc: str,
+        vpc: str, data: bytes,
     ) -> MachineId:
         tags = instances.own_tags(self.spec, self.request, self.options)
-        host_key = one_time(self.request.token)
-        data = user_data(
-            name=self.spec.name, user=self.options.user,
-            authorized_key=self.request.authorized_key, host_key=host_key,
-            agent_config=self.request.agent_config)
         groups: list[str] = []
         with contextlib.ExitStack() as undo:
             # in this order: an undo of what was not made yet finds nothing, and that is fine
@@ -170,7 +172,7 @@ class Creation:
                     vpn_port=self.request.vpn_port, sources=sources)
                 importing.result()
             instance = self._first_with_room(region, chosen, groups[0], {
-                **tags, instances.TAG_HOST_KEY: host_key.public}, data)
+                **tags, instances.TAG_HOST_KEY: one_time(self.request.token).public}, data)
             undo.pop_all()
             return MachineId(region, instance, self.attempt)
 
