@@ -79,7 +79,9 @@ def test_a_node_is_configured_and_activated(tmp_path, capsys):
     service = LaunchService(noninteractive=True)
     service.include_launch_description(LaunchDescription([
         RegisterEventHandler(OnProcessIO(target_action=node, on_stdout=lambda event: (
-            change(2), change(1)) if b'ready' in event.text else None)),
+            # one after the other: of two calls at once rclpy may lose a response
+            change(2), TimerAction(period=0.5, actions=[change(1)])
+        ) if b'ready' in event.text else None)),
         RegisterEventHandler(OnStateTransition(
             target_lifecycle_node=node, goal_state='inactive',
             entities=[OpaqueFunction(function=note), change(3)])),
