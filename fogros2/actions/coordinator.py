@@ -17,7 +17,7 @@ import difflib
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
-from launch import Event, EventHandler, LaunchContext
+from launch import Action, Event, EventHandler, LaunchContext
 from launch.actions import (
     OpaqueFunction,
     PopEnvironment,
@@ -28,7 +28,16 @@ from launch.event_handlers import OnShutdown
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
-from fogros2.actions import census, cost, interruption, private, signals, streaming, words
+from fogros2.actions import (
+    carriers,
+    census,
+    cost,
+    interruption,
+    private,
+    signals,
+    streaming,
+    words,
+)
 from fogros2.actions.console import Console
 from fogros2.actions.interruption import MachineInterrupted
 from fogros2.actions.keywords import ROBOT
@@ -405,11 +414,21 @@ class Coordinator:
             self._context.emit_event_sync(
                 MachineInterrupted(session.spec.name, reason, session.lost))
 
-    def _on_interrupted(self, context: LaunchContext) -> None:
+    def _on_interrupted(self, context: LaunchContext) -> list[Action]:
         session = self._sessions.get(context.locals.event.machine)
-        if session is not None and not context.is_shutdown:
-            interruption.react(
-                context.locals.event, session, self._streams, context, self._logger)
+        if session is None or context.is_shutdown:
+            return []
+        # which needs this module
+        from fogros2.actions.remote import carrier_on
+        new = interruption.react(
+            context.locals.event, session, self._streams, context, self._logger)
+        for one in self._sessions.values():
+            one.rename(self._streams.remappings(one.spec.name))
+        at_once: asyncio.Future[bool] = context.asyncio_loop.create_future()
+        at_once.set_result(True)
+        return [
+            carriers.RobotCarrier(spec, at_once) if name is None else carrier_on(spec, name)
+            for name, spec in new]
 
     # -- going down -----------------------------------------------------------------------------
 

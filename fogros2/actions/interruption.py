@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from typing import TYPE_CHECKING
+from typing import Optional, TYPE_CHECKING
 
 from launch import Event, LaunchContext
 from launch.actions import ExecuteLocal
@@ -13,6 +13,7 @@ from launch.events.process import ShutdownProcess
 
 from fogros2.actions.carriers import Carrier
 from fogros2.errors import ProviderError
+from fogros2.model import NodeSpec
 
 if TYPE_CHECKING:
     from fogros2.actions.session import Session
@@ -46,22 +47,27 @@ class MachineInterrupted(Event):
 def react(
     event: MachineInterrupted, session: Session, streams: Streams, context: LaunchContext,
     logger: logging.Logger,
-) -> None:
+) -> list[tuple[Optional[str], NodeSpec]]:
     """
     Do what the machine's ``on_interrupt`` says.
 
-    :param streams: of the launch; those of this machine end.
+    :param streams: of the launch; those of this machine end, or are the robot's from now on.
+    :returns: nodes of streams to start, each with its machine, None for the robot.
     :raises ProviderError: to end the launch.
     """
     what = (f"the machine '{event.machine}' "
             f'{"is gone" if event.lost else "is being taken away"}: {event.reason}')
     if session.spec.on_interrupt == 'robot':
         logger.warning(f'{what}; its nodes go on on the robot')
-        for node in streams.remove(event.machine):
+        ended, new, left = streams.take_over(event.machine)
+        for node in ended:
             context.emit_event_sync(
                 ShutdownProcess(process_matcher=functools.partial(_carries, node)))
+        if left:
+            logger.warning(f"{', '.join(left)} of '{event.machine}' reaches no other machine any "
+                           'more: the robot streams it in another way')
         session.move_all()
-        return
+        return new
     if event.lost:
         session.end_all()
     raise ProviderError(what, "on_interrupt='robot' would have its nodes go on on the robot")

@@ -106,14 +106,10 @@ class RemoteProcess(ExecuteLocal):
     def _carry(
         self, context: LaunchContext, streams: Sequence[Entry], session: Session,
     ) -> list[ExecuteLocal]:
-        found: list[ExecuteLocal] = []
-        for machine, spec in Coordinator.of(context).stream(streams, session):
-            if machine is None:
-                found.append(carriers.RobotCarrier(spec, session.came_up))
-            else:
-                found.append(carriers.Carrier(spec))
-                send(found[-1], machine)
-        return found
+        return [
+            carriers.RobotCarrier(spec, session.came_up) if machine is None else
+            carrier_on(spec, machine)
+            for machine, spec in Coordinator.of(context).stream(streams, session)]
 
     @property
     def can_come_here(self) -> bool:
@@ -168,6 +164,13 @@ def send(
     assert isinstance(action, RemoteProcess)
     action._fogros2_machine = machine
     action._fogros2_streams = streams
+
+
+def carrier_on(spec: NodeSpec, machine: str) -> ExecuteLocal:
+    """Return the process that carries a stream on a machine."""
+    carrier = carriers.Carrier(spec)
+    send(carrier, machine)
+    return carrier
 
 
 _remote_classes: dict[type[ExecuteLocal], type[RemoteProcess]] = {}

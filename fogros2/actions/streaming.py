@@ -82,22 +82,57 @@ class Streams:
                 for other in several:
                     _compare(one, other)
                 several.append(one)
-        needed = streams.nodes(several)
+        streams.nodes(several)  # which may be refused
         self._streams = several
-        new = [(machine, spec) for machine, specs in needed.items() for spec in specs
-               if spec.id not in self._handed_out]
+        return self._not_handed_out()
+
+    def take_over(
+        self, machine: str,
+    ) -> tuple[list[str], list[tuple[Optional[str], NodeSpec]], list[str]]:
+        """
+        Have the robot stand for a machine whose nodes go on there.
+
+        Topics between the two need no stream any more; those between the machine and another one
+        are between the robot and that one from now on.
+
+        :return: the ids of nodes elsewhere that none needs now; new nodes, as from ``add``; topics
+            that can't be streamed so, as the robot streams them in another way already.
+        """
+        if not self._streams:
+            return [], [], []
+        from fogros2.image_transport import streams, topics
+        before = self._nodes_elsewhere(machine)
+        several = [one for one in self._streams if machine not in (one.source, one.target)]
+        left: list[str] = []
+        for one in self._streams:
+            ends = {host for host in (one.source, one.target) if host != machine}
+            if len(ends) == 2 or ends == {None}:
+                continue  # not this machine's, or over
+            # camera info goes the way it went: others know it by a name already
+            moved = dataclasses.replace(
+                one, source=None if one.source == machine else one.source,
+                target=None if one.target == machine else one.target,
+                options={**one.options, 'camera_info': topics.carries_info(one)})
+            try:
+                for other in several:
+                    _compare(moved, other)
+                streams.nodes([*several, moved])
+            except ConfigurationError:
+                left.append(one.topic)
+            else:
+                several.append(moved)
+        self._streams = several
+        ended = sorted(before - self._nodes_elsewhere(machine))
+        self._handed_out -= set(ended)
+        return ended, self._not_handed_out(), left
+
+    def _not_handed_out(self) -> list[tuple[Optional[str], NodeSpec]]:
+        """Return the nodes that are needed and were never returned; they count as such then."""
+        from fogros2.image_transport import streams
+        new = [(machine, spec) for machine, specs in streams.nodes(self._streams).items()
+               for spec in specs if spec.id not in self._handed_out]
         self._handed_out |= {spec.id for _, spec in new}
         return new
-
-    def remove(self, machine: str) -> list[str]:
-        """Forget a machine's streams; return the ids of others' nodes that none needs now."""
-        if not self._streams:
-            return []
-        before = self._nodes_elsewhere(machine)
-        self._streams = [one for one in self._streams if machine not in (one.source, one.target)]
-        removed = sorted(before - self._nodes_elsewhere(machine))
-        self._handed_out -= set(removed)
-        return removed
 
     def _nodes_elsewhere(self, machine: str) -> set[str]:
         from fogros2.image_transport import streams

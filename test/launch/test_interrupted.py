@@ -386,6 +386,33 @@ def test_the_node_takes_topics_as_they_are(run, fake, harmless, planner, talker,
     assert first == {'lidar_h264_encoder', 'seen_h264_decoder_from_planner'}
 
 
+def test_other_machines_have_its_topics_from_the_robot_then(
+        run, fake, harmless, planner, talker, watch):
+    """Its nodes are there now, and those elsewhere keep the names that they have."""
+    other = ContainerInstance(name='other', ros_workspace='')
+    # three of the user's and a pair for each topic; then two of them here, a pair for what goes
+    # out, and a decoder for what comes in
+    watch.at_start = {
+        7: says(fake, 'lost', reason='evicted'),
+        12: lambda event: [TimerAction(period=0.3, actions=end())]}
+    assert run(FogROSLaunchDescription([
+        *watch(), talker(machine=planner, exec_name='maps'),
+        talker(machine=other, exec_name='sees', stream_topics=[
+            StreamTopic('/map', 'h264', source=planner)]),
+        talker(machine=planner, exec_name='looks', stream_topics=[
+            StreamTopic('/pose', 'h264', source=other)])])) == 0
+    assert sorted(name for name, _ in watch.starts[:7]) == [
+        'looks', 'map_h264_decoder_from_planner', 'map_h264_encoder', 'maps',
+        'pose_h264_decoder_from_other', 'pose_h264_encoder', 'sees']
+    assert sorted(name for name, _ in watch.starts[7:]) == [
+        'looks', 'map_h264_decoder', 'map_h264_encoder', 'maps', 'pose_h264_decoder_from_other']
+    there = [spec for spec in fake.machines['other'].all if 'decoder' in spec.name]
+    assert 'image:=/fogros2/other/map' in there[-1].arguments
+    assert 'stream:="/map/h264"' in there[-1].arguments
+    ended = [name for name, _ in watch.exits]
+    assert 'map_h264_decoder_from_planner' in ended[:1]
+
+
 # -- money ----------------------------------------------------------------------------------------
 
 def test_a_launch_says_what_it_cost(run, fake, talker, capfd):

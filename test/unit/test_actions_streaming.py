@@ -112,6 +112,36 @@ def test_streams_that_contradict_each_other(
     assert len(streams.add([('/b', 'h264')], 'two')) == 2
 
 
+def test_the_robot_stands_for_a_machine_that_is_taken_away() -> None:
+    streams = streaming.Streams()
+    streams.add([('/a', 'h264'), StreamTopic('/back', 'h264', 'to_robot'),
+                 StreamTopic('/map', 'h264', source='other', camera_info=True)], 'gone')
+    streams.add([('/a', 'h264'), StreamTopic('/seen', 'h264', source='gone')], 'other')
+    before = streams.remappings('other')
+    ended, new, left = streams.take_over('gone')
+    # /a goes to the other one as before, /map is encoded there as before
+    assert ended == ['other/seen_h264_decoder_from_gone', 'robot/back_h264_decoder_from_gone']
+    assert sorted((str(machine), spec.id) for machine, spec in new) == [
+        ('None', 'robot/map_h264_decoder_from_other'), ('None', 'robot/seen_h264_encoder'),
+        ('other', 'other/seen_h264_decoder')]
+    assert left == [] and streams.remappings('other') == before
+    # of camera info as before, too: the other's nodes have one name for it, and no new one
+    words = {spec.id: spec.arguments for _, spec in new}
+    assert 'camera_info:=true' in words['robot/map_h264_decoder_from_other']
+    assert 'camera_info:=false' in words['other/seen_h264_decoder']
+    assert streams.take_over('gone') == ([], [], [])
+    # its name has no stream left, so another launch of it would begin anew
+    assert streams.remappings('gone') == {}
+
+
+def test_what_the_robot_streams_already_in_another_way_is_not_taken_over() -> None:
+    streams = streaming.Streams()
+    streams.add([StreamTopic('/a', 'h264', source='gone')], 'other')
+    streams.add([StreamTopic('/a', 'h264', bitrate=1_000_000)], 'third')
+    ended, new, left = streams.take_over('gone')
+    assert (ended, new, left) == (['other/a_h264_decoder_from_gone'], [], ['/a'])
+
+
 def test_entries_are_resolved_when_executed() -> None:
     context = LaunchContext()
     context.launch_configurations.update(topic='camera', rate='1000000', transport='h264')
