@@ -2,8 +2,9 @@
 """
 ``rclpy`` on the embedded default, and beside it on ROS 2 where that is installed.
 
-Both run as they come, with Cyclone DDS, on this computer's loopback. ``ROS2_SETUP`` names the
-set-up script of a ROS 2 that isn't in ``/opt/ros/jazzy``.
+Both run as they come, with Cyclone DDS and the receive buffers that each asks for, on this
+computer's loopback. ``ROS2_SETUP`` names the set-up script of a ROS 2 that isn't in
+``/opt/ros/jazzy``.
 """
 
 from __future__ import annotations
@@ -271,7 +272,7 @@ class Ros:
         # a fixed threshold: each large buffer is mapped anew
         out, into = self._stream(MALLOC_MMAP_THRESHOLD_='262144')
         return [
-            self.row('images lost', IMAGES - seen['came'], '', 0, IMAGES),
+            self.row('images lost', IMAGES - seen['came'], 'images', 0, IMAGES),
             self.row('an image, published to callback', seen['late'], 'ms', None, IMAGES),
             # a publisher fills the CDR; a subscription what the network brings, and the message
             # (page faults of other causes are a few hundredths of an image)
