@@ -476,6 +476,8 @@ class Agent:
         self.adopted = False
         #: The launch that will have the machine when the former one's nodes are gone.
         self.claimed = ''
+        #: Whether no launch has the machine: what still comes from the former one starts nothing.
+        self.released = False
         self.heart: Optional[socket.socket] = None
         self.since = time.time()
         self.mark = f'{os.getpid()}-{time.time_ns()}'
@@ -573,7 +575,8 @@ class Agent:
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self.watchdog.configured(self.clock(), heartbeat=bool(self.config['heartbeat']))
             if not self.config['launch'] and self.config['on_exit'] == 'keep':
-                self.watchdog.disarm()  # it was released: it waits for no launch
+                self.watchdog.disarm()  # it waits for no launch
+                self.released = True
 
     def save(self) -> None:
         """Keep the pid for people and the configuration for an agent that starts anew."""
@@ -915,6 +918,7 @@ class Agent:
                 self.adopted = True
                 self.nodes.clear()
                 new.setdefault('heartbeat', None)
+            self.released = self.released and not new.get('launch')
             self.config.update(new)
             self.watchdog.config = self.config
             if taken_over:
@@ -944,8 +948,18 @@ class Agent:
             return None
         return apply()
 
+    def check_held(self) -> None:
+        """
+        Let nothing begin for a launch that has let go of the machine, however late it arrives.
+
+        :raises Refused: none has it.
+        """
+        if self.released:
+            raise Refused('no launch has this machine any more', kind='released')
+
     def do_keep(self, client: Client, request: Json) -> Json:
         """Keep something going; ``what`` again replaces it."""
+        self.check_held()
         kept = Kept(request)
         former = self.kept.get(kept.what)
         if former is not None and former.timer is not None:
@@ -957,6 +971,7 @@ class Agent:
 
     def do_watch(self, client: Client, request: Json) -> Json:
         """Wait for a command to succeed; ``what`` again replaces it."""
+        self.check_held()
         watched = Watched(request)
         if watched.what not in WATCHED or not watched.argv:
             raise Refused(f"there is no watch for '{watched.what}'", ', '.join(WATCHED))
@@ -1060,6 +1075,7 @@ class Agent:
             self.reply(client, request.get('id'), {})
             return
         self.claimed = ''
+        self.released = True
         self.config['on_exit'] = checked({
             'on_exit': request.get('on_exit', self.config['on_exit'])})['on_exit']
         self.watchdog.disarm()
@@ -1087,6 +1103,7 @@ class Agent:
 
         :raises Refused: it can't be started now.
         """
+        self.check_held()
         if self.ending or self.stopping:
             raise Refused('the agent is stopping its nodes', kind='ending')
         if self.launch is not None:

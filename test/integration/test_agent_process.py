@@ -992,7 +992,13 @@ def test_release_stops_the_nodes_before_it_answers(rig):
     assert gone(node)()
     status = client.request('status')
     assert (status['on_exit'], status['launch_running']) == ('keep', False)
-    # and is ready for the next one
+    # what comes too late starts nothing, neither ahead of time nor at all
+    for late in ({'command': 'launch'}, {'command': 'start', 'nodes': [rig.node('late', SLEEP)]},
+                 {'command': 'keep', 'what': 'vpn', 'alive': ['true'], 'repair': [['true']]}):
+        with pytest.raises(AgentError, match='no launch has this machine any more'):
+            client.request(**late)
+    # and it is ready for the next one
+    client.request('configure', launch='next')
     client.request('start', nodes=[rig.node('next', 'print("here")\n')])
     rig.wait('exited', node='next')
 
