@@ -13,6 +13,7 @@ from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.equipping import Equipment
 from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
+from fogros2.errors import AgentError
 from fogros2.model import Machine, NodeSpec, VpnInterface
 from fogros2.shell import Shell
 
@@ -119,8 +120,13 @@ class RunningMachine:
             lost = self._lost
         if lost:
             callback({'event': 'lost', 'reason': lost})
-        else:
+            return
+        try:
             self.agent.subscribe(tell, since=self._first_event)
+        except AgentError:
+            # that it is gone may have been told meanwhile, and the connection closed
+            if not self._lost:
+                raise
 
     def _gone(self, reason: str) -> None:
         """Tell, once, that the provider has the machine no longer; nobody else asks it."""

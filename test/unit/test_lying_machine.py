@@ -12,6 +12,7 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 
 from fogros2.actions.session import Session
 from fogros2.deploy import RunningMachine
+from fogros2.errors import AgentError
 from fogros2.model import MachineSpec
 from fogros2.shell import lines
 
@@ -81,3 +82,22 @@ def test_an_event_that_makes_no_sense_is_left_aside(event):
     finally:
         loop.close()
     assert heard == []
+
+
+def test_a_machine_that_goes_while_it_is_subscribed_to_is_lost_and_nothing_else():
+    heard = []
+    job = SimpleNamespace(spec=None, provider=SimpleNamespace(owned=False))
+
+    class Closing(Told):
+        def subscribe(self, callback, since):
+            machine._gone('it was deleted')
+            raise AgentError('the connection to the agent was closed')
+
+        def close(self):
+            pass
+
+    machine = RunningMachine(
+        SimpleNamespace(ending=False), job, None, None, Closing(), None,
+        SimpleNamespace(address='198.18.7.2'), 7, None)
+    machine.subscribe(heard.append)
+    assert heard == [{'event': 'lost', 'reason': 'it was deleted'}]
