@@ -98,6 +98,6 @@ def test_a_machine_that_goes_while_it_is_subscribed_to_is_lost_and_nothing_else(
 
     machine = RunningMachine(
         SimpleNamespace(ending=False), job, None, None, Closing(), None,
-        SimpleNamespace(address='198.18.7.2'), 7, None)
+        SimpleNamespace(address='198.18.7.2'), 7, None, None)
     machine.subscribe(heard.append)
     assert heard == [{'event': 'lost', 'reason': 'it was deleted'}]
