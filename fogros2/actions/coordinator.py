@@ -397,7 +397,8 @@ class Coordinator:
         session.up(running)
 
     def _raise_in_launch(self, task: asyncio.Task[None]) -> None:
-        error = task.exception()
+        # asking one that was cancelled for its error raises, and what should follow wouldn't
+        error = None if task.cancelled() else task.exception()
         if error is not None:
             self._fail(error)
 
