@@ -8,12 +8,15 @@ from pathlib import Path
 import re
 import shutil
 import sys
+import time
 import uuid
 
 import pytest
 
 from fogros2 import process
+from fogros2.model import Command
 from fogros2.testing.launched import launching
+from fogros2.waiting import wait_until
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 
@@ -121,6 +124,51 @@ def generate_launch_description():
         ExecuteProcess(cmd=['{python}', '{viewer}'], output='screen', on_exit=Shutdown()),
     ])
 """
+
+
+#: The machine in the middle can be taken away.
+GOING = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    first = ContainerInstance(name='{name}-a', network='{network}', ros_workspace='',
+                              on_interrupt='robot')
+    second = ContainerInstance(name='{name}-b', network='{network}', ros_workspace='')
+    return FogROSLaunchDescription([
+        CloudNode(machine=second, package='fogros2_examples', executable='image_processor',
+                  name='last', remappings=[('camera', '/between')], output='screen',
+                  stream_topics=[StreamTopic('/between', 'h264', source=first)]),
+        CloudNode(machine=first, package='fogros2_examples', executable='image_processor',
+                  name='middle', remappings=[('camera', '/front/camera'),
+                                             ('annotated', '/between')],
+                  output='screen', stream_topics=[('/front/camera', 'h264')]),
+        Node(package='fogros2_examples', executable='camera', namespace='front'),
+    ])
+"""
+
+
+def test_streams_go_on_when_the_machine_between_goes(
+    tmp_path: Path, cloud_network: str, engine: str,
+) -> None:
+    path = tmp_path / 'going.launch.py'
+    path.write_text(GOING.format(name=NAME, network=cloud_network))
+    with launching() as launch:
+        run = launch(str(path))
+        run.wait_for('[last]:', timeout=60.0)
+        process.run(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{NAME}-a'), sudo=True),
+                    timeout=60.0)
+        run.wait_for(f"the machine '{NAME}-a' is gone", timeout=30.0)
+        # the one here takes the camera's images as they are, and gives the other machine its own
+        wait_until(lambda: re.search(r'^\[image_processor-\d+\].* images/s', run.text, re.M),
+                   timeout=30.0, what='images of the camera')
+        since = time.monotonic()
+        wait_until(lambda: len(run.since(since, '[last]: ')) >= 2, timeout=30.0,
+                   what='images of the one here on the other machine')
+        run.interrupt()
+        assert run.ended() == 0, run.text
+        assert run.errors == [] and 'process has died' not in run.text, run.text
 
 
 @pytest.mark.parametrize('description', [LAUNCH, CHAIN], ids=['both ways', 'machine to machine'])
