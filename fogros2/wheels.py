@@ -22,6 +22,8 @@ import re
 import shutil
 import sys
 import tempfile
+import threading
+import time
 from typing import Optional
 import urllib.parse
 import zipfile
@@ -33,6 +35,8 @@ from fogros2.model import Command
 OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 #: What only the robot uses: a machine dials nobody.
 _ROBOT_ONLY = frozenset({'paramiko', 'setuptools'})
+#: Seconds for which what was found is taken for granted.
+FRESH = 5.0
 #: A wheel's fixed date: the same files always give the same wheel.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -70,13 +74,28 @@ def collect(folder: Optional[Path] = None) -> Wheels:
     """
     Return the wheels of this interpreter's FogROS2, packed now if their contents have changed.
 
-    The first call takes a few seconds, later ones some milliseconds.
+    The first call takes a few seconds, later ones some milliseconds. What one has found holds for
+    the next ``FRESH`` seconds: the machines of a launch ask at the same time.
 
     :param folder: the cache, ``cache_folder()`` unless given.
     :raises ConfigurationError: fogros2 isn't installed, it only lies on the path.
     :raises PrerequisiteError: one of the distributions can't be packed.
     """
     folder = folder or cache_folder()
+    with _collecting:
+        when, known = _collected.get(folder, (-FRESH, None))
+        if known is None or time.monotonic() - when > FRESH \
+                or not Path(known.folder, 'wheels.json').exists():
+            known = _collect(folder)
+            _collected[folder] = time.monotonic(), known
+    return known
+
+
+_collecting = threading.Lock()
+_collected: dict[Path, tuple[float, Wheels]] = {}
+
+
+def _collect(folder: Path) -> Wheels:
     found = list(_closure())
     names = [_normal(d.name) for d in found]
     key = _key(found)
@@ -192,10 +211,19 @@ def _key(found: list[metadata.Distribution]) -> str:
             # has the hash of each file in it
             digest.update((distribution.read_text('RECORD') or '').encode())
             continue
-        for path in sorted(sources.rglob('*.py')):
-            if not {'.venv', 'build', '.cache', 'test'} & set(path.relative_to(sources).parts):
-                digest.update(path.read_bytes())
+        for path in _programs(sources):
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _programs(sources: Path) -> list[Path]:
+    """Return the Python files of a source folder, in order, but for those that don't travel."""
+    found = []
+    for folder, folders, names in os.walk(sources):
+        # a virtual environment in it may have a hundred times as many
+        folders[:] = set(folders) - {'.venv', '.venv-ros', '.git', 'build', '.cache', 'test'}
+        found += [Path(folder, name) for name in names if name.endswith('.py')]
+    return sorted(found)
 
 
 def _wheel(distribution: metadata.Distribution, target: Path) -> str:

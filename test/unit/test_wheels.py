@@ -83,12 +83,25 @@ def test_a_wheel_is_made_of_what_colcon_installed(colcon, tmp_path):
         assert talker.external_attr >> 16 & 0o111
 
 
-def test_another_content_is_another_wheel(colcon, tmp_path):
+def test_another_content_is_another_wheel(colcon, tmp_path, monkeypatch):
     first = wheels.collect(tmp_path / 'cache')
+    # for the machines of a launch nobody looks anew
+    assert wheels.collect(tmp_path / 'cache') is first
+    monkeypatch.setattr(wheels, 'FRESH', 0.0)
     assert wheels.collect(tmp_path / 'cache').key == first.key
     (module,) = colcon.glob('lib/*/site-packages/fogros2/cloud_launch.py')
     module.write_text('x = 2\n')
     assert wheels.collect(tmp_path / 'cache').key != first.key
+
+
+def test_a_folder_of_sources_is_not_searched_where_nothing_travels_from(tmp_path):
+    for name in ('fogros2/b.py', 'fogros2/a.py', 'setup.py', '.venv/lib/x.py', 'test/unit/y.py',
+                 'build/z.py', 'fogros2/notes.txt'):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    assert [str(path.relative_to(tmp_path)) for path in wheels._programs(tmp_path)] == [
+        'fogros2/a.py', 'fogros2/b.py', 'setup.py']
 
 
 def test_a_path_without_the_set_up_script_is_told(colcon, tmp_path, monkeypatch):
