@@ -25,9 +25,9 @@ from fogros2 import host, process
 from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
 from fogros2.errors import PrerequisiteError
-from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python, RMW
+from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec
-from fogros2.plan import PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.plan import DEFAULT_RMW, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
 from fogros2.shell import Shell
 
 #: The system that ROS 2 Jazzy has packages for.
@@ -43,8 +43,9 @@ TOOLS: Mapping[str, str] = {
     'rsync': 'rsync',
     'wg': 'wireguard-tools',
 }
+#: Beside the middleware's, see :func:`apt_packages`.
 APT_PACKAGES = (
-    f'ros-{DISTRO}-ros-base', f'ros-{DISTRO}-{RMW.replace("_", "-")}',
+    f'ros-{DISTRO}-ros-base',
     'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
     'wireguard-tools', 'rsync', 'iproute2',
     'sudo',  # rosdep's way to root, which an image of ROS has not
@@ -104,6 +105,12 @@ class Preparation:
         return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
 
 
+def apt_packages(rmw: str) -> tuple[str, ...]:
+    """Return the packages that bring ROS 2, with a middleware, to a machine of its system."""
+    first, *others = APT_PACKAGES
+    return (first, f"ros-{DISTRO}-{rmw.replace('_', '-')}", *others)
+
+
 def dependencies(spec: MachineSpec, under: Underlay) -> str:
     """
     Return 16 hexadecimal digits that stand for what has to be installed on a machine.
@@ -122,7 +129,7 @@ def dependencies(spec: MachineSpec, under: Underlay) -> str:
         'distro': under.environment.get('ROS_DISTRO') or DISTRO,
         'bootstrap': spec.bootstrap,
         'kind': 'embedded' if embedded else 'ros',
-        'packages': sorted({*APT_PACKAGES, *TOOLS.values()}),
+        'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
         'workspace': workspaces.dependencies(spec.workspace) if spec.workspace else [],
     }
     return hashlib.sha256(json.dumps(needs, sort_keys=True).encode()).hexdigest()[:16]
@@ -201,7 +208,7 @@ def plan_alike(
     if not same or not ours or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
-        'ros' if robot.has_ros else 'embedded', (under.ros2, 'launch', *ours),
+        'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
     return Preparation('none', _with_workspace(install, workspace, spec.name),
                        _tools(facts, spec.bootstrap, spec.name))
@@ -225,15 +232,18 @@ def plan(
     tools = _tools(facts, mode, spec.name)
     python_only = workspace is None or workspace.python_only or mode == 'embedded'
     no_embedded = _why_not_embedded(facts, wheels, python_only)
+    if under.rmw != DEFAULT_RMW:
+        no_embedded = f'the embedded default has {DEFAULT_RMW} alone, and not {under.rmw}'
     no_apt = _why_not_apt(facts)
-    if facts.has_ros and (
+    if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
             or mode == 'apt' and {'colcon', 'rosdep'} <= facts.programs):
         todo = _ros(facts, wheels, workspace)
-    elif mode != 'apt' and wheels.embedded and wheels.key in facts.installed:
+    elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
+            and under.rmw == DEFAULT_RMW):
         todo = Preparation('none', _embedded_install(facts, wheels))
     elif mode == 'none':
-        raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {RMW}',
+        raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {under.rmw}',
                                 "bootstrap='auto' would install what is missing")
     elif mode != 'apt' and not no_embedded:
         todo = _embedded(facts, wheels)
@@ -243,7 +253,7 @@ def plan(
             'make room there' if 'are free' in no_embedded else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
-        todo = _apt(facts, wheels, workspace)
+        todo = _apt(facts, wheels, workspace, under.rmw)
     else:
         reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
         raise PrerequisiteError(
@@ -420,10 +430,11 @@ def _ros(
 
 def _apt(
     facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+    rmw: str,
 ) -> Preparation:
     """Return what installs ROS 2's packages, then adds this one."""
     ours = _ros(facts, wheels, workspace)
-    commands = [_apt_install(APT_PACKAGES, f'install ROS 2 {DISTRO}')]
+    commands = [_apt_install(apt_packages(rmw), f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
         commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
     return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))

@@ -139,8 +139,12 @@ class HostFacts:
 
     @property
     def has_ros(self) -> bool:
-        """Whether ROS 2 itself is there, with the middleware that we lead over the VPN."""
-        return RMW in self.rmw.get(DISTRO, ())
+        """Whether ROS 2 itself is there, with the middleware that launches use by default."""
+        return self.has_rmw(RMW)
+
+    def has_rmw(self, name: str) -> bool:
+        """Return whether ROS 2 itself is there, with that middleware."""
+        return name in self.rmw.get(DISTRO, ())
 
     @property
     def name(self) -> str:

@@ -47,6 +47,51 @@ def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
     return rmw
 
 
+def rmw_of(name: str, known: Sequence[str]) -> str:
+    """
+    Return the RMW that a launch file's ``dds=`` names: 'fastdds', or 'rmw_fastrtps_cpp'.
+
+    :raises DdsError: there is no plugin for it.
+    """
+    rmw = {'fastdds': 'rmw_fastrtps_cpp'}.get(name, name)
+    rmw = rmw if rmw in known else f'rmw_{rmw}_cpp'
+    if rmw not in known:
+        raise DdsError(f"dds='{name}' is none that FogROS2 can lead over a VPN",
+                       f"use one of {', '.join(known)}")
+    return rmw
+
+
+def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -> None:
+    """
+    Hold the launch's RMW against what the robot has and what its machines are asked to be.
+
+    :param prefixes: the robot's ament prefixes.
+    :raises DdsError: nodes here would not start, or would not understand those on a machine.
+    """
+    apt = f"ros-jazzy-{rmw.replace('_', '-')}"
+    indices = [index for prefix in prefixes if (
+        index := Path(prefix, 'share/ament_index/resource_index/rmw_typesupport')).is_dir()]
+    if not any((index / rmw).exists() for index in indices):
+        if indices:
+            raise DdsError(f'{rmw} is not installed on this computer',
+                           f'sudo apt-get install {apt}, or set RMW_IMPLEMENTATION to another')
+        if rmw != DEFAULT_RMW:
+            raise DdsError(f'{rmw} needs ROS 2: the embedded default has {DEFAULT_RMW} alone',
+                           'unset RMW_IMPLEMENTATION, or source ROS 2')
+    for spec in specs:
+        own = spec.environment.get('RMW_IMPLEMENTATION') or rmw
+        if own != rmw:
+            raise DdsError(
+                f"the nodes of machine '{spec.name}' would have RMW_IMPLEMENTATION={own}, those"
+                f' here {rmw}: they would not hear each other',
+                'set RMW_IMPLEMENTATION for the whole launch, before it')
+        if spec.bootstrap == 'embedded' and rmw != DEFAULT_RMW:
+            raise DdsError(
+                f"machine '{spec.name}' would get the embedded default, which has {DEFAULT_RMW}"
+                f' alone, and nodes here have {rmw}',
+                "leave bootstrap='embedded' out, or unset RMW_IMPLEMENTATION")
+
+
 def robot_interface(launch_id: str, network: str, port: int, key_file: str) -> VpnInterface:
     """Return the robot's VPN interface: the first address, and guarded."""
     return VpnInterface(
@@ -156,11 +201,13 @@ class Underlay:
     :param ros2: path of the ``ros2`` program.
     :param environment: variables that make nodes find all of it and the workspace's install
         space; entries of other places (a user's own) are left out.
+    :param rmw: the middleware of the launch's nodes.
     """
 
     prefixes: tuple[str, ...]
     ros2: str
     environment: Mapping[str, str]
+    rmw: str = DEFAULT_RMW
 
 
 def underlay(
@@ -188,7 +235,8 @@ def underlay(
             variables[name] = os.pathsep.join(entries)
     variables.update({
         name: environment[name] for name in PLAIN_VARIABLES if environment.get(name)})
-    return Underlay(tuple(prefixes), ros2, variables)
+    return Underlay(tuple(prefixes), ros2, variables,
+                    environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW)
 
 
 def _below(path: str, roots: Iterable[str]) -> bool:

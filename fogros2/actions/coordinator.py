@@ -112,6 +112,7 @@ class Coordinator:
         self._late: set[str] = set()
         self._streams = streaming.Streams()
         self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
+        self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
         self._restore_signals: Callable[[], None] = _nothing
         self._logger = launch.logging.get_logger('fogros2')
@@ -162,7 +163,19 @@ class Coordinator:
         self._launch = self._make_launch(
             report=self._console, environment=dict(context.environment), cancel=self._cancel)
         self._restore_signals = signals.take_over(context)
+        if self._dds is not None:
+            self._launch.use_dds(self._dds)
         self._set_dds_environment()
+
+    def use_dds(self, name: str) -> None:
+        """
+        Have all nodes of the launch use a middleware; see :meth:`fogros2.deploy.Launch.use_dds`.
+
+        :raises DdsError: nodes of the launch use another one already.
+        """
+        self._dds = name
+        if self._launch is not None:
+            self._launch.use_dds(name)
 
     def know(self, machine: Optional[SomeMachine]) -> None:
         """Remember a machine that the launch mentions, so that its name may stand for it."""

@@ -51,12 +51,13 @@ class FogROSLaunchDescription(LaunchDescription):
         executed in its order either way: only the start of a process waits.
     :param stream_topics: image topics that cross the VPN encoded, as at CloudNode, between the
         robot and every machine of the launch.
+    :param dds: the middleware of all nodes, such as 'fastdds', in RMW_IMPLEMENTATION's place.
     """
 
     def __init__(
         self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
         deprecated_reason: Optional[str] = None, robot_nodes: RobotNodes = 'after_cloud',
-        stream_topics: Sequence[Entry] = (),
+        stream_topics: Sequence[Entry] = (), dds: Optional[str] = None,
     ) -> None:
         super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
@@ -64,6 +65,7 @@ class FogROSLaunchDescription(LaunchDescription):
                 f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')
         self.robot_nodes = robot_nodes
         self.stream_topics = list(stream_topics)
+        self.dds = dds
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Visit the content; its robot processes wait for the cloud."""
@@ -71,6 +73,8 @@ class FogROSLaunchDescription(LaunchDescription):
         if context.is_shutdown or entities is None:
             return entities
         coordinator = Coordinator.of(context)
+        if self.dds is not None:
+            coordinator.use_dds(self.dds)
         coordinator.stream_everywhere(
             self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
         cloudy: list[SomeMachine] = []

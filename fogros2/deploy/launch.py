@@ -26,6 +26,7 @@ from fogros2.deploy.running import RunningMachine
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
+    DdsError,
     FogError,
     PrerequisiteError,
     StoreError,
@@ -92,6 +93,7 @@ class Launch:
                 raise ConfigurationError(f"two machines of this launch are called '{name}'",
                                          'give each a name= of its own')
         prefixes = plan.ament_prefixes(self.user_environment)
+        plan.check_rmw(self._rmw, prefixes, specs)
         for spec in specs:
             machines = self.provider(spec.provider)
             shells.warm(machines.shell_kind)
@@ -145,14 +147,34 @@ class Launch:
         """
         return self.choices.cost()
 
+    def use_dds(self, name: str) -> None:
+        """
+        Have all nodes use a middleware, as if RMW_IMPLEMENTATION had named it.
+
+        :param name: as RMW_IMPLEMENTATION has it, or short: 'cyclonedds', 'fastdds', 'zenoh'.
+        :raises DdsError: there is no plugin for it, or terminals and nodes that run have another.
+        """
+        rmw = plan.rmw_of(name, plugin_system.names('fogros2.dds'))
+        with self._lock:
+            other = self.user_environment.get('RMW_IMPLEMENTATION') or rmw
+            if self._robot_environment is not None:
+                other = self._rmw
+            if other != rmw:
+                raise DdsError(f"dds='{name}' contradicts RMW_IMPLEMENTATION={other}",
+                               'leave one of the two out')
+            self.user_environment['RMW_IMPLEMENTATION'] = rmw
+            self._rmw = ''
+
     def dds(self) -> DdsVendor:
         """
         Return the DDS vendor of the launch.
 
-        :raises DdsError: the user's RMW_IMPLEMENTATION is one without a plugin.
+        :raises DdsError: the user's RMW_IMPLEMENTATION has no plugin, or isn't installed.
         """
         if not self._rmw:
-            self._rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
+            rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
+            plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), ())
+            self._rmw = rmw
         vendor: DdsVendor = plugin_system.load('fogros2.dds', self._rmw)(domain=self.domain)
         return vendor
 
@@ -202,6 +224,8 @@ class Launch:
                 # no peers: the machines announce themselves
                 write_private(
                     path, vendor.render(interfaces, (), self.user_environment).encode())
+                # for terminals that join
+                write_private(path.with_name('rmw'), vendor.rmw.encode())
                 robot.ensure()
                 self._robot_environment = dict(
                     vendor.environment(str(path), self.user_environment))

@@ -21,7 +21,7 @@ import xml.etree.ElementTree as ElementTree
 from fogros2 import deploy, plan, plugin_system, process
 from fogros2.dds.cyclonedds import RECEIVE_BUFFER
 from fogros2.errors import FogError, Unsupported
-from fogros2.host import DISTRO, RMW
+from fogros2.host import DISTRO
 from fogros2.model import Command
 from fogros2.provider import container, container_engine, Provider
 from fogros2.store import state_home
@@ -221,7 +221,7 @@ def rmw() -> Check:
     if any(Path(prefix, 'share', 'rclcpp').is_dir() for prefix in prefixes) \
             and not any(Path(prefix, 'share', chosen).is_dir() for prefix in prefixes):
         return Check('RMW_IMPLEMENTATION', 'failed', f'{chosen} is not installed',
-                     f"sudo apt-get install ros-{DISTRO}-{RMW.replace('_', '-')}")
+                     f"sudo apt-get install ros-{DISTRO}-{chosen.replace('_', '-')}")
     return Check('RMW_IMPLEMENTATION', 'ok', f'{set_here}: launches use {chosen}')
 
 

@@ -14,10 +14,10 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import plan, plugin_system, process
+from fogros2 import plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.errors import AgentError, ConnectError, FogError, MachineNotFound
+from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.model import Command, Endpoint
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
@@ -263,6 +263,10 @@ def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
     path = store.root / 'launches' / record.launch / 'dds.xml'
     if not record.launch or not record.launch_alive or not path.exists():
         return None
-    rmw = plan.choose_rmw(os.environ, plugin_system.names('fogros2.dds'))
+    rmw = path.with_name('rmw').read_text()
+    own = os.environ.get('RMW_IMPLEMENTATION') or rmw
+    if own != rmw:
+        raise DdsError(f'the launch has RMW_IMPLEMENTATION={rmw}, this terminal {own}',
+                       'unset RMW_IMPLEMENTATION here')
     vendor = plugin_system.load('fogros2.dds', rmw)()
     return dict(vendor.environment(str(path), os.environ))

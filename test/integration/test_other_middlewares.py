@@ -30,16 +30,16 @@ from launch_ros.actions import Node
 def generate_launch_description():
     machine = ContainerInstance(name='{name}', network='{network}', ros_workspace='')
     return FogROSLaunchDescription([
-        CloudNode(machine=machine, package='demo_nodes_py', executable='talker',
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
                   name='far_talker', remappings=[('chatter', '/down')]),
-        CloudNode(machine=machine, package='demo_nodes_py', executable='listener',
+        CloudNode(machine=machine, package='fogros2_examples', executable='listener',
                   name='far_listener', remappings=[('chatter', '/up')]),
-        Node(package='demo_nodes_py', executable='talker', name='near_talker',
+        Node(package='fogros2_examples', executable='talker', name='near_talker',
              remappings=[('chatter', '/up')]),
-        Node(package='demo_nodes_py', executable='listener', name='near_listener',
+        Node(package='fogros2_examples', executable='listener', name='near_listener',
              remappings=[('chatter', '/down')]),
         ExecuteProcess(cmd=['sh', '-c', '{look}'], output='screen'),
-    ])
+    ], dds='{dds}')
 """
 #: Which nodes a terminal sees, asked again until all are there.
 LOOK = ('for i in 1 2 3 4 5 6 7 8; do '
@@ -54,14 +54,26 @@ def has_middleware(name: str) -> bool:
                for prefix in prefixes if prefix)
 
 
+def test_what_nodes_here_lack_is_refused_before_anything_is_made(
+        tmp_path: Path, cloud_network: str) -> None:
+    if has_middleware('rmw_fastrtps_cpp'):
+        pytest.skip("this computer's ROS 2 has rmw_fastrtps_cpp")
+    path = tmp_path / 'rmw.launch.py'
+    path.write_text(LAUNCH.format(name=NAME, network=cloud_network, look='true', dds='fastdds'))
+    with launching() as launch:
+        launched = launch(str(path))
+        assert launched.ended(30.0) == 1, launched.text
+    assert 'rmw_fastrtps_cpp' in launched.errors[0], launched.text
+    assert ': machine' not in launched.text
+
+
 def test_fast_dds_carries_a_launch(tmp_path: Path, cloud_network: str) -> None:
     if not has_middleware('rmw_fastrtps_cpp'):
         pytest.skip('needs ROS 2 with rmw_fastrtps_cpp')
     path = tmp_path / 'rmw.launch.py'
-    path.write_text(LAUNCH.format(name=NAME, network=cloud_network, look=LOOK))
+    path.write_text(LAUNCH.format(name=NAME, network=cloud_network, look=LOOK, dds='fastdds'))
     with launching() as launch:
-        launched = launch(str(path), environment={
-            **os.environ, 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'})
+        launched = launch(str(path))
         launched.wait_for('[near_listener]: I heard:', times=3)
         launched.wait_for('[far_listener]: I heard:', times=3)
         launched.wait_for('all four are seen')

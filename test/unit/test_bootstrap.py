@@ -15,7 +15,7 @@ import pytest
 from fogros2 import bootstrap, host, process, wheels
 from fogros2.errors import PrerequisiteError, WorkspaceError
 from fogros2.host import HostFacts, Python
-from fogros2.model import Command, MachineSpec
+from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import Underlay
 from fogros2.wheels import Wheels
 
@@ -197,6 +197,25 @@ def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
     script = scripts(plan(facts).commands)
     assert '--no-index' not in script
     assert 'ros2-embedded fogros2' in script
+
+
+def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
+    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {}, 'rmw_fastrtps_cpp')
+
+    def planned(facts: HostFacts, mode: Bootstrap) -> bootstrap.Preparation:
+        return bootstrap.plan(
+            MachineSpec('m', 'ssh', bootstrap=mode), facts, NOBLE, under, WHEELS, None)
+
+    # what it has is Cyclone's; and the embedded default has no other
+    todo = planned(ROS, 'auto')
+    assert todo.mode == 'apt'
+    assert 'ros-jazzy-rmw-fastrtps-cpp' in ''.join(one.argv[-1] for one in todo.commands)
+    assert planned(dataclasses.replace(ROS, rmw={'jazzy': ('rmw_fastrtps_cpp',)}),
+                   'none').mode == 'none'
+    with pytest.raises(PrerequisiteError, match='with rmw_fastrtps_cpp'):
+        planned(ROS, 'none')
+    with pytest.raises(PrerequisiteError, match='and not rmw_fastrtps_cpp'):
+        planned(DEBIAN, 'auto')
 
 
 def test_apt_installs_ros_on_noble_alone() -> None:

@@ -414,6 +414,7 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert 'no launch is running' in str(run('env', 'a'))
     path = Store().launch('abc123') / 'dds.xml'
     path.write_text('<x/>')
+    path.with_name('rmw').write_text('rmw_cyclonedds_cpp')
     assert run('env', 'a') == 0
     said = capsys.readouterr().out
     shown = subprocess.run(
@@ -422,6 +423,8 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}']
     assert run('env', 'a', '--json') == 0
     assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+    assert 'this terminal rmw_fastrtps_cpp' in str(run('env', 'a'))
     record('a', **dead())
     assert 'no launch is running' in str(run('env', 'a'))
 

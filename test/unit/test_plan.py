@@ -3,12 +3,13 @@
 
 import dataclasses
 from decimal import Decimal
+from pathlib import Path
 
 import pytest
 
 from fogros2 import plan
 from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
-from fogros2.model import Machine, MachineState, Peer
+from fogros2.model import Machine, MachineSpec, MachineState, Peer
 
 NETWORK = '198.18.7.0/24'
 
@@ -146,3 +147,30 @@ def test_a_program_that_is_not_there_is_refused_with_the_nearest(
         prefix, package, executable, words):
     with pytest.raises(WorkspaceError, match=words):
         plan.check_program(package, executable, [prefix])
+
+
+def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> None:
+    index = tmp_path / 'share/ament_index/resource_index/rmw_typesupport'
+    index.mkdir(parents=True)
+    (index / 'rmw_fastrtps_cpp').touch()
+    here = [str(tmp_path), '/nowhere']
+    like = MachineSpec('m', 'ssh', environment={'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'})
+    plan.check_rmw('rmw_fastrtps_cpp', here, [like, MachineSpec('n', 'ssh')])
+    plan.check_rmw(plan.DEFAULT_RMW, ['/nowhere'], [MachineSpec('n', 'ssh')])
+    for rmw, prefixes, spec, words in (
+            ('rmw_cyclonedds_cpp', here, like, 'rmw_cyclonedds_cpp is not installed'),
+            ('rmw_fastrtps_cpp', ['/nowhere'], like, 'needs ROS 2'),
+            ('rmw_cyclonedds_cpp', ['/nowhere'], like, 'would not hear each other'),
+            ('rmw_fastrtps_cpp', here, MachineSpec('m', 'ssh', bootstrap='embedded'),
+             'would get the embedded default')):
+        with pytest.raises(DdsError, match=words) as caught:
+            plan.check_rmw(rmw, prefixes, [spec])
+        assert caught.value.hint
+
+
+@pytest.mark.parametrize('name', ['fastdds', 'fastrtps', 'rmw_fastrtps_cpp'])
+def test_a_launch_file_names_its_middleware(name: str) -> None:
+    known = ['rmw_cyclonedds_cpp', 'rmw_fastrtps_cpp']
+    assert plan.rmw_of(name, known) == 'rmw_fastrtps_cpp'
+    with pytest.raises(DdsError, match='opendds'):
+        plan.rmw_of('opendds', known)
