@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Builds ``ros-jazzy-fogros2_VERSION_all.deb``, laid out as bloom lays out a package of ROS 2 Jazzy.
+
+    python3 packaging/deb.py [--output FOLDER]
+
+Everything goes below ``/opt/ros/jazzy``: modules where Ubuntu 24.04's Python finds them once
+``setup.bash`` is sourced, executables, launch files and index markers where ROS 2 looks. The names
+of its dependencies come from ``package.xml``: packages of ROS by ROS's rule, the others by the
+table below, as rosdep would say. ``dpkg-deb`` puts the package together; no network is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import email
+import hashlib
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+import zipfile
+
+ROOT = Path(__file__).resolve().parents[1]
+PREFIX = Path('opt/ros/jazzy')
+#: Of Ubuntu 24.04.
+SITE_PACKAGES = PREFIX / 'lib/python3.12/site-packages'
+#: Packages of this source tree, which are in the one that is built.
+OWN = {'fogros2', 'fogros2_examples', 'image_transport_h264'}
+#: What rosdep's keys are in Ubuntu 24.04, with the version that it has, the oldest that is tried.
+UBUNTU = {
+    'iproute2': 'iproute2',
+    'openssh-client': 'openssh-client',
+    'python3-boto3': 'python3-boto3 (>= 1.34)',
+    'python3-numpy': 'python3-numpy (>= 1:1.26)',
+    'python3-opencv': 'python3-opencv (>= 4.6)',
+    'python3-paramiko': 'python3-paramiko (>= 2.12)',
+    'python3-requests': 'python3-requests (>= 2.31)',
+    'python3-yaml': 'python3-yaml (>= 6.0)',
+    'rsync': 'rsync',
+    'wireguard': 'wireguard-tools',
+}
+#: What not every robot needs, and rosdep has no key for.
+RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'wireguard-go')
+
+
+def dependencies(manifests: list[Path]) -> list[str]:
+    """
+    Return what the package depends on, as Debian writes it, sorted.
+
+    :raises LookupError: a key that is neither a package of ROS nor in the table.
+    """
+    keys = {element.text or '' for manifest in manifests
+            for kind in ('depend', 'exec_depend')
+            for element in ElementTree.parse(manifest).getroot().iter(kind)
+            if element.get('condition') is None}
+    return sorted(_debian(key) for key in keys - OWN)
+
+
+def _debian(key: str) -> str:
+    if key in UBUNTU:
+        return UBUNTU[key]
+    if key.startswith('python3-'):
+        raise LookupError(f'package.xml names {key}, for which packaging/deb.py has no version')
+    return 'ros-jazzy-' + key.replace('_', '-')
+
+
+def wheel(folder: Path) -> Path:
+    """Build the wheel from a copy, as setuptools leaves folders behind, and return its path."""
+    source = folder / 'source'
+    names = subprocess.run(
+        ['git', 'ls-files', '-z', '-co', '--exclude-standard'], cwd=ROOT, check=True,
+        capture_output=True).stdout.decode().split('\0')
+    for name in filter(None, names):
+        target = source / name
+        if (ROOT / name).is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target)
+    subprocess.run(
+        [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-build-isolation',
+         '--wheel-dir', str(folder / 'wheel'), str(source)], check=True)
+    (found,) = (folder / 'wheel').glob('fogros2-*.whl')
+    return found
+
+
+def unpack(built: Path, stage: Path) -> str:
+    """Put a wheel's files where they belong below ``stage``; return its version."""
+    version = ''
+    with zipfile.ZipFile(built) as archive:
+        for entry in archive.infolist():
+            path = Path(entry.filename)
+            if path.parts[0].endswith('.data'):
+                if path.parts[1] != 'data':
+                    raise LookupError(f'{entry.filename}: what is it?')
+                target = stage / PREFIX / Path(*path.parts[2:])
+            else:
+                target = stage / SITE_PACKAGES / path
+            if path.name == 'METADATA':
+                version = email.message_from_bytes(archive.read(entry))['Version']
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(archive.read(entry))
+            # what ROS 2 runs
+            executable = target.is_relative_to(stage / PREFIX / 'lib') and \
+                not target.is_relative_to(stage / SITE_PACKAGES)
+            target.chmod(0o755 if executable else 0o644)
+    return version
+
+
+def documents(stage: Path, version: str) -> None:
+    """Write what Debian's policy wants beside the files: licence and change log."""
+    folder = stage / 'usr/share/doc/ros-jazzy-fogros2'
+    folder.mkdir(parents=True)
+    shutil.copy(ROOT / 'LICENSE', folder / 'copyright')
+    shutil.copy(ROOT / 'CHANGELOG.rst', folder / 'changelog')
+    for path in folder.iterdir():
+        path.chmod(0o644)
+
+
+def control(stage: Path, version: str) -> Iterator[str]:
+    """Yield the lines of the control file."""
+    manifests = [ROOT / 'package.xml', *(
+        ROOT / name / 'package.xml' for name in sorted(OWN - {'fogros2'}))]
+    root = ElementTree.parse(ROOT / 'package.xml').getroot()
+    maintainer = root.find('maintainer')
+    assert maintainer is not None
+    size = sum(path.stat().st_size for path in stage.rglob('*') if path.is_file())
+    yield 'Package: ros-jazzy-fogros2'
+    yield f'Version: {version}'
+    yield 'Architecture: all'
+    yield 'Section: misc'
+    yield 'Priority: optional'
+    yield f'Maintainer: {maintainer.text} <{maintainer.get("email")}>'
+    yield f'Installed-Size: {-(-size // 1024)}'
+    yield f'Depends: {", ".join(["python3 (>= 3.12)", *dependencies(manifests)])}'
+    others = (_debian(name) for name in sorted(OWN - {'fogros2'}))
+    yield f'Provides: {", ".join(f"{name} (= {version})" for name in others)}'
+    yield f'Recommends: {", ".join(RECOMMENDS)}'
+    yield f'Description: {(root.findtext("description") or "").strip()}'
+
+
+def build(output: Path) -> Path:
+    """Build the package and return its path."""
+    with tempfile.TemporaryDirectory(prefix='fogros2-deb-') as name:
+        folder = Path(name)
+        stage = folder / 'stage'
+        version = unpack(wheel(folder), stage)
+        documents(stage, version)
+        files = sorted(path for path in stage.rglob('*') if path.is_file())
+        debian = stage / 'DEBIAN'
+        lines = list(control(stage, version))
+        debian.mkdir()
+        (debian / 'control').write_text('\n'.join(lines) + '\n')
+        (debian / 'md5sums').write_text(''.join(
+            f'{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  '
+            f'{path.relative_to(stage)}\n' for path in files))
+        for path in (stage, *stage.rglob('*')):
+            if path.is_dir():
+                path.chmod(0o755)
+        output.mkdir(parents=True, exist_ok=True)
+        target = output / f'ros-jazzy-fogros2_{version}_all.deb'
+        subprocess.run(['dpkg-deb', '--build', '--root-owner-group', '-Zxz', str(stage),
+                        str(target)], check=True, stdout=subprocess.DEVNULL)
+    return target
+
+
+def main() -> None:
+    """Build, and say where the package is."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--output', type=Path, default=ROOT / '.cache/deb')
+    print(build(parser.parse_args().output))
+
+
+if __name__ == '__main__':
+    main()
