@@ -106,6 +106,12 @@ setup(
         'launch.frontend.launch_extension': [
             'fogros2 = fogros2.actions.frontend',
         ],
+        'ros2doctor.checks': [
+            'FogCheck = ros2fog_cli.ros2doctor:FogCheck',
+        ],
+        'ros2doctor.report': [
+            'FogReport = ros2fog_cli.ros2doctor:FogReport',
+        ],
         'ros2launch.option': [
             'machine = ros2fog_cli.option.machine:MachineOption',
         ],
