@@ -9,6 +9,10 @@ import warnings
 from ament_index_python.resources import get_resource, get_resources
 from ament_index_python.search_paths import get_search_paths
 
+__all__ = [
+    'get_package_prefix', 'get_package_share_directory', 'get_package_share_path',
+    'get_packages_with_prefixes', 'PackageNotFoundError']
+
 
 class PackageNotFoundError(KeyError):
     """There is no such package."""

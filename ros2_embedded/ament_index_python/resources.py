@@ -7,6 +7,10 @@ from typing import Literal
 from ament_index_python.constants import RESOURCE_INDEX_SUBFOLDER
 from ament_index_python.search_paths import get_search_paths
 
+__all__ = [
+    'get_resource', 'get_resource_types', 'get_resources', 'has_resource',
+    'InvalidResourceNameError', 'InvalidResourceTypeNameError']
+
 
 class InvalidResourceTypeNameError(ValueError):
     """A resource type's name holds a path separator."""

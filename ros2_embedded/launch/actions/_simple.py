@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions that say something, call something, or handle events."""
+"""Actions that set, say or call something, or handle events."""
 from __future__ import annotations
 
 import logging
-from typing import Any, Callable, Iterable
+import os
+from typing import Any, Callable, Iterable, List, TYPE_CHECKING
 
 import launch.logging
 
@@ -13,22 +14,239 @@ from .._base import (
     Conditional,
     Entities,
     Event,
+    ParsedAction,
     SomeSubstitutionsType,
 )
 from ..events import Shutdown as ShutdownEvent
 from ..events.process import ProcessExited
 from ..frontend.expose import expose_action
+from ..frontend.type_utils import Entity
 from ..launch_context import LaunchContext
-from ..utilities import (
-    is_a_subclass,
-    normalize_to_list_of_entities,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from ..utilities import is_a_subclass, normalize_to_list_of_entities, perform_substitutions
+from ..utilities import normalize_to_list_of_substitutions as normalize
+from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 
-__all__ = ['EmitEvent', 'LogInfo', 'OpaqueFunction', 'RegisterEventHandler', 'Shutdown']
+if TYPE_CHECKING:
+    from ..frontend import Parser
+
+__all__ = [
+    'AppendEnvironmentVariable', 'DeclareLaunchArgument', 'EmitEvent', 'LogInfo',
+    'OpaqueFunction', 'PopEnvironment', 'PopLaunchConfigurations', 'PushEnvironment',
+    'PushLaunchConfigurations', 'RegisterEventHandler', 'ResetEnvironment',
+    'ResetLaunchConfigurations', 'SetEnvironmentVariable', 'SetLaunchConfiguration', 'Shutdown',
+    'UnsetEnvironmentVariable', 'UnsetLaunchConfiguration']
 
 _logger = logging.getLogger('launch')
+
+
+def parse_pairs(
+    entity: Entity, parser: Parser, element: str, key: str = 'name', value: str = 'value'
+) -> dict[Any, Any] | None:
+    """Return what nested elements give by name, None if there are none of that kind."""
+    nested = entity.get_attr(element, data_type=List[Entity], optional=True)
+    if nested is None:
+        return None
+    pairs = {tuple(parser.parse_substitution(one.get_attr(key))):
+             parser.parse_substitution(one.get_attr(value)) for one in nested}
+    for one in nested:
+        one.assert_entity_completely_parsed()
+    return pairs
+
+
+class _Named(Action):
+
+    _texts = {'name': 'name'}
+
+    def __init__(self, name: SomeSubstitutionsType, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.name = normalize(name)
+
+
+class _NamedValue(_Named):
+
+    _texts = {'name': 'name', 'value': 'value'}
+
+    def __init__(
+        self, name: SomeSubstitutionsType, value: SomeSubstitutionsType, **kwargs: Any
+    ) -> None:
+        super().__init__(name, **kwargs)
+        self.value = normalize(value)
+
+
+@expose_action('set_env')
+class SetEnvironmentVariable(_NamedValue):
+
+    def execute(self, context: LaunchContext) -> None:
+        name = perform_substitutions(context, self.name)
+        context.environment[name] = perform_substitutions(context, self.value)
+
+
+@expose_action('unset_env')
+class UnsetEnvironmentVariable(_Named):
+
+    def execute(self, context: LaunchContext) -> None:
+        context.environment.pop(perform_substitutions(context, self.name), None)
+
+
+@expose_action('append_env')
+class AppendEnvironmentVariable(_NamedValue):
+
+    _texts = {**_NamedValue._texts, 'separator': 'separator?'}
+    _typed = {'prepend': bool}
+
+    def __init__(
+        self, name: SomeSubstitutionsType, value: SomeSubstitutionsType,
+        prepend: bool | SomeSubstitutionsType = False,
+        separator: SomeSubstitutionsType = os.pathsep, **kwargs: Any
+    ) -> None:
+        super().__init__(name, value, **kwargs)
+        self.prepend = normalize_typed_substitution(prepend, bool)
+        self.separator = normalize(separator)
+
+    def execute(self, context: LaunchContext) -> None:
+        name = perform_substitutions(context, self.name)
+        parts = [perform_substitutions(context, self.value)]
+        prepend = perform_typed_substitution(context, self.prepend, bool)
+        if name in context.environment:
+            parts.insert(len(parts) if prepend else 0, context.environment[name])
+        context.environment[name] = perform_substitutions(context, self.separator).join(parts)
+
+
+class PushEnvironment(Action):
+
+    def execute(self, context: LaunchContext) -> None:
+        context._push_environment()
+
+
+class PopEnvironment(Action):
+
+    def execute(self, context: LaunchContext) -> None:
+        context._pop_environment()
+
+
+@expose_action('reset_env')
+class ResetEnvironment(Action):
+
+    def execute(self, context: LaunchContext) -> None:
+        context._reset_environment()
+
+
+@expose_action('let')
+class SetLaunchConfiguration(_NamedValue):
+
+    def execute(self, context: LaunchContext) -> None:
+        name = perform_substitutions(context, self.name)
+        context.launch_configurations[name] = perform_substitutions(context, self.value)
+
+
+class UnsetLaunchConfiguration(_Named):
+
+    def execute(self, context: LaunchContext) -> None:
+        context.launch_configurations.pop(perform_substitutions(context, self.name), None)
+
+
+class PushLaunchConfigurations(Action):
+
+    def execute(self, context: LaunchContext) -> None:
+        context._push_launch_configurations()
+
+
+class PopLaunchConfigurations(Action):
+
+    def execute(self, context: LaunchContext) -> None:
+        context._pop_launch_configurations()
+
+
+@expose_action('reset')
+class ResetLaunchConfigurations(Action):
+    """Removes all launch configurations and sets the given ones, evaluated before that."""
+
+    def __init__(
+        self, launch_configurations: dict[Any, Any] | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        self.__launch_configurations = launch_configurations or {}
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        kwargs['launch_configurations'] = parse_pairs(entity, parser, 'keep')
+        return cls, kwargs
+
+    def execute(self, context: LaunchContext) -> None:
+        def text(given: SomeSubstitutionsType) -> str:
+            return perform_substitutions(context, normalize(given))
+
+        kept = {text(name): text(value) for name, value in self.__launch_configurations.items()}
+        context.launch_configurations.clear()
+        context.launch_configurations.update(kept)
+
+
+@expose_action('arg')
+class DeclareLaunchArgument(Action):
+    """
+    Declares a launch configuration that can be given to the launch file.
+
+    :param default_value: without one the argument is required.
+    :param choices: the values that are allowed, if not all are.
+    :raises RuntimeError: for no choices, or a default that isn't one of them.
+    """
+
+    _texts = {'default_value': 'default?'}
+
+    def __init__(
+        self, name: str, *, default_value: SomeSubstitutionsType | None = None,
+        description: str | None = None, choices: list[str] | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        self.name = name
+        self.__logger = launch.logging.get_logger(__name__)
+        self.default_value = None if default_value is None else normalize(default_value)
+        if choices is not None:
+            if not choices:
+                self.__refuse('Provided choices arg is empty. Use None to ignore the choice list.')
+            if isinstance(default_value, str) and default_value not in choices:
+                self.__refuse(f'Provided default_value "{default_value}" is not in provided '
+                              f'choices "{choices}".')
+        if description is None:
+            description = 'no description given' if choices is None else f'One of: {choices}'
+        elif choices is not None:
+            dot = '' if description.endswith('.') else '.'
+            description += f'{dot} Valid choices are: {choices}'
+        self.description = description
+        self.choices = choices
+        self._conditionally_included = False
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+        _, kwargs = super().parse(entity, parser)
+        kwargs['name'] = parser.escape_characters(entity.get_attr('name'))
+        description = entity.get_attr('description', optional=True)
+        if description is not None:
+            kwargs['description'] = parser.escape_characters(description)
+        choices = entity.get_attr('choice', data_type=List[Entity], optional=True)
+        if choices is not None:
+            kwargs['choices'] = [
+                parser.escape_characters(choice.get_attr('value')) for choice in choices]
+        return cls, kwargs
+
+    def __refuse(self, text: str) -> None:
+        self.__logger.error(text)
+        raise RuntimeError(text)
+
+    def execute(self, context: LaunchContext) -> None:
+        configurations = context.launch_configurations
+        if self.name not in configurations:
+            if self.default_value is None:
+                self.__logger.error(
+                    f'Required launch argument "{self.name}" (description: '
+                    f'"{self.description}") was not provided')
+                raise RuntimeError(f'Required launch argument "{self.name}" was not provided.')
+            configurations[self.name] = perform_substitutions(context, self.default_value)
+        value = configurations[self.name]
+        if self.choices is not None and value not in self.choices:
+            self.__refuse(f'Argument "{self.name}" provided value "{value}" is not valid. '
+                          f'Valid options are: {self.choices}')
 
 
 class EmitEvent(Action):
@@ -67,7 +285,7 @@ class LogInfo(Action):
 
     def __init__(self, *, msg: SomeSubstitutionsType, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.msg = normalize_to_list_of_substitutions(msg)
+        self.msg = normalize(msg)
         self.__logger = launch.logging.get_logger('launch.user')
 
     def execute(self, context: LaunchContext) -> None:

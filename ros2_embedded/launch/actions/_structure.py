@@ -31,8 +31,7 @@ from ..utilities import (
     perform_substitutions,
 )
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
-from . import _environment as environment
-from ._simple import OpaqueFunction
+from . import _simple as simple
 
 if TYPE_CHECKING:
     from ..frontend import Entity, Parser
@@ -67,7 +66,7 @@ class GroupAction(Action):
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs['launch_configurations'] = environment.parse_pairs(entity, parser, 'keep')
+        kwargs['launch_configurations'] = simple.parse_pairs(entity, parser, 'keep')
         kwargs['actions'] = [
             parser.parse_action(child) for child in entity.children
             if child.type_name != 'keep']
@@ -76,15 +75,15 @@ class GroupAction(Action):
     def get_sub_entities(self) -> Entities:
         if self.__actions_to_return is None:
             kept = self.__launch_configurations
-            before: Entities = [environment.SetLaunchConfiguration(*pair) for pair in kept.items()]
+            before: Entities = [simple.SetLaunchConfiguration(*pair) for pair in kept.items()]
             after: Entities = []
             if self.__scoped:
                 if not self.__forwarding:
-                    before = [environment.ResetEnvironment(),
-                              environment.ResetLaunchConfigurations(kept)]
-                before = [environment.PushLaunchConfigurations(), environment.PushEnvironment(),
+                    before = [simple.ResetEnvironment(),
+                              simple.ResetLaunchConfigurations(kept)]
+                before = [simple.PushLaunchConfigurations(), simple.PushEnvironment(),
                           *before]
-                after = [environment.PopEnvironment(), environment.PopLaunchConfigurations()]
+                after = [simple.PopEnvironment(), simple.PopLaunchConfigurations()]
             self.__actions_to_return = [*before, *self.__actions, *after]
         return self.__actions_to_return
 
@@ -114,7 +113,7 @@ class IncludeLaunchDescription(Action):
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs['launch_arguments'] = (environment.parse_pairs(entity, parser, 'arg') or {}).items()
+        kwargs['launch_arguments'] = (simple.parse_pairs(entity, parser, 'arg') or {}).items()
         return cls, kwargs
 
     def get_sub_entities(self) -> Entities:
@@ -151,7 +150,7 @@ class IncludeLaunchDescription(Action):
                     'Included launch description missing required argument '
                     f"'{argument.name}' (description: '{argument.description}'), "
                     f"given: [{', '.join(given)}]")
-        return [*(environment.SetLaunchConfiguration(*pair) for pair in self.launch_arguments),
+        return [*(simple.SetLaunchConfiguration(*pair) for pair in self.launch_arguments),
                 description]
 
 
@@ -222,7 +221,7 @@ class TimerAction(Action):
             # One handler does for all timers of a launch.
             context.register_event_handler(EventHandler(
                 matcher=lambda event: isinstance(event, TimerEvent),
-                entities=OpaqueFunction(
+                entities=simple.OpaqueFunction(
                     function=lambda context: context.locals.event.timer_action.handle(context))))
             vars(context)['_TimerAction__event_handler_has_been_installed'] = True
         self.__context_locals = context.get_locals_as_dict()

@@ -10,8 +10,7 @@ from ..descriptions import Executable
 from ..frontend.expose import expose_action
 from ..frontend.type_utils import Entity
 from ..substitutions import TextSubstitution
-from ._environment import parse_pairs
-from ._simple import Shutdown
+from ._simple import parse_pairs, Shutdown
 from .execute_local import ExecuteLocal
 
 if TYPE_CHECKING:

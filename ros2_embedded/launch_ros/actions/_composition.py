@@ -24,9 +24,12 @@ from launch.utilities import (
 from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import call_service, get_ros_node
-from ..utilities import evaluate_parameters, to_parameters_list
 from ..utilities.names import count_node_name, make_namespace_absolute, prefix_namespace
-from ..utilities.normalize_parameters import normalize_parameter_dict
+from ..utilities.parameters import (
+    evaluate_parameters,
+    normalize_parameter_dict,
+    to_parameters_list,
+)
 from .node import Node
 
 

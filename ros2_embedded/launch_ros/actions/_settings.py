@@ -12,9 +12,8 @@ from launch.logging import _get_logging_directory
 from launch.substitutions import SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
-from ..utilities.evaluate_parameters import evaluate_parameter_dict
 from ..utilities.names import check_namespace, make_namespace_absolute, prefix_namespace
-from ..utilities.normalize_parameters import normalize_parameter_dict
+from ..utilities.parameters import evaluate_parameter_dict, normalize_parameter_dict
 
 __all__ = [
     'PushROSNamespace', 'SetParameter', 'SetParametersFromFile', 'SetRemap', 'SetROSLogDir']

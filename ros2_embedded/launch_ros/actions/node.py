@@ -6,12 +6,12 @@ import atexit
 import os
 import pathlib
 from tempfile import NamedTemporaryFile
-from typing import Any, Iterable, List
+from typing import Any, Iterable, List, Sequence
 
 from launch import LaunchDescriptionEntity, SomeSubstitutionsType
 from launch._base import ParsedAction
 from launch.actions import ExecuteProcess
-from launch.actions._environment import parse_pairs
+from launch.actions._simple import parse_pairs
 from launch.frontend import Entity, expose_action, Parser
 from launch.frontend.type_utils import get_data_type_from_identifier
 from launch.launch_context import LaunchContext
@@ -24,11 +24,9 @@ from launch.utilities import (
 )
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
-from ..parameters_type import Parameters, SomeParameters
 from ..substitutions import ExecutableInPackage
 from ..utilities import names
-from ..utilities.evaluate_parameters import evaluate_parameters
-from ..utilities.normalize_parameters import as_yaml, normalize_parameters
+from ..utilities.parameters import as_yaml, evaluate_parameters, normalize_parameters
 
 
 @expose_action('node')
@@ -52,7 +50,7 @@ class Node(ExecuteProcess):
     def __init__(
         self, *, executable: SomeSubstitutionsType, package: SomeSubstitutionsType | None = None,
         name: SomeSubstitutionsType | None = None, namespace: SomeSubstitutionsType | None = None,
-        exec_name: SomeSubstitutionsType | None = None, parameters: SomeParameters | None = None,
+        exec_name: SomeSubstitutionsType | None = None, parameters: Sequence[Any] | None = None,
         remappings: Iterable[Any] | None = None,
         ros_arguments: Iterable[SomeSubstitutionsType] | None = None,
         arguments: Iterable[SomeSubstitutionsType] | None = None, **kwargs: Any
@@ -67,7 +65,7 @@ class Node(ExecuteProcess):
         if name is not None:
             cmd += ['-r', LocalSubstitution(
                 "ros_specific_arguments['name']", description='node name')]
-        self.__parameters: Parameters = ()
+        self.__parameters: Sequence[Any] = ()
         if parameters is not None:
             ensure_argument_type(parameters, list, 'parameters', 'Node')
             self.__parameters = normalize_parameters(parameters)

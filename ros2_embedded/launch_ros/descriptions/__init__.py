@@ -2,7 +2,7 @@
 """What nodes are made of."""
 from __future__ import annotations
 
-from typing import Any, List
+from typing import Any, List, Sequence
 
 from launch import Action, Condition, SomeSubstitutionsType
 from launch.frontend import Entity, Parser
@@ -12,7 +12,6 @@ from launch.utilities import normalize_to_list_of_substitutions
 from ..parameter_descriptions import Parameter as Parameter
 from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
-from ..parameters_type import SomeParameters
 from ..utilities import normalize_parameters, normalize_remap_rules
 
 
@@ -27,8 +26,8 @@ class ComposableNode:
     def __init__(
         self, *, package: SomeSubstitutionsType, plugin: SomeSubstitutionsType,
         name: SomeSubstitutionsType | None = None, namespace: SomeSubstitutionsType | None = None,
-        parameters: SomeParameters | None = None, remappings: Any = None,
-        extra_arguments: SomeParameters | None = None, condition: Condition | None = None
+        parameters: Sequence[Any] | None = None, remappings: Any = None,
+        extra_arguments: Sequence[Any] | None = None, condition: Condition | None = None
     ) -> None:
         self.package = normalize_to_list_of_substitutions(package)
         self.node_plugin = normalize_to_list_of_substitutions(plugin)

@@ -9,26 +9,13 @@ from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
 
 
-def positive_int(text: str) -> int:
-    """Read a number above zero."""
-    if not text.isdigit() or int(text) == 0:
-        raise argparse.ArgumentTypeError('value must be a positive integer')
-    return int(text)
-
-
-def unsigned_int(text: str) -> int:
-    """Read a number from zero on."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError('value must be positive or zero')
-    return int(text)
-
-
-def positive_float(text: str) -> float:
-    """Read a number above zero."""
-    value = float(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError('Value must be positive')
-    return value
+def above(least: int, kind: Any = int) -> Any:
+    """Make what reads a number that is greater than the least."""
+    def number(text: str) -> Any:
+        if kind(text) <= least:
+            raise argparse.ArgumentTypeError(f'value must be greater than {least}')
+        return kind(text)
+    return number
 
 
 def message_class(name: str, error: str = 'The passed message type is invalid') -> Any:

@@ -7,12 +7,11 @@ from typing import Any
 from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
 from ros2cli.verb.topic import (
+    above,
     add_qos_arguments,
     get_msg_class,
     message_class,
-    positive_float,
     qos_from_arguments,
-    unsigned_int,
 )
 
 
@@ -29,7 +28,7 @@ class EchoVerb(VerbExtension):
         add('--field', help="Echo a selected field of a message, such as 'pose.pose.position'")
         add('--full-length', '-f', action='store_true',
             help='Output all elements of arrays, bytes and strings')
-        add('--truncate-length', '-l', type=unsigned_int, default=128,
+        add('--truncate-length', '-l', type=above(-1), default=128,
             help='The length to truncate arrays, bytes, and string to (default: 128)')
         add('--no-arr', action='store_true', help="Don't print array fields of messages")
         add('--no-str', action='store_true', help="Don't print string fields of messages")
@@ -39,7 +38,7 @@ class EchoVerb(VerbExtension):
         add('--filter', dest='filter_expr', help='Python expression, over the message m, that '
                                                  'is true for messages to be printed')
         add('--once', action='store_true', help='Print the first message received and exit')
-        add('--timeout', metavar='N', type=positive_float, help='Exit after so many seconds')
+        add('--timeout', metavar='N', type=above(0, float), help='Exit after so many seconds')
 
     def _profile(self, node: Any, args: Any) -> Any:
         """Make a profile that goes together with all publishers, unless options say another."""

@@ -7,13 +7,7 @@ from typing import Any
 
 from ros2cli.node.direct import add_arguments, DirectNode
 from ros2cli.verb import VerbExtension
-from ros2cli.verb.topic import (
-    add_qos_arguments,
-    message_class,
-    positive_float,
-    qos_from_arguments,
-    unsigned_int,
-)
+from ros2cli.verb.topic import above, add_qos_arguments, message_class, qos_from_arguments
 
 _WAIT = 0.1  # seconds between looks for subscriptions
 
@@ -27,18 +21,18 @@ class PubVerb(VerbExtension):
         add('message_type', help="Type of the ROS message (e.g. 'std_msgs/String')")
         add('values', nargs='?', default='{}',
             help="Values to fill the message with in YAML format (e.g. 'data: Hello World')")
-        add('-r', '--rate', metavar='N', type=positive_float, default=1.0,
+        add('-r', '--rate', metavar='N', type=above(0, float), default=1.0,
             help='Publishing rate in Hz (default: 1)')
         add('-p', '--print', metavar='N', type=int, default=1,
             help='Only print every N-th published message (default: 1)')
         group = parser.add_mutually_exclusive_group()
         group.add_argument('-1', '--once', action='store_const', dest='times', const=1,
                            help='Publish one message and exit')
-        group.add_argument('-t', '--times', type=unsigned_int, default=0,
+        group.add_argument('-t', '--times', type=above(-1), default=0,
                            help='Publish this number of times and then exit')
-        add('-w', '--wait-matching-subscriptions', type=unsigned_int, default=None,
+        add('-w', '--wait-matching-subscriptions', type=above(-1), default=None,
             help='Wait for so many subscriptions; by default 1 with -1 or -t, otherwise 0')
-        add('--keep-alive', metavar='N', type=positive_float, default=0.1,
+        add('--keep-alive', metavar='N', type=above(0, float), default=0.1,
             help='Keep publishing node alive for N seconds after the last msg (default: 0.1)')
         add('-n', '--node-name', help='Name of the created publishing node')
         add_qos_arguments(parser, 'default')

@@ -9,7 +9,7 @@ from typing import Any
 
 from ros2cli.node.direct import add_arguments, DirectNode
 from ros2cli.verb import VerbExtension
-from ros2cli.verb.topic import get_msg_class, positive_int
+from ros2cli.verb.topic import above, get_msg_class
 
 
 def _measure(args: Any, topic: str, callback: Any, report: Any, raw: bool) -> None:
@@ -37,7 +37,7 @@ class HzVerb(VerbExtension):
         parser.add_argument(
             'topic_name', help="Name of the ROS topic to listen to (e.g. '/chatter')")
         parser.add_argument(
-            '--window', '-w', dest='window_size', type=positive_int, default=10000,
+            '--window', '-w', dest='window_size', type=above(0), default=10000,
             metavar='WINDOW',
             help='window size, in # of messages, for calculating rate (default: 10000)')
         parser.add_argument(
@@ -84,7 +84,7 @@ class BwVerb(VerbExtension):
     def add_arguments(self, parser: Any, cli_name: str) -> None:
         parser.add_argument('topic', help='Topic name to monitor for bandwidth utilization')
         parser.add_argument(
-            '--window', '-w', type=positive_int, default=100, metavar='WINDOW',
+            '--window', '-w', type=above(0), default=100, metavar='WINDOW',
             help='maximum window size, in # of messages, for calculating rate (default: 100)')
         add_arguments(parser)
 

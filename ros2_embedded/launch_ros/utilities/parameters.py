@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Parameters of nodes: normalized, evaluated, and as rclpy's.
+
+Normalized ones have flat names, and texts as substitutions. A plain text stays a text whatever it
+looks like, so it is quoted as YAML does: what substitutions become is read as YAML.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import pathlib
+from typing import Any, Iterator
+
+from launch import SomeSubstitutionsType_types_tuple, Substitution
+from launch.launch_context import LaunchContext
+from launch.substitutions import TextSubstitution
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
+
+from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+
+#: By tuples of substitutions.
+ParametersDict = dict[tuple[Any, ...], Any]
+
+_WRAP = ('If the parameter is meant to be a string, try wrapping it in '
+         'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')
+
+
+def as_yaml(value: Any) -> str:
+    import yaml
+    return str(yaml.dump(value))
+
+
+def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
+    kinds = set()
+    for item in value:
+        ensure_argument_type(
+            item, (float, int, str, bool, *SomeSubstitutionsType_types_tuple), 'subvalue')
+        kinds.add(next(
+            kind for kind in (Substitution, str, bool, int, float, object)
+            if isinstance(item, kind)))
+    if kinds in ({int}, {bool}):
+        return tuple(value)
+    if kinds and kinds <= {int, float}:
+        return tuple(float(item) for item in value)
+    if Substitution in kinds and kinds <= {str, Substitution}:
+        # One text made of several pieces, not an array.
+        return tuple(normalize_to_list_of_substitutions(value))
+    return tuple(
+        normalize_to_list_of_substitutions(
+            as_yaml(item) if isinstance(item, (float, int, bool, str)) else item)
+        for item in value)
+
+
+def normalize_parameter_dict(
+    parameters: Mapping[Any, Any], *, _prefix: Sequence[Substitution] | None = None
+) -> ParametersDict:
+    """
+    Return the dictionary with names of nested ones joined by dots.
+
+    :raises TypeError: for values that can't be parameters.
+    """
+    normalized: dict[Any, Any] = {}
+    for given_name, value in parameters.items():
+        parts = normalize_to_list_of_substitutions(given_name)
+        if _prefix:
+            parts = [*_prefix, TextSubstitution(text='.'), *parts]
+        name = tuple(parts)
+        if isinstance(value, Mapping):
+            normalized.update(normalize_parameter_dict(value, _prefix=name))
+        elif isinstance(value, str):
+            normalized[name] = tuple(normalize_to_list_of_substitutions(as_yaml(value)))
+        elif isinstance(value, Substitution):
+            normalized[name] = (value,)
+        elif isinstance(value, (ParameterValue, float, bool, int, bytes)):
+            normalized[name] = value
+        elif isinstance(value, Sequence):
+            normalized[name] = _normalize_array(value)
+        else:
+            raise TypeError(f'Unexpected type for parameter value {value!r}')
+    return normalized
+
+
+def normalize_parameters(parameters: Sequence[Any]) -> Sequence[Any]:
+    """
+    Return the dictionaries normalized, and what is neither them nor a parameter as files.
+
+    :raises TypeError: for anything but a sequence.
+    """
+    if isinstance(parameters, str) or not isinstance(parameters, Sequence):
+        raise TypeError(f'Expecting list of parameters, got {parameters}')
+    normalized: list[Any] = []
+    for parameter in parameters:
+        if isinstance(parameter, Mapping):
+            normalized.append(normalize_parameter_dict(parameter))
+        elif isinstance(parameter, (Parameter, ParameterFile)):
+            normalized.append(parameter)
+        else:
+            normalized.append(ParameterFile(parameter))
+    return tuple(normalized)
+
+
+def _uniform(name: str, items: Sequence[Any]) -> Any:
+    kind = type(items[0]) if items else None
+    if kind not in (bool, int, float, str) or not all(isinstance(i, kind) for i in items):
+        raise TypeError(
+            'Expected a non-empty sequence, with items of uniform type. Allowed sequence item '
+            f'types are bool, int, float, str. Got inconsistent input for "{name}"')
+    return tuple(items)
+
+
+def _from_text(name: str, text: str) -> Any:
+    import yaml
+    try:
+        value = yaml.safe_load(text or "''")
+    except yaml.YAMLError as exc:
+        raise TypeError(
+            f'Unable to parse the value of parameter {name} as yaml. {_WRAP}') from exc
+    if type(value) in (bool, int, float, str, bytes):
+        return value
+    if not isinstance(value, Sequence):
+        raise TypeError(
+            'Allowed value types are bytes, bool, int, float, str, Sequence[bool], '
+            'Sequence[int], Sequence[float], Sequence[str]. '
+            f'Got {type(value)} for "{name}". {_WRAP}')
+    return _uniform(name, value)
+
+
+def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
+    if isinstance(value, ParameterValue):
+        return value.evaluate(context)
+    if not isinstance(value, tuple) or not value:
+        ensure_argument_type(value, (float, int, str, bool, bytes), 'value')
+        return value
+    if isinstance(value[0], Substitution):
+        return _from_text(name, perform_substitutions(context, value))
+    if isinstance(value[0], Sequence):
+        import yaml
+        return _uniform(
+            name, [yaml.safe_load(perform_substitutions(context, item)) for item in value])
+    return value
+
+
+def evaluate_parameter_dict(
+    context: LaunchContext, parameters: ParametersDict
+) -> dict[str, Any]:
+    """
+    Return the values by name; what substitutions become is read as YAML.
+
+    :raises TypeError: for what becomes nothing a parameter can be.
+    """
+    evaluated = {}
+    for substitutions, value in parameters.items():
+        name = perform_substitutions(context, substitutions)
+        evaluated[name] = _evaluate(context, name, value)
+    return evaluated
+
+
+def evaluate_parameters(context: LaunchContext, parameters: Sequence[Any]) -> Sequence[Any]:
+    """Return dictionaries by value and files by path; single parameters stay as they are."""
+    evaluated: list[Any] = []
+    for parameter in parameters:
+        if isinstance(parameter, ParameterFile):
+            evaluated.append(parameter.evaluate(context))
+        elif isinstance(parameter, Parameter):
+            evaluated.append(parameter)
+        elif isinstance(parameter, dict):
+            evaluated.append(evaluate_parameter_dict(context, parameter))
+    return tuple(evaluated)
+
+
+def _nodes_of(content: dict[str, Any], names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if key == 'ros__parameters':
+            yield '/'.join(names), value
+        elif isinstance(value, dict):
+            yield from _nodes_of(value, (*names, key.strip('/')))
+
+
+def _read(path: pathlib.Path, node: str) -> dict[str, Any]:
+    import yaml
+    content = yaml.safe_load(path.read_text()) or {}
+    nodes = dict(_nodes_of(content))
+    if not nodes:
+        return dict(content)
+    return {**nodes.get('**', {}), **nodes.get(node, {})}
+
+
+def to_parameters_list(
+    context: LaunchContext, node_name: str, namespace: str | None,
+    evaluated_parameters: Sequence[Any]
+) -> list[Any]:
+    """
+    Return the node's parameters; of files, what stands there for all nodes or this one.
+
+    :raises RuntimeError: for values that can't be parameters.
+    """
+    from rclpy.parameter import Parameter
+    node = '/'.join(part.strip('/') for part in (namespace or '', node_name) if part.strip('/'))
+    parameters = []
+    for given in evaluated_parameters:
+        values = given if isinstance(given, dict) else evaluate_parameter_dict(
+            context, normalize_parameter_dict(_read(given, node)))
+        for name, value in values.items():
+            kind = next((kind for kind in Parameter.Type if kind.check(value)), None)
+            if kind is None:
+                raise RuntimeError(f'invalid parameter value {value!r}')
+            parameters.append(Parameter(name, kind, value))
+    return parameters
