@@ -50,9 +50,22 @@ def complete_names(
 
 def add_region(parser: argparse.ArgumentParser) -> None:
     """Add FogROS2's own ``--region``."""
-    parser.add_argument(
+    argument = parser.add_argument(
         '--region', nargs='*', metavar='REGION',
         help="regions to ask where a provider has some; 'all' for every one")
+    argument.completer = complete_regions  # type: ignore[attr-defined]
+
+
+def complete_regions(prefix: str, **_: object) -> list[str]:
+    """Return the AWS regions that begin with ``prefix``, and 'all'; asks nobody."""
+    from fogros2.provider.aws.regions import REGIONS
+    return [name for name in (*REGIONS, 'all') if name.startswith(prefix)]
+
+
+def complete_providers(prefix: str, **_: object) -> list[str]:
+    """Return the providers that begin with ``prefix``; loads none."""
+    from fogros2 import plugin_system
+    return [name for name in plugin_system.names('fogros2.provider') if name.startswith(prefix)]
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import dataclasses
 import json
 import sys
 
-from ros2fog_cli.verb import add_json, VerbExtension
+from ros2fog_cli.verb import add_json, complete_providers, VerbExtension
 
 _MARKS = {'ok': ' ok ', 'warning': 'warn', 'failed': 'FAIL'}
 _COLOURS = {'ok': '32', 'warning': '33', 'failed': '31'}
@@ -20,8 +20,10 @@ class DoctorVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_json(parser)
-        parser.add_argument('--provider', nargs='+', default=[], metavar='NAME',
-                            help='has to work; others are asked where they are set up')
+        provider = parser.add_argument(
+            '--provider', nargs='+', default=[], metavar='NAME',
+            help='has to work; others are asked where they are set up')
+        provider.completer = complete_providers  # type: ignore[attr-defined]
         parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
                             help='how long to look for ROS 2 on the LAN (0: not at all)')
 

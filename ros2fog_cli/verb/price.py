@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, VerbExtension, warn
+from ros2fog_cli.verb import add_json, complete_regions, VerbExtension, warn
 
 
 class PriceVerb(VerbExtension):
@@ -24,9 +24,10 @@ class PriceVerb(VerbExtension):
                             help="the processor's maker")
         parser.add_argument('--max-price', metavar='DOLLARS', help='an hour, at the most')
         parser.add_argument('--spot', action='store_true', help='spot prices count')
-        parser.add_argument(
+        region = parser.add_argument(
             '--region', nargs='*', metavar='REGION',
             help="'all' for every one, 'nearest' for that (default: the configured region)")
+        region.completer = complete_regions  # type: ignore[attr-defined]
         parser.add_argument('--limit', type=int, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
         parser.add_argument('--refresh', action='store_true',

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, VerbExtension
+from ros2fog_cli.verb import add_json, complete_regions, VerbExtension
 
 
 class RegionsVerb(VerbExtension):
@@ -14,7 +14,8 @@ class RegionsVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        parser.add_argument('region', nargs='*', help='these alone')
+        region = parser.add_argument('region', nargs='*', help='these alone')
+        region.completer = complete_regions  # type: ignore[attr-defined]
         parser.add_argument('--all', action='store_true',
                             help='also those that an account has to enable first')
         add_json(parser)

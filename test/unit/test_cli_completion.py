@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a shell offers for words of ``ros2``, asked as a shell asks: by argcomplete's protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import util
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import time
+
+import pytest
+
+from fogros2.model import MachineSpec
+from fogros2.store import Record, Store
+
+pytestmark = [
+    pytest.mark.skipif(util.find_spec('argcomplete') is None, reason='needs argcomplete'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+Complete = Callable[[str], list[str]]
+
+
+@pytest.fixture
+def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
+    """Return what completes a line, on a computer that has two machines and no network."""
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'state'))
+    for name in ('planner', 'mapper'):
+        Store().machine(name).save(Record(name, 'container', MachineSpec(name, 'container')))
+
+    def complete(line: str) -> list[str]:
+        answer = tmp_path / 'answer'
+        environment = {
+            **os.environ, '_ARGCOMPLETE': '1', '_ARGCOMPLETE_IFS': '\n', 'COMP_LINE': line,
+            'COMP_POINT': str(len(line)), 'COMP_TYPE': '9',
+            '_ARGCOMPLETE_STDOUT_FILENAME': str(answer),
+            # any request would have to go through here, where nobody listens
+            'https_proxy': 'http://127.0.0.1:9', 'http_proxy': 'http://127.0.0.1:9'}
+        program = shutil.which('ros2')
+        assert program is not None
+        subprocess.run([program], env=environment, capture_output=True, timeout=30, check=True)
+        return [word.strip() for word in answer.read_text().split('\n') if word.strip()]
+
+    return complete
+
+
+@pytest.mark.parametrize('line, offered', [
+    ('ros2 fog st', ['status']),
+    ('ros2 fog do', ['doctor']),
+    ('ros2 fog status ', ['mapper', 'planner']),
+    ('ros2 fog status pl', ['planner']),
+    ('ros2 fog delete ', ['all', 'mapper', 'planner']),
+    ('ros2 fog list --region eu-west-', ['eu-west-1', 'eu-west-2', 'eu-west-3']),
+    ('ros2 fog price --region ap-east-', ['ap-east-1', 'ap-east-2']),
+    ('ros2 fog regions sa-', ['sa-east-1']),
+    ('ros2 fog doctor --provider ', ['aws', 'container', 'kubernetes', 'ssh']),
+    ('ros2 launch --machine ma', ['mapper=']),
+    ('ros2 launch --machine mapper=', [
+        'mapper=aws', 'mapper=container', 'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
+])
+def test_a_line_goes_on_as(complete: Complete, line: str, offered: list[str]) -> None:
+    begin = time.monotonic()
+    words = [word for word in complete(line) if not word.startswith('-')]
+    seconds = time.monotonic() - begin
+    assert sorted(words) == offered
+    assert seconds < 5.0, sys.version
