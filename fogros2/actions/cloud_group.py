@@ -9,7 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING, Union
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.actions import streaming, words
+from fogros2.actions import components, streaming, words
 from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
@@ -73,8 +73,7 @@ class CloudGroup(GroupAction):
             if not coordinator.on_robot(self._resolved):
                 coordinator.engage()
             send(entity, self._resolved, self._streams)
-        elif any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__):
-            # by name: importing it takes longer than most launches have use for
+        elif isinstance(entity, Action) and components.are_loaded_by(entity):
             coordinator = Coordinator.of(context)
             if not coordinator.on_robot(self._resolved):
-                coordinator.session(self._resolved).loads_components()
+                components.tell(entity, coordinator.session(self._resolved).told_to_components)

@@ -109,6 +109,18 @@ def wait_to_fire(timer: TimerAction) -> Waiting:
     return bound
 
 
+def components(action: Any) -> list[Any]:
+    """Return the descriptions of the nodes that a LoadComposableNodes loads."""
+    found: list[Any] = list(vars(action)['_LoadComposableNodes__composable_node_descriptions'])
+    return found
+
+
+def set_remappings(component: Any, rules: Any) -> None:
+    """Give a ComposableNode other remappings, in launch_ros's normal form; it reads them alone."""
+    names = [name for name in vars(component) if name.endswith('remappings')]
+    vars(component)[names[0]] = rules
+
+
 def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
     """
     Return the copies of the environment that launch comes back to, to be changed in place.

@@ -112,7 +112,8 @@ class Session:
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
-        self._components = False
+        #: What components were told that were loaded first; None before that.
+        self._told: Optional[dict[str, str]] = None
         #: What was asked of the agent and isn't answered yet.
         self.requests: set[asyncio.Task[None]] = set()
         # requests reach the agent in the order they were made in
@@ -151,20 +152,19 @@ class Session:
                 'the first node of the machine stands')
         self._warn_of_components()
 
-    def loads_components(self) -> None:
-        """Remember that components are loaded there, which nobody can tell of new names."""
-        self._components = True
-        self._warn_of_components()
+    def told_to_components(self) -> dict[str, str]:
+        """Return the topics' names for components that are about to be loaded there."""
+        self._told = dict(self.names) if self._told is None else {
+            name: new for name, new in self._told.items() if name in self.names}
+        return dict(self.names)
 
     def _warn_of_components(self) -> None:
-        # streams may become known before components are loaded, or after
-        if self.names and self._components:
-            pairs = ', '.join(map(str, self.names.items()))
+        late = [name for name in self.names if self._told is not None and name not in self._told]
+        if late:
             self._logger.warning(
-                f"{self.spec.name}: components aren't told what streamed topics are called there, "
-                'and would take them unencoded; give those that use one remappings=[...] with '
-                f'{pairs}')
-            self._components = False
+                f"{self.spec.name}: components were loaded before {', '.join(late)} became a "
+                'stream and take it unencoded; stream it where the container stands')
+            self._told = None
 
     def give_up(self) -> None:
         """Take it that the machine won't come up any more, if it isn't up."""

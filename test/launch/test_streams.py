@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import re
 import threading
@@ -14,12 +15,21 @@ from launch.actions import (
     ExecuteProcess,
     GroupAction,
     RegisterEventHandler,
+    SetLaunchConfiguration,
     TimerAction,
 )
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit, OnProcessStart
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node, PushROSNamespace, SetRemap
+from launch.utilities import perform_substitutions
+from launch_ros.actions import (
+    ComposableNodeContainer,
+    LoadComposableNodes,
+    Node,
+    PushROSNamespace,
+    SetRemap,
+)
+from launch_ros.descriptions import ComposableNode
 import pytest
 
 from fogros2 import (
@@ -334,34 +344,69 @@ def test_a_program_that_takes_no_ros_arguments_is_named(run, fake, planner, capl
     assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_node')
 
 
-@pytest.mark.parametrize('streams, condition', [
-    ('group', 'true'), ('launch', 'true'), ('launch', 'false')])
-def test_components_are_named(run, fake, planner, caplog, streams, condition):
-    """They are made by a service call, which nobody can add a remapping to."""
-    from launch_ros.actions import ComposableNodeContainer, LoadComposableNodes
-    from launch_ros.descriptions import ComposableNode
-    class Loading(LoadComposableNodes):
-        """One that finds no container to ask."""
+class Loading(LoadComposableNodes):
+    """Notes what launch_ros would tell a container, and asks none."""
 
-        def execute(self, context):
-            return None
+    told = ()
 
+    def execute(self, context):
+        words = functools.partial(perform_substitutions, context)
+        rules = [*context.launch_configurations.get('ros_remaps', ())]
+        type(self).told += ([*rules, *(
+            (words(old), words(new)) for old, new in self.node.remappings or ())],)
+
+    def __init__(self, node, **kwargs):
+        super().__init__(
+            target_container='/box', composable_node_descriptions=[node], **kwargs)
+        self.node = node
+
+
+@pytest.fixture
+def box(monkeypatch):
+    """Return a container."""
+    monkeypatch.setattr(Loading, 'told', ())
+    return ComposableNodeContainer(
+        package='demo', executable='talker', exec_name='own', name='box', namespace='')
+
+
+@pytest.mark.parametrize('streams', ['group', 'launch'])
+def test_components_are_told(run, fake, planner, caplog, box, streams):
+    """They are made by a service call, whose remappings are rewritten as a process's are."""
     ends_when_all_started(fake, 3)
     topics = [('/camera', 'h264')]
-    container = ComposableNodeContainer(
-        package='demo', executable='talker', exec_name='own', name='box', namespace='')
-    load = Loading(target_container='/box', condition=IfCondition(condition),
-                   composable_node_descriptions=[
-                       ComposableNode(package='demo', plugin='demo::View', name='view')])
-    group = CloudGroup(planner, [container, load],
-                       stream_topics=topics if streams == 'group' else [])
+    view = ComposableNode(
+        package='demo', plugin='demo::View', name='view', namespace='arm',
+        remappings=[('image', '/camera'), ('x', LaunchConfiguration('which'))])
+    load = Loading(view)
+    group = CloudGroup(planner, [
+        box, SetRemap('seen', '/camera'), PushROSNamespace('left'),
+        SetLaunchConfiguration('which', '/y'), load, load,
+        Loading(ComposableNode(package='demo', plugin='demo::View', condition=IfCondition('0'))),
+    ], stream_topics=topics if streams == 'group' else [])
     assert run(watched(fake, FogROSLaunchDescription, group,
                        stream_topics=topics if streams == 'launch' else [])) == 0
+    here = '/fogros2/planner/camera'
+    assert Loading.told[:2] == 2 * ([
+        ('seen', here), ('image', here), ('x', '/y'), ('/camera', here),
+        ('/camera_info', '/fogros2/planner/camera_info')],)
+    # nothing of it stays, and what isn't loaded isn't looked at
+    assert len(list(view.remappings)) == 2 and Loading.told[2] == []
+    assert not [record for record in caplog.records if 'components were' in record.getMessage()]
+
+
+@pytest.mark.parametrize('condition', ['true', 'false'])
+def test_components_that_came_before_a_stream_are_named(
+        run, fake, planner, caplog, box, condition):
+    ends_when_all_started(fake, 4)
+    assert run(watched(
+        fake, FogROSLaunchDescription,
+        CloudGroup(planner, [box, Loading(
+            ComposableNode(package='demo', plugin='demo::View'),
+            condition=IfCondition(condition))]),
+        talker(planner, stream_topics=[('/camera', 'h264')]))) == 0
     said = [record.getMessage() for record in caplog.records
-            if "components aren't told" in record.getMessage()]
+            if 'components were loaded before /camera, /camera_info' in record.getMessage()]
     assert len(said) == (condition == 'true')
-    assert not said or (
-        "remappings=[...] with ('/camera', '/fogros2/planner/camera')" in said[0])
 
 
 def test_a_group_whose_processes_are_all_left_out_makes_no_machine(run, fake, planner):

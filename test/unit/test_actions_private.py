@@ -79,3 +79,17 @@ def test_the_signal_manager():
 def test_handlers_of_the_context_can_be_gone_through():
     context = LaunchService().context
     assert len(tuple(context._event_handlers)) >= 2
+
+
+def test_remappings_of_components():
+    pytest.importorskip('launch_ros', reason='launch_ros is not installed')
+    from launch_ros.actions import LoadComposableNodes
+    from launch_ros.descriptions import ComposableNode
+    node = ComposableNode(package='demo', plugin='demo::View', remappings=[('a', 'b')])
+    load = LoadComposableNodes(target_container='/box', composable_node_descriptions=[node])
+    assert private.components(load) == [node]
+    before = node.remappings
+    private.set_remappings(node, None)
+    assert node.remappings is None
+    private.set_remappings(node, before)
+    assert node.remappings is before
