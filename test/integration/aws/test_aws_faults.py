@@ -46,11 +46,8 @@ def test_what_stays_is_said_in_one_line(robot, box, name):
     """Each launch in a region of its own, which refuses it in its own way."""
     refusals = {
         'us-west-1': ('InsufficientInstanceCapacity', 'RunInstances', 't3.medium'),
-        'us-west-2': ('VcpuLimitExceeded', 'RunInstances', 'quota'),
-        'us-east-2': ('UnauthorizedOperation', 'RunInstances', 'ec2:RunInstances'),
-        'eu-west-1': ('UnauthorizedOperation', 'CreateSecurityGroup', 'ec2:CreateSecurityGroup'),
-        'eu-west-2': ('RequestExpired', 'DescribeInstances', 'clock'),
-        'eu-west-3': ('AuthFailure', 'DescribeInstances', 'credentials')}
+        'us-east-2': ('UnauthorizedOperation', 'CreateSecurityGroup', 'ec2:CreateSecurityGroup'),
+        'eu-west-2': ('RequestExpired', 'DescribeInstances', 'clock')}
     for region, (code, action, _) in refusals.items():
         box.fail(code, action=action, region=region, times=0)
     runs = {region: robot.launch(*TALKER, f'name:={name}-{region}', f'region:={region}')
@@ -62,28 +59,19 @@ def test_what_stays_is_said_in_one_line(robot, box, name):
     assert all(found.state == 'terminated' for found in box.instances())
 
 
-def test_what_does_not_exist_is_found_before_anything_is_made(robot, box, name):
+def test_what_can_be_known_before_is_said_before_anything_is_made(robot, box, name):
     box.publish('ami-0aaaaaaaaaaaaaaaa', region='us-east-1')
-    wrong = [
-        ('xx-nowhere-1', 'region:=xx-nowhere-1'),
-        ('t9.huge', 'ec2_instance_type:=t9.huge'),
-        ('ami-0123456789abcdef0', 'ami_image:=ami-0123456789abcdef0'),
-        ('arm64', 'ec2_instance_type:=t4g.medium', 'ami_image:=ami-0aaaaaaaaaaaaaaaa')]
-    runs = [(word, robot.launch(*TALKER, f'name:={name}-{number}', *arguments))
-            for number, (word, *arguments) in enumerate(wrong)]
-    for word, run in runs:
+    launches = {
+        'xx-nowhere-1': (['region:=xx-nowhere-1'], {}),
+        'arm64': (['ec2_instance_type:=t4g.medium', 'ami_image:=ami-0aaaaaaaaaaaaaaaa'], {}),
+        'credentials': ([], {'AWS_ACCESS_KEY_ID': ''}),
+        'does not answer': ([], {'AWS_ENDPOINT_URL': 'http://198.51.100.1:9'})}
+    runs = {word: robot.launch(*TALKER, f'name:={name}-{number}', *arguments, **variables)
+            for number, (word, (arguments, variables)) in enumerate(launches.items())}
+    for word, run in runs.items():
         assert word in complaint(run)
     assert not [call for call in box.calls() if call.action in (
         'RunInstances', 'CreateSecurityGroup', 'ImportKeyPair')]
-
-
-def test_nobody_to_ask_and_nobody_to_ask_as(robot, box, name):
-    said = complaint(robot.launch(*TALKER, f'name:={name}', AWS_ACCESS_KEY_ID=''))
-    assert 'credentials' in said
-    assert box.calls() == []
-    said = complaint(robot.launch(
-        *TALKER, f'name:={name}', AWS_ENDPOINT_URL='http://198.51.100.1:9'))
-    assert 'reach' in said or 'answer' in said
 
 
 LAUNCH = '''\
