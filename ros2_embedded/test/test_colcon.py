@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Workspaces of ``ament_python`` packages built by colcon: set-up, run, launch, overlay."""
+
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+# beside this interpreter, or where ROS 2's tools are
+SEARCHED = os.pathsep.join([os.path.dirname(sys.executable), os.environ['PATH']])
+COLCON = shutil.which('colcon', path=SEARCHED)
+
+pytestmark = pytest.mark.skipif(COLCON is None, reason="colcon isn't installed here")
+
+MANIFEST = '''<?xml version="1.0"?>
+<package format="3">
+  <name>{name}</name>
+  <version>1.0.0</version>
+  <description>For a test.</description>
+  <maintainer email="nobody@example.org">nobody</maintainer>
+  <license>Apache-2.0</license>
+  <exec_depend>rclpy</exec_depend>
+  <export><build_type>ament_python</build_type></export>
+</package>
+'''
+SETUP = '''
+from setuptools import setup
+setup(
+    name='{name}', version='1.0.0', packages=['{name}'], zip_safe=False,
+    data_files=[('share/ament_index/resource_index/packages', ['resource/{name}']),
+                ('share/{name}', ['package.xml', 'say.launch.py'])],
+    entry_points={{'console_scripts': ['say = {name}.node:main']}})
+'''
+NODE = '''
+import rclpy
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('sayer')
+    print('{text} from', node.get_fully_qualified_name(), flush=True)
+    node.destroy_node()
+    rclpy.shutdown()
+'''
+LAUNCH_FILE = '''
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+def generate_launch_description():
+    return LaunchDescription([
+        Node(package='{name}', executable='say', name='renamed', output='screen')])
+'''
+
+
+def run(script, cwd):
+    """Run a script of bash's, with the interpreter of this test and ROS 2's variables."""
+    done = subprocess.run(
+        ['bash', '-ec', script], cwd=cwd, capture_output=True, text=True, timeout=120,
+        env={**os.environ, 'PATH': SEARCHED, 'ROS_LOG_DIR': str(cwd / 'log'),
+             'PYTHONWARNINGS': 'ignore'})
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def workspace(root, name, text, setup=''):
+    """Lay out a workspace with a package, and build it on top of what a script has set up."""
+    package = root / 'src' / name
+    for folder in (package / name, package / 'resource'):
+        folder.mkdir(parents=True)
+    for path, content in (
+            ('package.xml', MANIFEST), ('setup.py', SETUP), (f'resource/{name}', ''),
+            ('setup.cfg', f'[develop]\nscript_dir=$base/lib/{name}\n'
+                          f'[install]\ninstall_scripts=$base/lib/{name}\n'),
+            (f'{name}/__init__.py', ''), (f'{name}/node.py', NODE),
+            ('say.launch.py', LAUNCH_FILE)):
+        (package / path).write_text(textwrap.dedent(content.format(name=name, text=text)))
+    run(f'{setup}\n{COLCON} build', root)
+    return f'. {root}/install/setup.bash'
+
+
+@pytest.fixture(scope='module')
+def underlay(tmp_path_factory):
+    root = tmp_path_factory.mktemp('underlay')
+    return root, workspace(root, 'fog_colcon_test', 'underlay')
+
+
+def test_a_package_is_built_found_run_and_launched(underlay):
+    root, setup = underlay
+    prefix = f'{root}/install/fog_colcon_test'
+    assert run(f'{setup}; ros2 pkg prefix fog_colcon_test', root) == f'{prefix}\n'
+    assert run(f'{setup}; ros2 pkg executables fog_colcon_test', root) == 'fog_colcon_test say\n'
+    assert run(f'{setup}; ros2 run fog_colcon_test say', root) == 'underlay from /sayer\n'
+    out = run(f'{setup}; ros2 launch fog_colcon_test say.launch.py', root)
+    assert '] underlay from /renamed' in out
+
+
+def test_an_overlay_comes_first_and_leaves_the_rest(underlay, tmp_path):
+    root, setup = underlay
+    over = workspace(tmp_path, 'fog_colcon_test', 'overlay', setup)
+    assert run(f'{over}; ros2 run fog_colcon_test say', tmp_path) == 'overlay from /sayer\n'
+    found = run(f'{over}; ros2 pkg prefix fog_colcon_test; ros2 pkg prefix rclpy', tmp_path)
+    prefix, rclpy = found.splitlines()
+    assert prefix == f'{tmp_path}/install/fog_colcon_test'
+    assert Path(rclpy) not in (root, tmp_path)
+    # by itself the underlay is as it was
+    assert run(f'{setup}; ros2 run fog_colcon_test say', root) == 'underlay from /sayer\n'
