@@ -2,6 +2,7 @@
 """What rmw_cyclonedds makes of ROS 2's environment variables."""
 
 import os
+import re
 
 from rclpy.exceptions import RCLError
 
@@ -44,6 +45,15 @@ def check_implementation() -> None:
             'alone: unset it, or use ROS 2')
 
 
+def _names_interfaces(uri: str) -> bool:
+    """Say whether a user's configuration, its files included, chooses network interfaces."""
+    for name in re.findall(r'file://([^,]+)', uri):
+        if os.path.isfile(name):
+            with open(name, encoding='utf-8', errors='replace') as file:
+                uri += file.read()
+    return 'NetworkInterface' in uri
+
+
 def configuration(domain: int) -> str:
     """
     Give Cyclone DDS's configuration: ROS 2's own fragment, then the user's CYCLONEDDS_URI.
@@ -64,7 +74,11 @@ def configuration(domain: int) -> str:
         peer for peer in os.environ.get('ROS_STATIC_PEERS', '').split(';') if peer]
     general, discovery = '', ''
     if given in ('LOCALHOST', 'OFF'):
-        general = '<General><AllowMulticast>false</AllowMulticast></General>'
+        general = '<AllowMulticast>false</AllowMulticast>'
+    if given == 'LOCALHOST' and not peers and not _names_interfaces(uri):
+        # ROS 2's Cyclone DDS says hello over the loopback, whatever interface it has chosen; this
+        # one hears nothing from an interface that it wasn't told of
+        general += '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
     if given == 'OFF':
         discovery = ('<ParticipantIndex>none</ParticipantIndex>'
                      f'<Tag>ros_discovery_off_{os.getpid()}</Tag>')
@@ -76,5 +90,5 @@ def configuration(domain: int) -> str:
     if peers:
         listed = ''.join(f'<Peer address="{peer}"/>' for peer in peers)
         discovery += f'<Peers>{listed}</Peers>'
-    return (f'<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery>{_BUFFER}</Domain>'
-            f'</CycloneDDS>,{uri}')
+    return (f'<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery>'
+            f'{_BUFFER}</Domain></CycloneDDS>,{uri}')

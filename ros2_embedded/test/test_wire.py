@@ -70,7 +70,7 @@ except (KeyboardInterrupt, ExternalShutdownException):
 
 def ros2(*command, **kwargs):
     """Start a program in ROS 2's environment."""
-    keep = ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'HOME', 'LANG')
+    keep = ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'HOME', 'LANG')
     environment = {name: os.environ[name] for name in keep if name in os.environ}
     environment.update(PATH='/usr/local/bin:/usr/bin:/bin', PYTHONUNBUFFERED='1')
     script = f'. "{SETUP}" && export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp && exec "$@"'
@@ -224,6 +224,33 @@ def test_it_shows_in_our_commands(peer):
         done = subprocess.run([command, *words], capture_output=True, text=True, timeout=60)
         assert done.returncode == 0 and done.stderr == ''
         assert any(line.startswith(expected) for line in done.stdout.splitlines()), done.stdout
+
+
+def test_both_find_each_other_on_this_computer_alone(monkeypatch):
+    """The older one to be there is ours, then ROS 2's: each has to answer a newcomer."""
+    domain = int(os.environ['ROS_DOMAIN_ID']) + 100
+    monkeypatch.delenv('CYCLONEDDS_URI')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = Context()
+    context.init(args=[])
+    node = rclpy.create_node('first', context=context)
+    try:
+        with ros2('python3', '-c', PEER) as process:
+            assert 'ready' in process.stdout.readline()
+            assert '/first' in output('ros2', 'node', 'list', '--no-daemon').splitlines()
+            end = time.monotonic() + LIMIT
+            while ('peer', '/real') not in node.get_node_names_and_namespaces():
+                assert time.monotonic() < end, 'ROS 2 was not seen'
+                time.sleep(0.05)
+            late = subprocess.run([str(Path(sys.executable).with_name('ros2')), 'node', 'list'],
+                                  capture_output=True, text=True, timeout=60)
+            assert sorted(late.stdout.splitlines()) == ['/first', '/real/peer']
+            process.terminate()
+            process.communicate(timeout=20)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def test_nobody_warned_of_anything(side, capfd):
