@@ -319,6 +319,8 @@ class Coordinator:
         wanted += entries
         if not wanted:
             return []
+        away = [name for name, one in self._sessions.items() if one.interrupted]
+        wanted = [streaming.from_robot(entry, away) for entry in wanted]
         new = self._streams.add(wanted, session.spec.name)
         # another machine may be the source
         for one in self._sessions.values():

@@ -39,6 +39,8 @@ class RemoteProcess(ExecuteLocal):
     _fogros2_command: Optional[list[str]] = None
     #: Whether the process is on the robot: its machine was taken away.
     _fogros2_here = False
+    #: Whether launch has taken the step in which it would have started the process here.
+    _fogros2_began = False
 
     @property
     def machine(self) -> SomeMachine:
@@ -79,8 +81,10 @@ class RemoteProcess(ExecuteLocal):
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return the processes that carry the streams asked for here and nowhere before."""
         session = self._fogros2_session
-        if isinstance(self, carriers.Carrier) or session.interrupted:
+        if isinstance(self, carriers.Carrier):
             return []
+        if session.interrupted:
+            return self._carriers_here(context)
         return self._carry(context, self._fogros2_streams, session)
 
     def _monitor(self) -> list[LaunchDescriptionEntity]:
@@ -124,10 +128,12 @@ class RemoteProcess(ExecuteLocal):
         self.process_details['cmd'] = self._fogros2_command
         private.unprefix_output(self, self._fogros2_session.spec.name)
         private.set_transport(self, None)
-        context.asyncio_loop.create_task(private.execute_process(self)(context))
+        if self._fogros2_began:
+            context.asyncio_loop.create_task(private.execute_process(self)(context))
 
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
         """Do nothing: the session starts the process and hands over what happens to it."""
+        self._fogros2_began = True
         if self._fogros2_here:
             await getattr(super(), private.EXECUTE_PROCESS)(context)
 

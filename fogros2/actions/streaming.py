@@ -242,6 +242,16 @@ def to_robot(entry: StreamTopic) -> StreamTopic:
     return StreamTopic(entry.topic, entry.transport, 'to_robot', **entry.parameters)
 
 
+def from_robot(entry: Entry, away: Iterable[str]) -> Entry:
+    """Return a stream as it is when its source is one of the machines that were taken away."""
+    from fogros2.image_transport.streams import StreamTopic
+    if not isinstance(entry, StreamTopic) or entry.source not in away:
+        return entry
+    # as one that the robot took over
+    return StreamTopic(entry.topic, entry.transport, entry.direction, **{
+        'camera_info': False, **entry.parameters})
+
+
 def _parameter(context: LaunchContext, value: Any) -> Any:
     if isinstance(value, (bool, int, float, str)):
         return value

@@ -413,6 +413,27 @@ def test_other_machines_have_its_topics_from_the_robot_then(
     assert 'map_h264_decoder_from_planner' in ended[:1]
 
 
+def test_streams_that_come_later_know_of_it(run, fake, harmless, planner, talker, watch):
+    other = ContainerInstance(name='other', ros_workspace='')
+    late = [
+        talker(machine=other, exec_name='sees', stream_topics=[
+            StreamTopic('/map', 'h264', source=planner)]),
+        talker(machine=planner, exec_name='looks', stream_topics=[
+            ('/camera', 'h264'), StreamTopic('/pose', 'h264', source=other)])]
+    watch.at_start = {
+        2: says(fake, 'lost', reason='evicted'),
+        3: lambda event: late,
+        9: lambda event: [TimerAction(period=0.3, actions=end())]}
+    assert run(FogROSLaunchDescription([
+        *watch(), talker(machine=planner, exec_name='maps'),
+        talker(machine=other, exec_name='idles')])) == 0
+    assert sorted(name for name, _ in watch.starts[3:]) == [
+        'looks', 'map_h264_decoder', 'map_h264_encoder', 'pose_h264_decoder_from_other',
+        'pose_h264_encoder', 'sees']
+    # beside the node, nothing more ran on the one that is away
+    assert len(fake.machines['planner'].all) == 1
+
+
 # -- money ----------------------------------------------------------------------------------------
 
 def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
