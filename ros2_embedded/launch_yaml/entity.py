@@ -2,7 +2,7 @@
 """A YAML mapping or sequence as an entity."""
 from __future__ import annotations
 
-from typing import Any, List, Optional, Set
+from typing import Any
 
 from launch.frontend import Entity as BaseEntity
 from launch.frontend.type_utils import check_is_list_entity
@@ -12,74 +12,62 @@ from launch.utilities.type_utils import is_instance_of
 class Entity(BaseEntity):
     """A mapping of attributes, its children under 'children'; or a sequence of children."""
 
-    def __init__(
-        self, element: Any, type_name: str, *, parent: Optional[Entity] = None
-    ) -> None:
-        self.__element = element
-        self.__type_name = type_name
-        self.__parent = parent
-        self.__read_keys: Set[str] = set()
+    def __init__(self, element: Any, type_name: str, parent: BaseEntity | None = None) -> None:
+        super().__init__(element, type_name, parent)
+        self.__read_keys: set[str] = set()
         self.__children_called = False
 
     @property
-    def type_name(self) -> str:
-        return self.__type_name
-
-    @property
-    def parent(self) -> Optional[Entity]:
-        return self.__parent
-
-    @property
-    def children(self) -> List[BaseEntity]:
+    def children(self) -> list[BaseEntity]:
         self.__children_called = True
-        children = self.__element
+        children = self._element
         if not isinstance(children, (dict, list)):
             raise TypeError(
                 f'Expected a dict or list, got {type(children)}:\n---\n{children}\n---')
         if isinstance(children, dict):
             if 'children' not in children:
                 raise ValueError(
-                    f'Expected entity `{self.__type_name}` to have children entities.'
+                    f'Expected entity `{self.type_name}` to have children entities.'
                     'That can be a list of subentities or a dictionary with a `children` '
                     'list element')
             self.__read_keys.add('children')
             children = children['children']
-        entities: List[BaseEntity] = []
+        entities: list[BaseEntity] = []
         for child in children:
             if not isinstance(child, dict) or len(child) != 1:
                 raise RuntimeError(
                     'Subentities must be a dictionary with only one key, '
                     'which is the entity type')
             [(type_name, element)] = child.items()
-            entities.append(Entity(element, type_name, parent=self))
+            entities.append(Entity(element, type_name, self))
         return entities
 
     def assert_entity_completely_parsed(self) -> None:
-        if isinstance(self.__element, list):
+        if isinstance(self._element, list):
             if not self.__children_called:
                 raise ValueError(
-                    f'Unexpected nested entity(ies) found in `{self.__type_name}`: '
-                    f'{self.__element}')
-        elif isinstance(self.__element, dict):
-            unread = set(self.__element) - self.__read_keys
+                    f'Unexpected nested entity(ies) found in `{self.type_name}`: '
+                    f'{self._element}')
+        elif isinstance(self._element, dict):
+            unread = set(self._element) - self.__read_keys
             if unread:
                 raise ValueError(
-                    f'Unexpected key(s) found in `{self.__type_name}`: {unread}')
+                    f'Unexpected key(s) found in `{self.type_name}`: {unread}')
 
     def get_attr(
         self, name: str, *, data_type: Any = str, optional: bool = False,
         can_be_str: bool = True
     ) -> Any:
-        if not isinstance(self.__element, dict) or name not in self.__element:
+        if not isinstance(self._element, dict) or name not in self._element:
             if optional:
                 return None
             raise AttributeError(
                 f"Can not find attribute '{name}' in Entity '{self.type_name}'")
         self.__read_keys.add(name)
-        value = self.__element[name]
+        value = self._element[name]
         if check_is_list_entity(data_type):
             if isinstance(value, list) and value and isinstance(value[0], dict):
-                return [Entity(child, name, parent=self) for child in value]
+                return [Entity(child, name, self) for child in value]
             raise TypeError(
                 f"Attribute '{name}' of Entity '{self.type_name}' expected to be a list of "
                 'dictionaries.')

@@ -10,13 +10,10 @@ from ..utilities.type_utils import is_typing_list
 class Entity:
     """An element with a type's name, attributes and children; it notes what was read."""
 
-    @property
-    def type_name(self) -> str:
-        raise NotImplementedError()
-
-    @property
-    def parent(self) -> Entity | None:
-        raise NotImplementedError()
+    def __init__(self, element: Any, type_name: str, parent: Entity | None = None) -> None:
+        self._element = element
+        self.type_name = type_name
+        self.parent = parent
 
     @property
     def children(self) -> list[Entity]:

@@ -73,13 +73,28 @@ def get_launch_description_from_any_launch_file(
     raise InvalidLaunchFileError(extension, likely_errors=errors)
 
 
-class AnyLaunchDescriptionSource(LaunchDescriptionSource):
+class _FileSource(LaunchDescriptionSource):
+
+    _method: str
+    _load: Callable[[str], LaunchDescription]
 
     def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
-        super().__init__(None, launch_file_path, 'interpreted launch file')
+        super().__init__(None, launch_file_path, self._method)
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
-        return get_launch_description_from_any_launch_file(location)
+        return self._load(location)
+
+
+class AnyLaunchDescriptionSource(_FileSource):
+
+    _method = 'interpreted launch file'
+    _load = staticmethod(get_launch_description_from_any_launch_file)
+
+
+class PythonLaunchDescriptionSource(_FileSource):
+
+    _method = 'interpreted python launch file'
+    _load = staticmethod(get_launch_description_from_python_launch_file)
 
 
 class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
@@ -93,12 +108,3 @@ class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
         return get_launch_description_from_frontend_launch_file(location, parser=self._parser)
-
-
-class PythonLaunchDescriptionSource(LaunchDescriptionSource):
-
-    def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
-        super().__init__(None, launch_file_path, 'interpreted python launch file')
-
-    def _get_launch_description(self, location: str) -> LaunchDescription:
-        return get_launch_description_from_python_launch_file(location)
