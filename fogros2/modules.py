@@ -190,7 +190,9 @@ def answer(output: str) -> Answer:
         return Answer((int(python[0]), int(python[1])), str(architecture), str(libc),
                       tuple(map(str, missing)))
     except (ValueError, LookupError, TypeError) as error:
-        raise PrerequisiteError(f'no Python there says what it has: {output[-200:]!r}') from error
+        raise PrerequisiteError(
+            f'no Python there says what it has: {output[-200:]!r}',
+            'is its python3 at least 3.10, and does a login there print nothing?') from error
 
 
 def copy(there: Answer) -> Optional[Copy]:

@@ -198,7 +198,8 @@ def transfer(
     """
     way = destination.workspace
     if way is None or way.source != Path(os.path.abspath(path.expanduser())):
-        raise WorkspaceError(f'{path} is not the workspace that was planned for')
+        raise WorkspaceError(f'{path} is not the workspace that was planned for',
+                             'name the same one when planning and when sending')
     target = shlex.quote(way.target)
     # the login user may not write to where the robot's user has their workspace
     shell.run(Command.script(
@@ -297,7 +298,8 @@ def _parsed(manifest: Path) -> ElementTree.Element:
     try:
         return ElementTree.parse(manifest).getroot()
     except (ElementTree.ParseError, OSError) as error:
-        raise WorkspaceError(f'{manifest} is no package manifest: {error}') from error
+        raise WorkspaceError(f'{manifest} is no package manifest: {error}',
+                             'correct it, or put a COLCON_IGNORE beside it') from error
 
 
 def _build_type(folder: Path) -> str:

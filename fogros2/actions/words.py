@@ -162,7 +162,7 @@ def _number(value: Any) -> float:
     try:
         return float(value)
     except ValueError:
-        raise ConfigurationError(f'{value!r} is no number') from None
+        raise ConfigurationError(f'{value!r} is no number', 'such as 2 or 1.5') from None
 
 
 def read_truth(value: Any) -> bool:
@@ -174,7 +174,7 @@ def read_truth(value: Any) -> bool:
     if not isinstance(value, str):
         return bool(value)
     if value.lower() not in _TRUTHS:
-        raise ConfigurationError(f'{value!r} is neither true nor false')
+        raise ConfigurationError(f'{value!r} is neither true nor false', 'write one of the two')
     return _TRUTHS[value.lower()]
 
 

@@ -150,7 +150,8 @@ class CycloneDds(DdsVendor):
         :raises DdsError: no interface.
         """
         if not interfaces:
-            raise DdsError('Cyclone DDS needs a network interface')
+            raise DdsError('Cyclone DDS needs a network interface',
+                           'ip link shows those there are')
         ordered = sorted(interfaces, key=lambda interface: -interface.priority)
         multicast = any(interface.multicast for interface in interfaces)
         networks = [interface for interface in interfaces if not _is_loopback(interface)]

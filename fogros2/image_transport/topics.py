@@ -38,7 +38,8 @@ def check(stream: Stream) -> None:
                                  "write it as ros2 topic list does, such as '/camera/image_raw'")
     if stream.source == stream.target:
         where = stream.source or 'the robot'
-        raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself')
+        raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself',
+                                 'source= names another machine; leave it out for the robot')
 
 
 def local_topic(topic: str, machine: Optional[str]) -> str:

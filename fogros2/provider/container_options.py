@@ -105,14 +105,16 @@ def _check_values(options: Options) -> None:
                                      "devices= takes such as '/dev/video0'")
     for name, value in options.env.items():
         if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name) or '"' in value or '\n' in value:
-            raise ConfigurationError(f"env= can't carry the variable {name!r}")
+            raise ConfigurationError(f"env= can't carry the variable {name!r}",
+                                     'a name has letters, digits and _, a value one line')
     for mount in options.mounts:
         source = mount.split(':')[0]
         if mount.count(':') > 1 or not os.path.isabs(source) or '/..' in mount:
             raise ConfigurationError(f"mounts= can't hold '{mount}'",
                                      "it takes '/path' or '/path:/path there'")
         if not os.path.exists(source):
-            raise ConfigurationError(f"'{source}' of mounts= doesn't exist")
+            raise ConfigurationError(f"'{source}' of mounts= doesn't exist",
+                                     'make it, or correct the path: it is one on this computer')
 
 
 def _check_address(options: Options) -> None:

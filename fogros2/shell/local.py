@@ -55,7 +55,8 @@ class LocalShell:
                 command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
                 environment={**os.environ, **command.environment})
         except FileNotFoundError as error:
-            raise PrerequisiteError(f'{error.filename} not found on this computer') from error
+            raise PrerequisiteError(f'{error.filename} not found on this computer',
+                                    'ros2 fog doctor names the package that brings it') from error
         stream = LocalStream(child)
         if command.input:
             stream.write(command.input)

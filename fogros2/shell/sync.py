@@ -124,7 +124,8 @@ def check_source(source: Path) -> None:
     :raises WorkspaceError: it isn't there, or is no folder.
     """
     if not source.is_dir():
-        raise WorkspaceError(f'{source} is no folder that could be sent')
+        raise WorkspaceError(f'{source} is no folder that could be sent',
+                             'ros_workspace= takes the folder that src and install are in')
 
 
 def is_large(source: Path, limit: int) -> bool:
@@ -270,7 +271,8 @@ def open_ssh(endpoint: Endpoint) -> Iterator[str]:
                     tempfile.NamedTemporaryFile('w', prefix='fogros2-', suffix='.hosts'))
             except OSError as error:
                 raise PrerequisiteError(
-                    f'no temporary file can be made: {error.strerror}') from error
+                    f'no temporary file can be made: {error.strerror}',
+                    'is there room in /tmp? TMPDIR names another folder') from error
             known.write(f'machine {endpoint.host_key}\n')
             known.flush()
             words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',

@@ -50,7 +50,8 @@ class ImageVerb(VerbExtension):
         first, rest = args.first, _among(args)
         if first == 'list':
             if rest:
-                raise ConfigurationError("'ros2 fog image list' takes no names")
+                raise ConfigurationError("'ros2 fog image list' takes no names",
+                                         'it lists all images')
             return _list(args)
         if first == 'delete':
             if not rest:
@@ -58,7 +59,8 @@ class ImageVerb(VerbExtension):
                                          'ros2 fog image list shows them')
             return _delete(args, rest)
         if args.image_name and rest:
-            raise ConfigurationError('--image-name names the image of one machine alone')
+            raise ConfigurationError('--image-name names the image of one machine alone',
+                                     'leave it out, or make one image at a time')
         return max(_make(args, name) for name in [first, *rest])
 
 

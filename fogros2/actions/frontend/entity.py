@@ -156,5 +156,5 @@ def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
         left = _UNREAD.search(str(error))
         names = sorted(ast.literal_eval(left[1])) if left is not None else []
         if not names:
-            raise ConfigurationError(str(error)) from error
+            raise ConfigurationError(str(error), 'take it out') from error
         raise keywords.unknown(what or entity.type_name, names[0], known) from error

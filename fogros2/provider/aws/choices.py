@@ -138,7 +138,8 @@ def wants(
                         ('gpu_memory_gb', gpu_memory_gb), ('cores', cores),
                         ('threads_per_core', threads_per_core)):
         if value is not None and not 0 <= value < 1_000_000:
-            raise ConfigurationError(f'{name} can not be {value:g}')
+            raise ConfigurationError(f'{name} can not be {value:g}',
+                                     'it takes a number from 0 to a million')
     return Wants(
         _ARCHITECTURES[given.lower()], MIN_CPU if min_cpu is None else int(min_cpu),
         MIN_MEMORY_GB if min_memory_gb is None else float(min_memory_gb), cpu_type or '', number,

@@ -70,9 +70,11 @@ def recipe(
                                  "such as 'registry.example/robots' or 'localhost:5000'")
     for word in (*packages, *keys, dependencies, user, distro):
         if not _WORD.fullmatch(word):
-            raise ConfigurationError(f"'{word}' can't be part of an image's recipe")
+            raise ConfigurationError(f"'{word}' can't be part of an image's recipe",
+                                     'is it the name of a package, as package.xml has it?')
     if not base or base.startswith('-') or any(c.isspace() for c in base):
-        raise ConfigurationError(f"'{base}' can't be the image to begin with")
+        raise ConfigurationError(f"'{base}' can't be the image to begin with",
+                                 'such as docker.io/library/ros:jazzy-ros-base')
     files = [(CONTAINERFILE, _containerfile(dependencies, packages, keys, base, user, distro))]
     if keys:
         files.append((MANIFEST, _manifest(keys)))
@@ -127,7 +129,8 @@ def write(what: Recipe, folder: Path) -> Path:
         for name, text in what.files:
             (folder / name).write_text(text)
     except OSError as error:
-        raise PrerequisiteError(f'{folder} can not be written: {error.strerror}') from error
+        raise PrerequisiteError(f'{folder} can not be written: {error.strerror}',
+                                '--folder names another') from error
     return folder / CONTAINERFILE
 
 

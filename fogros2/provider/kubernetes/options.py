@@ -106,10 +106,12 @@ def _check_values(options: Options) -> None:
         raise ConfigurationError(f"'{options.namespace}' can't be a namespace",
                                  'lower-case letters, digits and - make one, 63 at most')
     if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
-        raise ConfigurationError(f"'{options.user}' can't be a user name")
+        raise ConfigurationError(f"'{options.user}' can't be a user name",
+                                 'lower-case letters, digits, _ and - make one, 32 at most')
     if any(c.isspace() or c in '/@' for c in options.robot_host):
         raise ConfigurationError(f"robot_host= can't be '{options.robot_host}'",
                                  'it takes an address or a name')
     for name in options.env:
         if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name):
-            raise ConfigurationError(f"env= can't carry the variable {name!r}")
+            raise ConfigurationError(f"env= can't carry the variable {name!r}",
+                                     'a name has letters, digits and _')

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""doc/troubleshooting.md has every error there is, with what to do."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCUMENT = (ROOT / 'doc' / 'troubleshooting.md').read_text()
+PROGRAM = ROOT / 'tools' / 'messages.py'
+
+spec = importlib.util.spec_from_file_location('messages', PROGRAM)
+assert spec is not None and spec.loader is not None
+messages = importlib.util.module_from_spec(spec)
+sys.modules['messages'] = messages
+spec.loader.exec_module(messages)
+
+#: Kinds whose remedy depends on what is wrong, so each message brings its own.
+OWN_REMEDY = ('AuthenticationError', 'ConfigurationError', 'NameTaken', 'PrerequisiteError',
+              'StoreError', 'WorkspaceError')
+
+
+@pytest.mark.parametrize('kind', messages.kinds())
+def test_each_kind_of_error_has_a_part_with_what_to_do(kind: str) -> None:
+    part = re.search(rf'^### {kind}\n\n(.*?)(?=^##)', DOCUMENT, re.MULTILINE | re.DOTALL)
+    assert part is not None, f'no part on {kind}'
+    assert kind == 'FogError' or 'What to do:' in part[1]
+
+
+def test_no_part_is_on_an_error_that_is_gone() -> None:
+    by_kind = DOCUMENT[DOCUMENT.index('## By kind'):DOCUMENT.index('## Messages')]
+    assert set(re.findall(r'^### (\w+)', by_kind, re.MULTILINE)) == set(messages.kinds())
+
+
+def test_each_message_brings_its_remedy_where_its_kind_has_none_for_all() -> None:
+    assert [f'{one.place}: {one.text}' for one in messages.messages()
+            if one.kind in OWN_REMEDY and not one.hint] == []
+
+
+def test_all_messages_are_in_it() -> None:
+    found = subprocess.run(
+        [sys.executable, str(PROGRAM), '--check'], capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout
+    assert len(messages.messages()) > 300
+
+
+def test_a_message_is_found_wherever_it_is_made(tmp_path: Path) -> None:
+    source = tmp_path / 'a.py'
+    source.write_text("raise VpnError(f'{x} is away' + (' again' if y else ''), hint='go ' + z)\n")
+    messages_of = messages._in_file
+    messages.ROOT, before = tmp_path, messages.ROOT
+    try:
+        (one,) = messages_of(source, {'VpnError'})
+    finally:
+        messages.ROOT = before
+    assert (one.text, one.hint, one.place) == ('… is away again', 'go …', 'a.py:1')
+
+
+def test_what_the_table_quotes_is_said_somewhere() -> None:
+    """Rows that begin with a message have it in the words of the source."""
+    said = {
+        messages._text(node) for package in messages.PACKAGES
+        for path in (ROOT / package).rglob('*.py')
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, (ast.Constant, ast.JoinedStr))}
+    table = DOCUMENT[:DOCUMENT.index('## By kind')]
+    rows = re.findall(r'^\| `([^`]+)`', table, re.MULTILINE)
+    assert rows
+    for row in rows:
+        if not row.startswith('ros2 '):  # a command, not a message
+            assert any(_is_like(row, text) for text in said), row
+
+
+def _is_like(row: str, text: str) -> bool:
+    """Return whether most of a row is a text's own words, in their order."""
+    parts = [part for part in text.split(messages.OPEN) if part]
+    pattern = '.*'.join(map(re.escape, parts))
+    return sum(map(len, parts)) > len(row) / 2 and re.search(pattern, row) is not None
