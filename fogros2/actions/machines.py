@@ -11,6 +11,7 @@ import os
 import re
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
+from fogros2 import containers
 from fogros2.actions import names, words
 from fogros2.errors import ConfigurationError
 from fogros2.model import (
@@ -176,8 +177,33 @@ class CloudInstance:
             'vpn_ip': self.vpn_ip,
         }
 
-    def add_docker_container(self, cmd: SomeSubstitutionsType) -> None:
-        """Have a ``docker run`` command line executed on the machine before its nodes start."""
+    def add_docker_container(
+        self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
+    ) -> None:
+        """
+        Run a container on the machine from before its nodes start until they have ended.
+
+        :param cmd: a ``docker run`` command line.
+        :param image: instead of that, the container's image, with any of ``command``, ``ports``,
+            ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see
+            :func:`fogros2.containers.described`.
+        :raises ConfigurationError: it is neither, or both.
+        """
+        if bool(cmd) == bool(image) or cmd and parts:
+            raise ConfigurationError(
+                'add_docker_container takes a command line, or image= and the rest by name',
+                "such as 'docker run --net=host IMAGE'")
+        if image:
+            try:
+                cmd = containers.described(image, **parts)
+            except TypeError as error:
+                raise ConfigurationError(
+                    f'add_docker_container: {error}',
+                    f"there are: {', '.join(inspect.signature(containers.described).parameters)}"
+                ) from error
+        assert cmd is not None
+        if isinstance(cmd, str):
+            containers.parse(cmd)
         self._containers.append(cmd)
 
     def is_up(self, running: RunningMachine) -> None:

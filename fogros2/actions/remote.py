@@ -76,7 +76,7 @@ class RemoteProcess(ExecuteLocal):
         private.set_transport(self, run)
         context.register_event_handler(OnProcessIO(target_action=self, on_stdin=run.on_stdin))
         self._fogros2_session.submit(run)
-        return [*(entities or ()), *self._carriers(context), *self._monitor()]
+        return [*(entities or ()), *self._carriers(context), *self._beside(context)]
 
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return the processes that carry the streams asked for here and nowhere before."""
@@ -87,14 +87,23 @@ class RemoteProcess(ExecuteLocal):
             return self._carriers_here(context)
         return self._carry(context, self._fogros2_streams, session)
 
-    def _monitor(self) -> list[LaunchDescriptionEntity]:
-        """Return what serves the machine's topics, if it was to and nothing does yet."""
+    def _beside(self, context: LaunchContext) -> list[LaunchDescriptionEntity]:
+        """Return what the machine runs beside its nodes, for the first of them."""
         session = self._fogros2_session
-        if not session.spec.launch_foxglove or session.served:
+        if session.furnished or session.interrupted:
             return []
-        from fogros2.actions.foxglove import Foxglove
-        session.served = True
-        return [Foxglove(session.spec.name)]
+        session.furnished = True
+        found: list[LaunchDescriptionEntity] = []
+        for number, line in enumerate(session.spec.containers):
+            from fogros2 import containers
+            follower = carriers.Carrier(containers.follow(
+                containers.parse(line), number, Coordinator.of(context).launch.id))
+            send(follower, session.spec.name)
+            found.append(follower)
+        if session.spec.launch_foxglove:
+            from fogros2.actions.foxglove import Foxglove
+            found.append(Foxglove(session.spec.name))
+        return found
 
     def _carriers_here(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return those that bring what a machine publishes for this process to the robot."""

@@ -94,8 +94,8 @@ class Session:
         self.deployment: Optional[asyncio.Task[None]] = None
         #: True when the machine is up, False when it never will be.
         self.came_up: asyncio.Future[bool] = loop.create_future()
-        #: Whether its bridge to Foxglove was asked for.
-        self.served = False
+        #: Whether what runs there beside its nodes was asked for.
+        self.furnished = False
         #: Topics that its nodes know by other names, for the sake of streams.
         self.names: dict[str, str] = {}
         self._loop = loop

@@ -39,6 +39,8 @@ class Provider(abc.ABC):
     agent_program: ClassVar[str] = ''
     #: Whether its computers are made for a launch, not somebody's that exist already.
     owned: ClassVar[bool] = True
+    #: Whether a container engine can run on its machines.
+    runs_containers: ClassVar[bool] = True
     #: Seconds between two looks at a machine that comes up slowly, at the most.
     look_interval: ClassVar[float] = 3.0
     #: Whether ``allow`` decides who reaches a machine; the launch then closes the SSH port as soon

@@ -95,6 +95,8 @@ class ContainerProvider(Provider):
     """Containers of podman or docker on this computer."""
 
     name: ClassVar[str] = 'container'
+    #: One of its own would take rights that would make a container little of a wall.
+    runs_containers = False
     look_interval: ClassVar[float] = 0.1
     agent_directory: ClassVar[str] = f'/{container_entry.AGENT_DIRECTORY}'
     agent_program: ClassVar[str] = f'/{container_entry.FOLDER}/agent.py'

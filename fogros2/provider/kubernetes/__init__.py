@@ -28,18 +28,25 @@ from fogros2.provider.kubernetes.start import Start
 _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 #: Seconds for which an API server is waited for before anything has begun.
 _FIRST = 5.0
+#: Seconds for which rights that were there are not asked for again.
+_SURE = 30.0
 
 
 class KubernetesProvider(Provider):
     """Pods of the cluster that the kubeconfig names."""
 
     name: ClassVar[str] = 'kubernetes'
+    #: Not within a pod that may do no more than WireGuard takes.
+    runs_containers = False
     shell_kind: ClassVar[str] = 'kubernetes'
     look_interval: ClassVar[float] = 1.0
     notice: ClassVar[tuple[str, ...]] = boot.NOTICE_COMMAND
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._reviewing = threading.Lock()
+        #: When it was found that this user has all rights, by context and namespace.
+        self._reviewed: dict[tuple[str, str], float] = {}
         #: Contexts and namespaces that launch files have named.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
@@ -69,15 +76,24 @@ class KubernetesProvider(Provider):
                 "use on_exit='keep' or 'delete'")
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
-        review = api.request(
-            'POST', _REVIEW, {'spec': {'namespace': namespace}}, patience=_FIRST)
-        status = review.get('status') or {}
-        lacking = hints.missing_rights(status.get('resourceRules') or ())
-        # a cluster whose authorizer can't list all rules says so; what it refuses is told then
-        if lacking and not status.get('incomplete'):
-            raise PrerequisiteError(
-                f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
-                f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
+        self._check_rights(api, namespace)
+
+    def _check_rights(self, api: Api, namespace: str) -> None:
+        """Ask once for the machines of a launch what this user may do."""
+        with self._reviewing:
+            when = self._reviewed.get((api.context, namespace))
+            if when is not None and time.monotonic() - when < _SURE:
+                return
+            review = api.request(
+                'POST', _REVIEW, {'spec': {'namespace': namespace}}, patience=_FIRST)
+            status = review.get('status') or {}
+            lacking = hints.missing_rights(status.get('resourceRules') or ())
+            # a cluster whose authorizer can't list all rules says so; what it refuses is told then
+            if lacking and not status.get('incomplete'):
+                raise PrerequisiteError(
+                    f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
+                    f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
+            self._reviewed[api.context, namespace] = time.monotonic()
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Try the pod's admission, then make the Job and what leads UDP to it."""
