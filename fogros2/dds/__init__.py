@@ -5,10 +5,26 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+import dataclasses
 from types import MappingProxyType
 from typing import ClassVar, Optional
 
 from fogros2.model import Command, DdsInterface
+
+
+@dataclasses.dataclass(frozen=True)
+class Router:
+    """
+    A program at which the nodes of a host meet each other, and other hosts.
+
+    :param package: with ``executable`` names a program of the ament index.
+    :param variable: names the file with ``config`` to it.
+    """
+
+    package: str
+    executable: str
+    variable: str
+    config: str
 
 
 class DdsVendor(abc.ABC):
@@ -22,6 +38,10 @@ class DdsVendor(abc.ABC):
     rmw: ClassVar[str]
     #: Ranges of UDP ports, first and last, that the robot's nodes listen at beside the domain's.
     ports: ClassVar[Sequence[tuple[int, int]]] = ()
+    #: Whether the VPN's interface is told by its address in place of its name.
+    by_address: ClassVar[bool] = False
+    #: What the configuration's file is called, where the middleware minds.
+    file_name: ClassVar[str] = 'dds.xml'
 
     @abc.abstractmethod
     def ask_lan(self) -> Command:
@@ -69,6 +89,18 @@ class DdsVendor(abc.ABC):
 
         :param user: the environment as the user has it; what it configures is kept, ours after it.
         """
+
+    def router(
+        self, address: str, others: Sequence[str], user: Optional[Mapping[str, str]],
+    ) -> Optional[Router]:
+        """
+        Return what has to run beside the nodes of a host; None, the default, for nothing.
+
+        :param address: the host's in the VPN.
+        :param others: those of hosts that it shall find.
+        :param user: the robot's environment as the user has it; None on a machine.
+        """
+        return None
 
 
 def static_peers(user: Mapping[str, str]) -> list[str]:

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from fogros2 import bootstrap, workspace
+from fogros2.agent_client import AgentClient
+from fogros2.deploy import routing
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.equipping import Equipment
@@ -15,7 +18,8 @@ from fogros2.deploy.guarding import Guard
 from fogros2.deploy.job import Job
 from fogros2.deploy.joining import Joining
 from fogros2.deploy.running import RunningMachine
-from fogros2.model import MachineSpec, VpnInterface
+from fogros2.errors import DdsError
+from fogros2.model import MachineSpec, to_json, VpnInterface
 from fogros2.report import Progress
 from fogros2.shell import Shell
 
@@ -63,6 +67,7 @@ class Deployment:
             job.save(public_key=public_key)
             # once more, to come first on the way down
             self.guard.undo_nodes(agent)
+            self.start_router(agent, interface)
             self.entrance.go_inside(interface)
             job.failed = False
             running = RunningMachine(
@@ -114,8 +119,22 @@ class Deployment:
         vendor = self.launch.dds()
         # the robot hears of a machine by multicast, machines of each other by asking
         peers = self.launch.addresses_but(self.job.name)
-        path = f'{self.guard.directory}/dds.xml'
+        path = f'{self.guard.directory}/{vendor.file_name}'
         shell.put(
-            vendor.render(vendor.machine_interfaces(interface.name), peers).encode(),
+            vendor.render(vendor.machine_interfaces(
+                interface.address if vendor.by_address else interface.name), peers).encode(),
             path, mode=0o600, timeout=self.job.timeouts.command)
         return dict(vendor.environment(path, {}))
+
+    def start_router(self, agent: AgentClient, interface: VpnInterface) -> None:
+        """Start the router that the machine's nodes meet at, for a middleware that has one."""
+        name = self.job.name
+        router = self.launch.dds().router(
+            interface.address, self.launch.addresses_but(name), None)
+        if router is None:
+            return
+        if self.launch.index(name) >= routing.MACHINES:
+            raise DdsError(
+                f"'{name}' is one machine too many: the robot's router knows {routing.MACHINES}",
+                'spread them over several launches, or use another RMW_IMPLEMENTATION')
+        agent.request('start', nodes=[json.loads(to_json(routing.node(router, name)))])

@@ -18,6 +18,7 @@ from typing import Optional
 from fogros2 import model, plan, plugin_system, process, workspace
 from fogros2 import shell as shells
 from fogros2.dds import DdsVendor
+from fogros2.deploy import routing
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.deployment import Deployment
 from fogros2.deploy.robot import check_robot, provider
@@ -219,17 +220,31 @@ class Launch:
                 lan = vendor.parse_lan(self.robot([vendor.ask_lan()]))
                 robot = self.robot_vpn()
                 interfaces = vendor.robot_interfaces(
-                    robot.interface.name, lan, self.user_environment)
-                path = self.store.launch(self.id) / 'dds.xml'
+                    robot.interface.address if vendor.by_address else robot.interface.name,
+                    lan, self.user_environment)
+                path = self.store.launch(self.id) / vendor.file_name
                 # no peers: the machines announce themselves
                 write_private(
                     path, vendor.render(interfaces, (), self.user_environment).encode())
                 # for terminals that join
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
                 robot.ensure()
+                self._route(vendor, path.parent)
                 self._robot_environment = dict(
                     vendor.environment(str(path), self.user_environment))
             return dict(self._robot_environment)
+
+    def _route(self, vendor: DdsVendor, folder: Path) -> None:
+        """Start the router that the robot's nodes meet at, for a middleware that has one."""
+        robot = self.robot_vpn().interface
+        machines = [
+            plan.machine_interface('', robot.network, index, 0, '').address
+            for index in range(routing.MACHINES)]
+        router = vendor.router(robot.address, machines, self.user_environment)
+        if router is not None:
+            running = routing.RobotRouter(router, folder, self.user_environment)
+            # after the robot's nodes, and before the VPN
+            self.undo.callback(running.close)
 
     def expect(self, names: Iterable[str]) -> None:
         """Give machines their addresses ahead, so that nodes started meanwhile know them."""

@@ -260,13 +260,14 @@ def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
 
     :raises FogError: the user's RMW_IMPLEMENTATION is one that can't join.
     """
-    path = store.root / 'launches' / record.launch / 'dds.xml'
-    if not record.launch or not record.launch_alive or not path.exists():
+    chosen = store.root / 'launches' / record.launch / 'rmw'
+    if not record.launch or not record.launch_alive or not chosen.exists():
         return None
-    rmw = path.with_name('rmw').read_text()
+    rmw = chosen.read_text()
     own = os.environ.get('RMW_IMPLEMENTATION') or rmw
     if own != rmw:
         raise DdsError(f'the launch has RMW_IMPLEMENTATION={rmw}, this terminal {own}',
                        'unset RMW_IMPLEMENTATION here')
     vendor = plugin_system.load('fogros2.dds', rmw)()
+    path = chosen.with_name(vendor.file_name)
     return dict(vendor.environment(str(path), os.environ))

@@ -11,6 +11,8 @@ import uuid
 import pytest
 
 from fogros2 import process
+from fogros2.model import Command
+from fogros2.testing.colcon_workspace import colcon_workspace
 from fogros2.testing.launched import launching
 
 pytestmark = [
@@ -54,6 +56,12 @@ def has_middleware(name: str) -> bool:
                for prefix in prefixes if prefix)
 
 
+def runs(process_id: str) -> bool:
+    """Return whether a process is there; one that has ended and waits to be reaped isn't."""
+    path = Path('/proc', process_id, 'cmdline')
+    return path.exists() and path.read_bytes() != b''
+
+
 def test_what_nodes_here_lack_is_refused_before_anything_is_made(
         tmp_path: Path, cloud_network: str) -> None:
     if has_middleware('rmw_fastrtps_cpp'):
@@ -80,3 +88,71 @@ def test_fast_dds_carries_a_launch(tmp_path: Path, cloud_network: str) -> None:
         launched.interrupt()
         assert launched.ended(30.0) == 0, launched.text
     assert not launched.errors, launched.text
+
+
+#: Stand where rmw_zenoh's programs do: the router, and nodes that are zenoh's own.
+ROUTER = """
+import os, signal, threading, zenoh
+ended = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: ended.set())
+signal.signal(signal.SIGINT, lambda *_: ended.set())
+with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_ROUTER_CONFIG_URI'])):
+    ended.wait()
+"""
+TALKER = """
+import os, sys, time, zenoh
+with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_SESSION_CONFIG_URI'])) as session:
+    for number in range(400):
+        session.put(sys.argv[1], f'{number} from {os.uname().nodename}')
+        time.sleep(0.1)
+"""
+LISTENER = """
+import os, sys, time, zenoh
+with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_SESSION_CONFIG_URI'])) as session:
+    session.declare_subscriber(sys.argv[1], lambda sample: print(
+        'I heard', sys.argv[1], sample.payload.to_string(), flush=True))
+    time.sleep(40)
+"""
+ZENOH = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def node(where, executable, topic):
+    words = dict(package='rmw_zenoh_cpp', executable=executable, arguments=[topic],
+                 output='screen')
+    return CloudNode(machine=where, **words) if where else Node(**words)
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name='{name}', network='{network}', ros_workspace='{root}')
+    return FogROSLaunchDescription([
+        node(machine, 'talker', 'down'), node(machine, 'listener', 'up'),
+        node(None, 'talker', 'up'), node(None, 'listener', 'down'),
+    ], dds='zenoh')
+"""
+
+
+def test_zenoh_has_a_router_on_each_side(tmp_path: Path, cloud_network: str) -> None:
+    pytest.importorskip('zenoh', reason='eclipse-zenoh is not installed')
+    if has_middleware('rmw_zenoh_cpp'):
+        pytest.skip("this computer's ROS 2 has rmw_zenoh_cpp, which this stands for")
+    root = tmp_path / 'workspace'
+    variables = {**os.environ, **colcon_workspace(root, 'rmw_zenoh_cpp', programs={
+        'rmw_zenohd': ROUTER, 'talker': TALKER, 'listener': LISTENER})}
+    index = root / 'install/rmw_zenoh_cpp/share/ament_index/resource_index/rmw_typesupport'
+    index.mkdir()
+    (index / 'rmw_zenoh_cpp').touch()
+    path = tmp_path / 'rmw.launch.py'
+    path.write_text(ZENOH.format(name=NAME, network=cloud_network, root=root))
+    with launching() as launch:
+        launched = launch(str(path), environment=variables)
+        launched.wait_for('I heard up', times=3)
+        launched.wait_for('I heard down', times=3)
+        routers = process.run(
+            Command(('pgrep', '-f', f'{root}.*/rmw_zenohd')), timeout=10.0).stdout.split()
+        # the robot's program and the shell that ends it with the launch; the machine's
+        assert len(routers) >= 3
+        launched.interrupt()
+        launched.ended(30.0)
+    assert not [one for one in routers if runs(one)]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Zenoh, ROS 2's ``rmw_zenoh_cpp``: one router per host, connected over the VPN.
+
+Nodes know the router of their host alone, at the host's address in the VPN: an address of this
+launch's own, so two launches, and a router that runs already, have their own each. The robot's
+router dials those of machines (nothing from the VPN reaches a TCP port of the robot), machines'
+routers dial each other, and the robot's joins the one that the user's other nodes have, and with
+it the robot's LAN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import json
+from types import MappingProxyType
+from typing import Any, ClassVar, Optional
+
+from fogros2.dds import DdsVendor, Router, static_peers
+from fogros2.errors import DdsError
+from fogros2.model import Command, DdsInterface
+
+#: TCP port of routers in the VPN; 7447 is the one that rmw_zenoh's own takes on all interfaces.
+PORT = 7448
+USERS_ROUTER = 'tcp/127.0.0.1:7447'
+MAX_DOMAIN = 232
+#: Milliseconds between attempts to dial a router, doubled up to the second.
+RETRY, RETRY_MAX = 250, 2000
+#: Milliseconds without a sign of life after which a link is taken for broken and dialled anew.
+LEASE = 10_000
+#: Milliseconds that a service or action call waits for its answer: as long as it takes.
+QUERY_TIMEOUT = 600_000
+
+
+class Zenoh(DdsVendor):
+    """
+    Renders the configurations of sessions and routers.
+
+    :param domain: ROS_DOMAIN_ID, which rmw_zenoh has in its keys itself.
+    """
+
+    rmw: ClassVar[str] = 'rmw_zenoh_cpp'
+    by_address: ClassVar[bool] = True
+    file_name: ClassVar[str] = 'dds.json5'
+
+    def __init__(self, domain: int = 0) -> None:
+        if not 0 <= domain <= MAX_DOMAIN:
+            raise DdsError(f'ROS_DOMAIN_ID {domain} is none', 'use 0 to 232')
+        self.domain = domain
+
+    def ask_lan(self) -> Command:
+        """Return a command that says nothing: nodes know their router alone."""
+        return Command(('true',), what='look at the network interfaces')
+
+    def parse_lan(self, output: str) -> Optional[str]:
+        """Return None: nodes use no interface but their router's."""
+        return None
+
+    def robot_interfaces(
+        self, vpn: str, lan: Optional[str], user: Mapping[str, str],
+    ) -> list[DdsInterface]:
+        """
+        Return the address at which nodes meet the robot's router.
+
+        :raises DdsError: the user's environment leads nodes to another one.
+        """
+        if user.get('ZENOH_SESSION_CONFIG_URI'):
+            raise DdsError(
+                'ZENOH_SESSION_CONFIG_URI leads nodes past the router that knows the machines',
+                'say in ZENOH_CONFIG_OVERRIDE what shall differ, and unset the other')
+        override = user.get('ZENOH_CONFIG_OVERRIDE', '')
+        if any(word in override for word in ('connect/', 'mode=')):
+            raise DdsError(
+                f'ZENOH_CONFIG_OVERRIDE={override} leads nodes past the router that knows the'
+                ' machines', "leave 'connect/' and 'mode' out of it")
+        return [DdsInterface(vpn)]
+
+    def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
+        """Return the address at which nodes meet the machine's router."""
+        return [DdsInterface(vpn)]
+
+    def render(
+        self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
+        user: Mapping[str, str] = MappingProxyType({}),
+    ) -> str:
+        """
+        Return the configuration of nodes' sessions, JSON.
+
+        :param interfaces: one, by its address.
+        :param peers: left out: the router dials them.
+        """
+        if len(interfaces) != 1:
+            raise DdsError('nodes on zenoh need one address of a router')
+        return _text({
+            'mode': 'peer',
+            'connect': {'endpoints': [_endpoint(interfaces[0].name)], **_PATIENT},
+            # others of the host learn it from the router, and talk without it
+            'listen': {'endpoints': ['tcp/127.0.0.1:0']},
+            'scouting': {
+                'multicast': {'enabled': False},
+                'gossip': {'enabled': True, 'multihop': False,
+                           'autoconnect': {'router': [], 'peer': ['router', 'peer']}}},
+            # latched topics are kept in order by it
+            'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
+            'queries_default_timeout': QUERY_TIMEOUT,
+            'transport': _TRANSPORT,
+        })
+
+    def router(
+        self, address: str, others: Sequence[str], user: Optional[Mapping[str, str]],
+    ) -> Optional[Router]:
+        """
+        Return the host's router.
+
+        :param user: its ROS_STATIC_PEERS have routers too, at rmw_zenoh's own port. With
+            ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST the router keeps to the machines.
+        """
+        dialled = [_endpoint(other) for other in others]
+        if user is not None and not _here_only(user):
+            dialled += [USERS_ROUTER, *(f'tcp/{host}:7447' for host in static_peers(user))]
+        return Router('rmw_zenoh_cpp', 'rmw_zenohd', 'ZENOH_ROUTER_CONFIG_URI', _text({
+            'mode': 'router',
+            'listen': {'endpoints': [_endpoint(address)]},
+            'connect': {'endpoints': dialled, **_PATIENT},
+            # nobody else in reach of the VPN's interface is asked, and none of a LAN
+            'scouting': {'multicast': {'enabled': False}, 'gossip': {'enabled': True}},
+            'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
+            'queries_default_timeout': QUERY_TIMEOUT,
+            'transport': _TRANSPORT,
+        }))
+
+    def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
+        """
+        Return RMW_IMPLEMENTATION and the place of the sessions' configuration.
+
+        :raises DdsError: the user's environment turns discovery off.
+        """
+        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
+            raise DdsError(
+                'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
+                'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+        return {'RMW_IMPLEMENTATION': self.rmw, 'ZENOH_SESSION_CONFIG_URI': path}
+
+
+#: A router that isn't there yet is dialled again and again, and nothing fails meanwhile.
+_PATIENT: Mapping[str, Any] = {
+    'timeout_ms': -1, 'exit_on_failure': False,
+    'retry': {'period_init_ms': RETRY, 'period_max_ms': RETRY_MAX, 'period_increase_factor': 2}}
+_TRANSPORT: Mapping[str, Any] = {
+    'unicast': {'open_timeout': 60_000, 'accept_timeout': 60_000, 'max_sessions': 10_000},
+    'link': {'tx': {'lease': LEASE, 'keep_alive': 4}},
+    # hosts share none, and a machine's limits are small
+    'shared_memory': {'enabled': False}}
+
+
+def _here_only(user: Mapping[str, str]) -> bool:
+    return (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
+            or user.get('ROS_LOCALHOST_ONLY') == '1')
+
+
+def _endpoint(address: str) -> str:
+    return f'tcp/{address}:{PORT}'
+
+
+def _text(config: Mapping[str, Any]) -> str:
+    return json.dumps(config, indent=2, default=dict) + '\n'
