@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from pathlib import Path
+import re
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import OpaqueFunction, SetLaunchConfiguration
@@ -361,3 +363,22 @@ def test_docker_containers_of_a_machine():
         <docker_container cmd="docker run --rm $(var image)"/>
       </fog_machine>"""), image='redis')
     assert found.containers == ('docker run --rm redis',)
+
+
+# -- the documentation ---------------------------------------------------------------------------
+
+DOCUMENT = (Path(__file__).parents[2] / 'doc' / 'launch_xml_yaml.md').read_text()
+
+
+@pytest.mark.parametrize('text', re.findall(
+    r'^```(?:xml|yaml)\n(.*?)^```', DOCUMENT, re.MULTILINE | re.DOTALL))
+def test_what_the_documentation_shows_is_read(text):
+    assert load(text).entities
+
+
+def test_the_documentation_names_every_element():
+    Parser.load_launch_extensions()
+    from launch.frontend.expose import action_parse_methods
+    assert {name for name, parse in action_parse_methods.items()
+            if parse.__module__.startswith('fogros2.')} == set(
+                re.findall(r'^\| `(\w+)` \| `', DOCUMENT, re.MULTILINE))
