@@ -2,6 +2,7 @@
 """Entry points of installed distributions."""
 from __future__ import annotations
 
+import functools
 from importlib import metadata
 import logging
 from typing import Any, Iterable
@@ -9,10 +10,13 @@ from typing import Any, Iterable
 logger = logging.getLogger(__name__)
 
 
+# read once: there are files of each distribution
+_all = functools.cache(metadata.entry_points)
+
+
 def get_entry_points(group_name: str) -> dict[str, metadata.EntryPoint]:
     """Return the group's entry points by name."""
-    return {entry_point.name: entry_point
-            for entry_point in metadata.entry_points(group=group_name)}
+    return {entry_point.name: entry_point for entry_point in _all().select(group=group_name)}
 
 
 def load_entry_points(

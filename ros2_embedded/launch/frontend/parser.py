@@ -25,13 +25,13 @@ class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
 
 
 def _load_entry_points(group: str, kind: str) -> dict[str, Any]:
-    from importlib.metadata import entry_points
+    from ros2cli.entry_points import get_entry_points
     loaded = {}
-    for entry_point in entry_points(group=group):
+    for name, entry_point in get_entry_points(group).items():
         try:
-            loaded[entry_point.name] = entry_point.load()
+            loaded[name] = entry_point.load()
         except Exception:  # noqa: BLE001 - Another's module must not end this launch.
-            warnings.warn(f'Failed to load the {kind} extension: {entry_point.name}\n'
+            warnings.warn(f'Failed to load the {kind} extension: {name}\n'
                           f'{traceback.format_exc()}', stacklevel=2)
     return loaded
 

@@ -94,7 +94,7 @@ def _called(root_parser: Any, dest: str, argv: Any) -> Any:
     """Say which of the subparsers the arguments, or the words to be completed, call."""
     if os.environ.get('_ARGCOMPLETE') != '1':
         return getattr(root_parser.parse_known_args(args=argv)[0], dest)
-    from argcomplete import split_line  # type: ignore[import-not-found, unused-ignore]
+    from argcomplete import split_line  # type: ignore[attr-defined, unused-ignore]
     try:
         words = split_line(os.environ['COMP_LINE'])[3][1:]
         return getattr(root_parser.parse_known_args(args=words)[0], dest)
