@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 import contextlib
 import functools
-import shlex
 import threading
 from typing import Any, Optional
 
@@ -29,6 +28,24 @@ from fogros2.waiting import wait_until
 AGENT_FOLDER = '/run/fogros2'
 #: Seconds between two looks for the provider's notice that it takes the machine away.
 NOTICE_INTERVAL = 5.0
+
+# All in one round trip. Its input is the configuration, one line (which sh reads byte by byte, so
+# the rest is left to cat), then the agent. $1 folder of all agents, $2 this one's, $3 program,
+# $4 our configuration, $5 login user.
+_INSTALL = """\
+umask 077
+install -d -m 755 "$1"
+install -d -m 700 -o "$5" "$2"
+aside=$3.$$.new
+trap 'rm -f -- "$4" "$aside"' EXIT
+IFS= read -r told
+printf '%s\\n' "$told" >"$4"
+cat >"$aside"
+chmod 700 "$aside"
+chown "$5" "$aside"
+mv -f -- "$aside" "$3"
+python3 -IS "$3" serve --detach --config "$4"
+"""
 
 # One that was released has left; one that was never reached hasn't. Another robot's stays: the
 # agent says in its configuration whose it is. $1 folder, $2 launch, $3 our configuration.
@@ -105,18 +122,14 @@ class Guard:
 
     def _install(self, shell: Shell, program: str, config: Mapping[str, Any]) -> None:
         job = self._job
-        job.on(shell, [Command.script(
-            f'install -d -m 755 {AGENT_FOLDER}; '
-            f'install -d -m 700 -o {shlex.quote(config["user"])} {self.directory}', sudo=True,
-            what="make the agent's folder")])
-        shell.put(agent_source().read_bytes(), program, mode=0o700)
-        # of this launch alone: another robot may be doing the same at this moment
-        shell.put(model.to_json(config).encode(), self._first_config, mode=0o600)
+        told = model.to_json(config).encode()
+        assert b'\n' not in told
         try:
-            job.on(shell, [Command.script(
-                f'python3 -IS {program} serve --detach --config {self._first_config} && code=0 '
-                f'|| code=$?\nrm -f {self._first_config}\nexit $code',
-                sudo=True, what='start the agent')])
+            job.on(shell, [Command(
+                ('sh', '-ec', _INSTALL, 'sh', AGENT_FOLDER, self.directory, program,
+                 self._first_config, str(config['user'])),
+                sudo=True, input=told + b'\n' + agent_source().read_bytes(),
+                what='start the agent')])
         except CommandError as error:
             if '"kind":"running"' in error.result.stdout:
                 raise AgentError(

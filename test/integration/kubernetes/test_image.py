@@ -31,7 +31,7 @@ pytestmark = [
 ]
 
 BASE = 'localhost/fogt-base:1'
-APPLETS = ('cat chmod chown cp date echo grep kill ls mkdir rm sh sleep test true').split()
+APPLETS = ('cat chmod chown cp echo grep kill ls mkdir rm sh sleep test true').split()
 #: Stands for the packages, which nobody has here: notes which were asked for.
 APT = '#!/bin/sh\necho "$*" >>/asked\n'
 
