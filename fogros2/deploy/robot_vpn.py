@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 TICKET_REFRESH = 30.0
 #: Seconds that a new machine waits for the others to have been told of it.
 TELLING = 5.0
+#: Seconds between two attempts to repair the interface, at the most, where they fail.
+SELDOM = 15.0
 
 
 class RobotVpn:
@@ -142,7 +144,8 @@ class RobotVpn:
     def _keep(self) -> None:
         """Get the interface's program going again when it died; nodes don't notice."""
         asked = time.monotonic()
-        while not self._stop.wait(1.0):
+        pause = 1.0
+        while not self._stop.wait(pause):
             if time.monotonic() - asked > TICKET_REFRESH:
                 asked = time.monotonic()
                 self._refresh_ticket()
@@ -151,14 +154,18 @@ class RobotVpn:
                     return
                 if self._launch.ending:
                     continue  # with the machines go the networks that lead to them
+                # what can't be repaired is told now and then, not each second
+                pause = min(2 * pause, SELDOM)
                 try:
                     alive = process.run(self.vpn.alive(self.interface), check=False,
                                         timeout=self._launch.timeouts.vpn)
                     if alive.returncode == 0:
+                        pause = 1.0
                         continue
                     with step(self._launch.report, '', 'VPN repair', fatal=False):
                         self._launch.robot(
                             self.vpn.repair(self.interface, self._sorted()), cancel=False)
+                    pause = 1.0
                 except FogError:
                     pass  # a repair's is reported by its step; the next round tries again
 

@@ -305,6 +305,26 @@ def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
     assert len(seen) == 2
 
 
+def test_a_vpn_that_cannot_be_repaired_is_told_now_and_then(launch, monkeypatch):
+    waits = []
+
+    def wait(seconds):
+        waits.append(seconds)
+        return len(waits) > 8
+
+    def run(command, **arguments):
+        if command.what.startswith('repair') and len(waits) < 7:
+            raise FogError('no')
+        return Result(1 if len(waits) < 8 else 0, '', '')
+
+    robot = launch.robot_vpn()
+    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
+    monkeypatch.setattr(process, 'run', run)
+    monkeypatch.setattr(robot._stop, 'wait', wait)
+    robot._keep()
+    assert waits == [1.0, 2.0, 4.0, 8.0, 15.0, 15.0, 15.0, 1.0, 1.0]
+
+
 def test_an_interface_that_was_taken_down_does_not_come_up_again(launch, monkeypatch):
     robot = launch.robot_vpn()
     robot._stop.set()
