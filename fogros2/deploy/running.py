@@ -78,17 +78,19 @@ class RunningMachine:
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
-        self.agent.request('stop', timeout=self._patience(), silent=SILENT,
-                           nodes=None if ids is None else list(ids))
+        self._request('stop', nodes=None if ids is None else list(ids))
 
     def signal(self, node: str, name: str) -> None:
         """Send a node a signal, by its name (``SIGUSR1``)."""
-        self.agent.request(
-            'signal', timeout=self._patience(), silent=SILENT, node=node, signal=name)
+        self._request('signal', node=node, signal=name)
 
-    def _patience(self) -> float:
-        """Return how long a request may take: at the end nobody out of reach is waited for."""
-        return self._job.patience(30.0) if self._launch.cancel.is_set() else 30.0
+    def _request(self, command: str, **arguments: Any) -> None:
+        """Ask the agent for something; at the end nobody out of reach is waited for."""
+        if self._launch.cancel.is_set():
+            self.agent.request(
+                command, timeout=self._job.patience(30.0), silent=SILENT, **arguments)
+        else:
+            self.agent.request(command, timeout=30.0, **arguments)
 
     def serves(self, port: int) -> None:
         """Remember the TCP port of the bridge to Foxglove that runs there."""
