@@ -159,10 +159,10 @@ def camera() -> None:
 
     rclpy.init()
     node = rclpy.create_node('camera')
-    publisher = node.create_publisher(Image, 'image', 1)
+    publisher = node.create_publisher(Image, 'image', 10)
     image = Image(height=HEIGHT, width=WIDTH, encoding='bgr8', step=3 * WIDTH)
     image.data = array.array('B', os.urandom(3 * WIDTH * HEIGHT))
-    until(node, publisher.get_subscription_count)
+    until(node, lambda: node.count_publishers('viewing'))
     begin = time.monotonic()
     filled = Filled()
     for index in range(IMAGES):
@@ -190,7 +190,9 @@ def viewer() -> None:
         stamp = image.header.stamp
         late.append(time.time() - stamp.sec - stamp.nanosec / 1e9)
 
-    node.create_subscription(Image, 'image', take, 10)
+    subscription = node.create_subscription(Image, 'image', take, 10)
+    until(node, subscription.get_publisher_count)
+    node.create_publisher(Image, 'viewing', 1)  # says that from now on no image may be lost
     until(node, lambda: late)
     filled = Filled()
     until(node, lambda: len(late) == IMAGES or time.monotonic() - last > 2.0)
