@@ -168,7 +168,7 @@ class Creation:
                     self.account, region, attempt=self.attempt, name=self.spec.name, vpc=vpc,
                     tags=made))
                 network.open_group(
-                    self.account, region, groups[0], name=self.spec.name,
+                    self.account, region, groups[0], attempt=self.attempt, name=self.spec.name,
                     vpn_port=self.request.vpn_port, sources=sources)
                 importing.result()
             instance = self._first_with_room(region, chosen, groups[0], {

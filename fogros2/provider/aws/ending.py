@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Optional
 
 from fogros2.provider import TAG_NAME
@@ -28,16 +28,18 @@ def destroy(account: Account, machine: MachineId) -> None:
 
     :raises FogError: something could not be deleted.
     """
+    disks = account.disks.pop(machine.instance, set())
     # what this process has made is ours without asking
-    if machine.instance in account.made or _there(account, machine):
+    if machine.instance in account.made or _there(account, machine, disks):
         if _terminate(account, machine):
             # it takes EC2 half a minute and more
             wait_until(
-                lambda: not _there(account, machine), timeout=PATIENCE, first=1.0, interval=4.0,
-                longest=15.0, what=f'{machine.instance} in {machine.region} to be terminated',
-                hint='ros2 fog delete again later')
+                lambda: not _there(account, machine, disks), timeout=PATIENCE, first=1.5,
+                interval=3.0, longest=15.0, hint='ros2 fog delete again later',
+                what=f'{machine.instance} in {machine.region} to be terminated')
     account.made.pop(machine.instance, None)
-    sweep(account, machine.region, machine.attempt)
+    account.doors.pop(machine.attempt, None)
+    sweep(account, machine.region, machine.attempt, gone=disks)
 
 
 def _terminate(account: Account, machine: MachineId) -> bool:
@@ -58,17 +60,23 @@ def _terminate(account: Account, machine: MachineId) -> bool:
     return any(entry['CurrentState']['Name'] != 'terminated' for entry in told)
 
 
-def _there(account: Account, machine: MachineId) -> bool:
+def _there(account: Account, machine: MachineId, disks: set[str]) -> bool:
+    """Return whether an instance is there; adds the disks that go with it."""
     # by filters: unlike an id that EC2 has forgotten, what they don't find is no error
     found = instances.instances_in(account.call(
         'ec2', machine.region, 'describe_instances', f'watching {machine.instance} end',
         Filters=[{'Name': 'instance-id', 'Values': [machine.instance]},
                  *instances.tag_filters({TAG_ATTEMPT: machine.attempt})])['Reservations'])
+    disks |= {disk for instance in found for disk in instances.own_disks(instance)}
     return any(instance['State']['Name'] != 'terminated' for instance in found)
 
 
-def sweep(account: Account, region: str, attempt: str) -> None:
-    """Delete what an attempt made besides its instance: key, group, addresses, disks."""
+def sweep(account: Account, region: str, attempt: str, gone: Collection[str] = ()) -> None:
+    """
+    Delete what an attempt made besides its instance: key, group, addresses, disks.
+
+    :param gone: ids of what goes by itself, which EC2 tells of for some time.
+    """
     drop_key(account, region, attempt)
     left = [str(entry['ResourceId']) for entry in account.pages(
         'ec2', region, 'describe_tags', 'Tags', 'looking for what is left',
@@ -84,12 +92,11 @@ def sweep(account: Account, region: str, attempt: str) -> None:
         if address.startswith('eipalloc-'):
             _gone_is_fine(account, region, 'release_address', 'releasing an address',
                           AllocationId=address)
-    if any(each.startswith('vol-') for each in left):
+    if any(each.startswith('vol-') and each not in gone for each in left):
         _drop_volumes(account, region, attempt)
 
 
 def _drop_volumes(account: Account, region: str, attempt: str) -> None:
-    # the instance's own goes with it, and is told of for some time
     volumes: Iterable[Mapping[str, Any]] = account.call(
         'ec2', region, 'describe_volumes', 'looking for disks',
         Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},

@@ -237,6 +237,13 @@ def address_of(instance: Mapping[str, Any]) -> str:
     return str(instance.get('PublicIpAddress') or instance.get('PrivateIpAddress') or '')
 
 
+def own_disks(instance: Mapping[str, Any]) -> set[str]:
+    """Return the ids of the disks that go with an instance."""
+    return {str(mapping['Ebs']['VolumeId'])
+            for mapping in instance.get('BlockDeviceMappings') or ()
+            if mapping.get('Ebs', {}).get('DeleteOnTermination')}
+
+
 def reason_of(instance: Mapping[str, Any]) -> str:
     """Return why an instance ended, in EC2's words."""
     reason = instance.get('StateReason') or {}

@@ -138,7 +138,7 @@ def create_group(
 
 
 def open_group(
-    account: Account, region: str, group: str, *, name: str, vpn_port: int,
+    account: Account, region: str, group: str, *, attempt: str, name: str, vpn_port: int,
     sources: Sequence[str],
 ) -> None:
     """
@@ -155,6 +155,9 @@ def open_group(
     except AwsError as error:
         if error.code != 'InvalidPermission.Duplicate':
             raise
+    else:
+        if sources:
+            account.doors[attempt] = (group, rule('tcp', SSH, sources))
 
 
 def find_groups(account: Account, region: str, attempt: str) -> list[Mapping[str, Any]]:
@@ -198,6 +201,16 @@ def allow(
 
     :raises ProviderError: the machine has no group (any more).
     """
+    door = account.doors.pop(attempt, None)
+    if door is not None and not sources and port == SSH:
+        # the first change of what this process has made: nothing has to be asked
+        try:
+            account.call('ec2', region, 'revoke_security_group_ingress', f'closing port {port}',
+                         GroupId=door[0], IpPermissions=[door[1]])
+            return
+        except AwsError as error:
+            if error.code != 'InvalidPermission.NotFound':
+                raise  # somebody else has changed it meanwhile
     groups = find_groups(account, region, attempt)
     if not groups:
         raise ProviderError(f'the machine in {region} has no security group any more',

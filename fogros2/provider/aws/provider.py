@@ -279,13 +279,14 @@ class AWSProvider(Provider):
                     f"{instances.reason_of(instance) or 'EC2 does not say why'}",
                     'the EC2 console has its system log')
             ready = found.state is MachineState.RUNNING and found.shell is not None
+            self._account.disks[machine.instance] = instances.own_disks(instance)
             return dataclasses.replace(
                 found, id=machine_id, note=self._notes.get(machine.instance, ''),
             ) if ready else None
 
         # it takes EC2 some ten seconds: few questions, but a fast one is seen soon
         return wait_until(
-            look, timeout=timeout, cancel=cancel, first=0.3, interval=1.0, longest=4.0,
+            look, timeout=timeout, cancel=cancel, first=0.5, interval=1.5, longest=5.0,
             what=f"'{name}' ({machine.instance}) to run")
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
