@@ -64,7 +64,7 @@ def test_the_demo(launch, engine):
 
 
 def test_three_hosts_hear_each_other(launch, cloud_network):
-    run = launch('fogros2_examples', 'two_clouds.launch.py', f'name:=speaker-{RUN}',
+    run = launch('fogros2_examples', 'two_clouds.launch.xml', f'name:=speaker-{RUN}',
                  f'second_name:=hearer-{RUN}', f'network:={cloud_network}')
     said = f'I heard: [Hello World from speaker-{RUN} '
     run.wait_for(f'[listener]: {said}')
@@ -75,9 +75,14 @@ def test_three_hosts_hear_each_other(launch, cloud_network):
     assert run.errors == [], run.text
 
 
-@pytest.mark.parametrize('name', ['talker.container.launch.py', 'two_clouds.launch.py'])
-def test_the_machine_is_chosen_at_launch_time(launch, name):
-    run = launch('fogros2_examples', name, 'machine:=local', 'count:=2')
+@pytest.mark.parametrize('words', [
+    ('talker.container.launch.py', 'machine:=local'),
+    ('two_clouds.launch.py', 'machine:=local'),
+    ('talker.aws.launch.py', '--machine', '*=robot'),
+    ('two_clouds.launch.yaml', '--machine', 'speaker=robot', '--machine', 'hear*=robot'),
+])
+def test_the_machine_is_chosen_at_launch_time(launch, words):
+    run = launch('fogros2_examples', words[0], 'count:=2', *words[1:])
     assert run.ended() == 0, run.text
     assert run.text.count('I heard: [Hello World') >= 2
     assert '[fogros2]' not in run.text, 'a machine was made'
@@ -87,7 +92,8 @@ def test_the_machine_is_chosen_at_launch_time(launch, name):
 @pytest.mark.parametrize('option', ['-s', '-p'])
 @pytest.mark.parametrize('name', [
     'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.container.launch.py',
-    'talker.kube.launch.py', 'talker.ssh.launch.py', 'two_clouds.launch.py'])
+    'talker.container.launch.xml', 'talker.kube.launch.py', 'talker.ssh.launch.py',
+    'two_clouds.launch.py', 'video.container.launch.yaml'])
 def test_looking_at_a_launch_file_makes_nothing(name, option, state_home):
     shown = ros2('launch', str(example(name)), option, timeout=20)
     assert shown.returncode == 0, shown.stdout + shown.stderr
