@@ -35,6 +35,8 @@ NOTE, FOLDERS = 0.05, 10
 #: 'fogt' begins the names of tests of single parts, which tidy up by themselves.
 _SINGLE = 'fogt'
 _INTERFACE = re.compile(r'\bfog([0-9a-f]{6})(?:m\d+)?\b')
+#: Root folders of containers, by their ids.
+_roots: dict[str, str] = {}
 _ROOT = re.compile(r'/fogros2/([A-Za-z0-9_-]+)')
 
 
@@ -172,6 +174,7 @@ def _named(kind: str, line: str) -> Trace:
 class _Container:
     """A container, of a launch if it has the label that every launch gives its machines."""
 
+    identity: str
     name: str
     launch: str
     token: str
@@ -188,7 +191,11 @@ class _Container:
         """Return whether it is a computer among a test's own files, such as an SSH machine."""
         if _SINGLE not in self.name:
             return False
-        root = ''.join(_output('podman', 'inspect', '--format', '{{.Rootfs}}', self.name)).strip()
+        # each question to the engine takes a tenth of a second, and the answer doesn't change
+        if not _roots.get(self.identity):
+            _roots[self.identity] = ''.join(_output(
+                'podman', 'inspect', '--format', '{{.Rootfs}}', self.identity)).strip()
+        root = _roots[self.identity]
         return bool(root) and Path(root).is_relative_to(files)
 
 
@@ -200,7 +207,7 @@ def _containers() -> dict[str, _Container]:
     for line in _output('podman', 'ps', '-a', '--no-trunc', '--format', '\t'.join(columns)):
         identity, *about = line.split('\t')
         if len(about) == 3 and 'fog' in about[0]:
-            found[identity] = _Container(*about)
+            found[identity] = _Container(identity, *about)
     return found
 
 
