@@ -5,7 +5,8 @@ How long a launch on a rented machine takes from ``ros2 launch`` to the first me
 Against EC2 in a box (``fogros2.testing.ec2``), whose instances boot as slowly as they are told.
 *Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
 without the installation of ROS 2 on an image that has none. The instances are this computer's own
-containers: where many boot at once they share its cores, as EC2's wouldn't.
+containers: where many boot at once they share its cores, as EC2's wouldn't. The robot's CPU is
+that of its launch and of what that runs.
 
     python benchmarks/startup.py [--provider aws|kubernetes] [--runs 3]
 
@@ -87,8 +88,8 @@ class Robot:
         installed = float(found[1]) if found and 'installed' in found[2] else 0.0
         return total, newest.ready - newest.asked, installed, len(self.box.calls())
 
-    def machines(self, number: int) -> float:
-        """Return the seconds until the nodes of ``number`` machines run."""
+    def machines(self, number: int) -> tuple[float, float]:
+        """Return the seconds until the nodes of ``number`` machines run, and the launch's CPU."""
         path = self.home / 'many.launch.py'
         path.write_text(LAUNCH.format(number=number))
         with launching() as launch:
@@ -96,10 +97,17 @@ class Robot:
             run = launch(str(path), environment=self.environment, prefix=self.box.on_robot([]))
             run.wait_for('process started with pid', times=number, timeout=300.0)
             total = time.perf_counter() - begin
+            spent = cpu(run.child.pid)
             run.interrupt()
             if run.ended(120.0) != 0:
                 raise SystemExit(f'the launch failed:\n{run.text}')
-        return total
+        return total, spent
+
+
+def cpu(pid: int) -> float:
+    """Return the CPU seconds of a process and of those that it has waited for."""
+    words = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return sum(map(int, words[11:15])) / os.sysconf('SC_CLK_TCK')
 
 
 @contextlib.contextmanager
@@ -161,13 +169,16 @@ def several(runs: int) -> Iterator[Row]:
         here.machines(1)
         for delay in DELAYS:
             here.box.set_boot_delay(delay)
-            one = statistics.median(here.machines(1) for _ in range(runs))
-            many = statistics.median(here.machines(MANY) for _ in range(runs))
+            one, spent = map(statistics.median, zip(*(here.machines(1) for _ in range(runs))))
+            many, spent_by_many = map(
+                statistics.median, zip(*(here.machines(MANY) for _ in range(runs))))
             what = f'{MANY} instances, boot delay {delay:g} s'
             yield Row(f'1 instance, boot delay {delay:g} s', one, 's', runs=runs)
             yield Row(what, many, 's', runs=runs)
             yield Row(what, many / one, 'times one', 1.5, runs=runs,
                       published='one after another')
+            yield Row(f"{what}: the robot's CPU", spent_by_many, 's', runs=runs)
+            yield Row(f"{what}: the robot's CPU", spent_by_many / spent, 'times one', runs=runs)
 
 
 def main() -> None:
