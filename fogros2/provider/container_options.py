@@ -23,7 +23,7 @@ from fogros2.provider.container_machine import (
     LOGIN,
     MACHINE,
 )
-from fogros2.provider.options import convert, known
+from fogros2.provider.options import parsed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +65,7 @@ class Options:
 
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        options_given = known(given, fields, 'a container machine')
-        options = cls(**{
-            name: convert(name, value, {} if name == 'env' else fields[name].default)
-            for name, value in options_given.items()})
+        options = parsed(cls, given, 'a container machine')
         _check_values(options)
         return options
 

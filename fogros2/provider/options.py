@@ -3,11 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import dataclasses
 import difflib
-from typing import Any
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    Options = TypeVar('Options', bound=DataclassInstance)
 
 
 def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str, Any]:
@@ -26,6 +32,26 @@ def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str
                 f"{what} has no option '{name}'",
                 f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(names)}")
     return {name: value for name, value in given.items() if value is not None}
+
+
+def parsed(
+    kind: type[Options], given: Mapping[str, Any], what: str,
+    value: Callable[[str, Any, Any], Any] | None = None,
+) -> Options:
+    """
+    Return the options of a spec: what isn't given has its default.
+
+    :param kind: a dataclass, each field with a default.
+    :param what: whose options they are, such as 'a container machine'.
+    :param value: returns an option's value by its name, what was given, and its default;
+        ``convert`` unless there are some that it can't do.
+    :raises ConfigurationError: one is unknown (with the nearest name) or of another kind.
+    """
+    defaults = {field.name: {} if field.default is dataclasses.MISSING else field.default
+                for field in dataclasses.fields(kind)}
+    value = value or convert
+    return kind(**{name: value(name, word, defaults[name])
+                   for name, word in known(given, defaults, what).items()})
 
 
 def convert(name: str, value: Any, default: Any) -> Any:

@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl, urlencode
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError, Unsupported
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider
-from fogros2.provider.options import convert, known
+from fogros2.provider.options import parsed
 
 _SCHEME = 'ssh:'
 #: Seconds after which a computer that doesn't answer counts as off.
@@ -47,10 +47,7 @@ class Options:
 
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
-        fields = {field.name: field.default for field in dataclasses.fields(cls)}
-        options = cls(**{
-            name: str(convert(name, value, fields[name]))
-            for name, value in known(given, fields, 'an SSH machine').items()})
+        options = parsed(cls, given, 'an SSH machine')
         if any(c.isspace() or c in '/@' for c in options.host) \
                 or options.host.startswith('-') or not _is_name(options.host):
             raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",

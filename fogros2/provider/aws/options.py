@@ -12,7 +12,7 @@ from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError
 from fogros2.model import MachineSpec
-from fogros2.provider.options import convert, known
+from fogros2.provider.options import convert, parsed
 
 #: What a machine is unless something else is asked for.
 DEFAULT_TYPE = 't3.medium'
@@ -82,10 +82,7 @@ class Options:
 
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        options = cls(**{
-            name: _value(name, value, fields[name].default)
-            for name, value in known(given, fields, 'a machine at AWS').items()})
+        options = parsed(cls, given, 'a machine at AWS', _value)
         _check(options)
         return dataclasses.replace(options, arch=_ARCHES[options.arch])
 
@@ -111,8 +108,6 @@ def check_spec(spec: MachineSpec) -> Options:
 
 
 def _value(name: str, value: Any, default: Any) -> Any:
-    if name == 'tags':
-        return convert(name, value, {})
     if name == 'max_price':
         return Decimal(repr(convert(name, _number(value), 0.0)))
     if name == 'ssh_from' and isinstance(value, str):

@@ -9,7 +9,7 @@ import re
 from typing import Any
 
 from fogros2.errors import ConfigurationError
-from fogros2.provider.options import convert, known
+from fogros2.provider.options import convert, parsed
 
 IMAGE = 'docker.io/library/ros:jazzy-ros-base'
 #: How the robot's VPN gets to a pod, in the order in which 'auto' tries them.
@@ -71,10 +71,7 @@ class Options:
 
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        options = cls(**{
-            name: _converted(name, value, fields[name].default)
-            for name, value in known(given, fields, 'a Kubernetes machine').items()})
+        options = parsed(cls, given, 'a Kubernetes machine', _converted)
         _check_values(options)
         return options
 
@@ -82,7 +79,7 @@ class Options:
 def _converted(name: str, value: Any, default: Any) -> Any:
     if name == 'tolerations':
         return _tolerations(value)
-    return convert(name, value, {} if default is dataclasses.MISSING else default)
+    return convert(name, value, default)
 
 
 def _tolerations(value: Any) -> tuple[Mapping[str, Any], ...]:
