@@ -17,6 +17,11 @@ from fogros2 import CloudNode, ContainerInstance, SSHInstance
 SECOND = 'second_'
 
 
+def argument(name: str, value: str, description: str) -> DeclareLaunchArgument:
+    """Return a launch argument with a default."""
+    return DeclareLaunchArgument(name, default_value=value, description=description)
+
+
 def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchArgument]:
     """
     Return the launch arguments that say where the machines are.
@@ -25,9 +30,6 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
     :param name: what the machine is called unless said.
     :param second: the same of a second one; '' where there is none.
     """
-    def argument(name: str, value: str, description: str) -> DeclareLaunchArgument:
-        return DeclareLaunchArgument(name, default_value=value, description=description)
-
     found = [
         DeclareLaunchArgument(
             'machine', default_value=machine, choices=['container', 'ssh', 'local'],

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A talker in a pod of the cluster that the kubeconfig names; a listener here."""
 
-from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.actions import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from fogros2 import CloudNode, FogROSLaunchDescription, KubeInstance
+from fogros2_examples.choice import argument
 
 
 def generate_launch_description():
     """Describe the pair; ``count:=20`` ends it after 20 messages."""
-    def argument(name, value, description):
-        return DeclareLaunchArgument(name, default_value=value, description=description)
-
     pod = KubeInstance(
         name=LaunchConfiguration('name'), on_exit=LaunchConfiguration('on_exit'),
         container_image=LaunchConfiguration('image'), user=LaunchConfiguration('user'),
