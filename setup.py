@@ -41,7 +41,7 @@ AWS = ['boto3', 'requests']
 #: What serves topics to a viewer in the browser, on the machine.
 MONITOR = ['foxglove-sdk>=0.30']
 #: What nodes that handle images need; a robot that streams none doesn't.
-VIDEO = ['av>=15', 'numpy', 'opencv-python-headless']
+VIDEO = ['av>=17', 'numpy', 'opencv-python-headless']
 
 setup(
     name='fogros2',

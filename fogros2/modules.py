@@ -51,8 +51,8 @@ class Module:
 
 MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('numpy', ('numpy',)),
-    # 14 makes nothing of depth images of a few pixels, and 11 knows no colour range
-    Module('av', ('av',), (15,)),
+    # 16 takes the colours of bgr8 for another range, 14 spoils depth images of a few pixels
+    Module('av', ('av',), (17,)),
     Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
                    'opencv-contrib-python')),
     Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),

@@ -314,7 +314,7 @@ def test_what_the_robot_lacks_for_streams_is_said_before_anything(
     monkeypatch.setattr(importlib.util, 'find_spec', lambda name, *rest: (
         None if name == 'av' else find(name, *rest)))
     assert run(LaunchDescription([talker(planner, stream_topics=[('/camera', 'h264')])])) == 1
-    assert "pip install 'av>=15'" in capfd.readouterr().out
+    assert "pip install 'av>=17'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 
