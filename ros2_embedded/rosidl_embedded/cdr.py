@@ -76,15 +76,17 @@ def _read_string(buffer: Any, place: int) -> tuple[str, int]:
 
 
 def _write_wide(buffer: bytearray, value: str) -> None:
-    text = value.encode('utf-16-le')
-    _COUNT.write(buffer, len(text) // 2)
-    buffer += text
+    units = array.array('H', value.encode('utf-16-le'))
+    _COUNT.write(buffer, len(units))
+    buffer += array.array('I', units)  # rmw_cyclonedds spends 4 bytes on each
 
 
 def _read_wide(buffer: Any, place: int) -> tuple[str, int]:
     count, place = _COUNT.read(buffer, place)
-    end = _end(buffer, place, 2 * count)
-    return str(buffer[place:end], 'utf-16-le', 'replace'), end
+    end = _end(buffer, place, 4 * count)
+    wide = array.array('I', bytes(buffer[place:end]))
+    units = array.array('H', [unit & 0xffff for unit in wide])
+    return str(units.tobytes(), 'utf-16-le', 'replace'), end
 
 
 _SINGLE = {'string': Codec(_write_string, _read_string), 'wstring': Codec(_write_wide, _read_wide),

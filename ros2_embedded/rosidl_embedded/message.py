@@ -20,6 +20,7 @@ from typing import Any
 from rosidl_embedded.definition import Definition, definition, Field, FLOATS, INTEGERS, TYPECODES
 
 CHECK_FIELDS = os.environ.get('ROS_PYTHON_CHECK_FIELDS', '1') == '1'
+IDL_NAMES = {'bool': 'boolean', 'byte': 'octet', 'float32': 'float', 'float64': 'double'}
 _LIMITS = {'float32': ('float', 3.402823466e+38), 'float64': ('double', 1.7976931348623157e+308)}
 
 
@@ -262,7 +263,7 @@ def _equal(self: Any, other: Any) -> bool:
 def type_text(field: Field) -> str:
     """Write a field's type as ``get_fields_and_field_types()`` gives it."""
     base = field.base.replace('/msg/', '/').replace('/srv/', '/')
-    text = {'byte': 'octet', 'float32': 'float', 'float64': 'double'}.get(base, base)
+    text = IDL_NAMES.get(base, base)
     if field.text:
         text += f'<{field.text}>'
     if field.kind == 'sequence':

@@ -3,10 +3,12 @@
 
 import array
 from collections import OrderedDict
+from collections.abc import Callable
 import sys
 from typing import Any
 
 from rosidl_embedded.definition import Field
+from rosidl_embedded.message import IDL_NAMES
 
 
 def _is_many(value: Any) -> bool:
@@ -14,7 +16,7 @@ def _is_many(value: Any) -> bool:
 
 
 def _abbreviated(value: Any, field: Field) -> str:
-    base = {'byte': 'octet', 'float32': 'float', 'float64': 'double'}.get(field.base, field.base)
+    base = IDL_NAMES.get(field.base, field.base)
     if field.kind == 'array':
         return f'<array type: {base}[{field.size}]>'
     bound = f'[{field.size}]' if field.size else ''
@@ -48,50 +50,41 @@ def message_to_yaml(msg: Any, *, truncate_length: int | None = None, no_arr: boo
 def message_to_csv(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
                    no_str: bool = False) -> str:
     """Write all a message holds, separated by commas; see :func:`message_to_yaml`."""
-    def text(value: Any, field: Field | None) -> str:
-        if _is_many(value):
-            if no_arr and field is not None:
-                return _abbreviated(value, field)
-            items = [text(item, None) for item in value[:truncate_length]]
-            if truncate_length is not None and len(value) > truncate_length:
-                items.append('...')
-            return ','.join(items)
-        if hasattr(value, '_definition'):
-            return message_to_csv(
-                value, truncate_length=truncate_length, no_arr=no_arr, no_str=no_str)
-        if no_str and isinstance(value, str):
-            return f'<string length: <{len(value)}>>'
-        if isinstance(value, (str, bytes)) and truncate_length is not None \
-                and len(value) > truncate_length:
-            dots: Any = '...' if isinstance(value, str) else b'...'
-            value = value[:truncate_length] + dots
-        return str(value)
+    def flat(value: Any) -> str:
+        if isinstance(value, dict):
+            value = list(value.values())
+        if not isinstance(value, list):
+            return str(value)
+        return ','.join(map(flat, value)).lstrip(',')  # as ROS 2: none before the first text
 
-    return ','.join(text(getattr(msg, field.name), field) for field in msg._definition.fields)
+    return flat(_convert(msg, None, str, truncate_length, no_arr, no_str))
 
 
 def message_to_ordereddict(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
                            no_str: bool = False) -> 'OrderedDict[str, Any]':
     """Convert a message to a dictionary; see :func:`message_to_yaml`."""
-    def convert(value: Any, field: Field | None) -> Any:
-        if isinstance(value, (bytes, str)):
-            text = value if isinstance(value, str) else ''.join(map(chr, value))
-            if no_str and isinstance(value, str):
-                return f'<string length: <{len(text)}>>'
-            if truncate_length is not None and len(text) > truncate_length:
-                return text[:truncate_length] + '...'
-            return text
-        if _is_many(value):
-            if no_arr and field is not None:
-                return _abbreviated(value, field)
-            items = [convert(item, None) for item in value[:truncate_length]]
-            if truncate_length is not None and len(value) > truncate_length:
-                items.append('...')
-            return items
-        if hasattr(value, '_definition'):
-            return message_to_ordereddict(
-                value, truncate_length=truncate_length, no_arr=no_arr, no_str=no_str)
-        return value.item() if hasattr(value, 'item') else value
+    converted: OrderedDict[str, Any] = _convert(
+        msg, None, lambda octets: ''.join(map(chr, octets)), truncate_length, no_arr, no_str)
+    return converted
 
-    return OrderedDict((field.name, convert(getattr(msg, field.name), field))
-                       for field in msg._definition.fields)
+
+def _convert(value: Any, field: Field | None, octets: Callable[[bytes], str], *how: Any) -> Any:
+    truncate_length, no_arr, no_str = how
+    if hasattr(value, '_definition'):
+        return OrderedDict((one.name, _convert(getattr(value, one.name), one, octets, *how))
+                           for one in value._definition.fields)
+    if isinstance(value, (bytes, str)):
+        if no_str and isinstance(value, str):
+            return f'<string length: <{len(value)}>>'
+        text = value if isinstance(value, str) else octets(value)
+        if truncate_length is not None and len(value) > truncate_length:
+            return text[:truncate_length] + '...'
+        return text
+    if _is_many(value):
+        if no_arr and field is not None:
+            return _abbreviated(value, field)
+        items = [_convert(item, None, octets, *how) for item in value[:truncate_length]]
+        if truncate_length is not None and len(value) > truncate_length:
+            items.append('...')
+        return items
+    return value.item() if hasattr(value, 'item') else value

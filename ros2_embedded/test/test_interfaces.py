@@ -7,6 +7,7 @@ import pickle
 import random
 
 from builtin_interfaces.msg import Time
+from example_interfaces.msg import WString
 from example_interfaces.srv import AddTwoInts
 from geometry_msgs.msg import Polygon, PoseStamped, Quaternion
 import numpy
@@ -141,6 +142,7 @@ def test_field_types():
     assert Header.get_fields_and_field_types()['stamp'] == 'builtin_interfaces/Time'
     assert ParameterDescriptor.get_fields_and_field_types()['integer_range'] == \
         'sequence<rcl_interfaces/IntegerRange, 1>'
+    assert Bool.get_fields_and_field_types() == {'data': 'boolean'}
     assert '_data' in String.__slots__
 
 
@@ -193,6 +195,14 @@ def test_alignment_after_strings_and_sequences():
         assert deserialize_message(serialize_message(message), type(message)) == message
 
 
+def test_wide_strings():
+    for text, written in (('', '00000000'), ('a', '0100000061000000'),
+                          ('€𝄞', '03000000ac20000034d800001edd0000')):
+        data = serialize_message(WString(data=text))
+        assert data.hex() == '00010000' + written and \
+            deserialize_message(data, WString).data == text
+
+
 def test_damaged_bytes_are_an_error_not_a_crash():
     numbers = random.Random(7)
     whole = serialize_message(PointCloud2(header=Header(frame_id='map'), data=[1] * 20))
@@ -210,6 +220,8 @@ def test_yaml_csv_and_dictionaries():
     header = Header(stamp=Time(sec=1, nanosec=2), frame_id='map')
     assert message_to_yaml(header) == 'stamp:\n  sec: 1\n  nanosec: 2\nframe_id: map\n'
     assert message_to_csv(header) == '1,2,map'
+    assert message_to_csv(ParameterValue(bool_array_value=[True])) == \
+        '0,False,0,0.0,,,True,,,'
     assert list(message_to_ordereddict(header)) == ['stamp', 'frame_id']
     numbers = UInt8MultiArray(data=range(9))
     assert message_to_ordereddict(numbers, truncate_length=2)['data'] == [0, 1, '...']
