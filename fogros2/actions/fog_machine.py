@@ -25,13 +25,13 @@ class FogMachine(Action):
         runs what is meant for the machine here.
     :param given: keywords of that provider's class. Where the provider is a substitution, those
         that it doesn't have may be empty texts.
-    :param containers: ``docker run`` command lines executed there before its nodes start.
+    :param containers: keywords of ``add_docker_container``, each for one container there.
     :raises ConfigurationError: what is plain is wrong.
     """
 
     def __init__(
         self, provider: SomeSubstitutionsType, given: Mapping[str, Any],
-        containers: Sequence[SomeSubstitutionsType] = (), **kwargs: Any,
+        containers: Sequence[Mapping[str, Any]] = (), **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         self._provider = provider
@@ -40,25 +40,22 @@ class FogMachine(Action):
         #: The machine, None while its provider isn't known.
         self.machine: Optional[CloudInstance] = None
         if isinstance(provider, str):
-            self.machine = self._make(provider, self._given)
+            self.machine = keywords.make(provider, self._given)
 
     def execute(self, context: LaunchContext) -> None:
         """Execute the action: from now on the machine's name stands for it."""
         if self.machine is None:
             provider = words.resolve(context, self._provider)
             known = keywords.keywords(keywords.machine_class(provider))
-            self.machine = self._make(provider, {
+            self.machine = keywords.make(provider, {
                 name: value for name, value in self._given.items()
                 if name in known or not self._is_empty(context, value)})
+        for container in self._containers:
+            self.machine.add_docker_container(**{
+                name: words.resolve(context, value) for name, value in container.items()})
         # its name may be a substitution, and is to be found resolved
         self.machine.spec(context)
         Coordinator.of(context).know(self.machine)
-
-    def _make(self, provider: str, given: Mapping[str, Any]) -> CloudInstance:
-        machine = keywords.make(provider, given)
-        for line in self._containers:
-            machine.add_docker_container(line)
-        return machine
 
     @staticmethod
     def _is_empty(context: LaunchContext, value: Any) -> bool:

@@ -8,7 +8,7 @@ without a line of its own here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import difflib
@@ -83,23 +83,42 @@ def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
         if '__init__' not in vars(base) or not issubclass(base, CloudInstance):
             continue
         constructor = vars(base)['__init__']
-        parameters = inspect.signature(constructor).parameters
-        for name, hint in get_type_hints(constructor, localns=_NAMES).items():
-            if name not in _NOT_MEANT and name not in found:
-                needed = parameters[name].default is inspect.Parameter.empty
-                found[name] = Keyword(name, *_kind(hint), needed=needed)
+        for name, keyword in parameters_of(constructor).items():
+            found.setdefault(name, keyword)
     return found
+
+
+def parameters_of(function: Callable[..., Any]) -> dict[str, Keyword]:
+    """
+    Return what a function or a constructor takes, by name.
+
+    :raises ConfigurationError: an annotation names what isn't there to tell.
+    """
+    try:
+        hints = get_type_hints(function, localns=_NAMES)
+    except NameError as error:
+        raise ConfigurationError(
+            f"{function.__qualname__} can't be called from a text: {error}",
+            'import what its annotations name, not for type checkers alone') from error
+    parameters = inspect.signature(function).parameters
+    return {
+        name: Keyword(name, *_kind(hint),
+                      needed=parameters[name].default is inspect.Parameter.empty)
+        for name, hint in hints.items() if name not in _NOT_MEANT}
 
 
 def _kind(hint: Any) -> tuple[Kind, Mapping[str, Kind]]:
     scalars: set[Any] = set()
-    for option in _options(hint):
+    options = list(_options(hint))
+    for option in options:
         if get_origin(option) in (None, Literal):
             scalars.add(option)
             continue
         item = get_args(option)[-1]
         if issubclass(get_origin(option), Mapping):
             return 'mapping', {}
+        if str in options:
+            continue  # one text, or its parts
         if isinstance(item, type) and issubclass(item, dict):
             return 'table', {name: _kind(one)[0] for name, one in get_type_hints(item).items()}
         return 'list', {}

@@ -3,22 +3,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 import io
 from pathlib import Path
 import re
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import OpaqueFunction, SetLaunchConfiguration
 from launch.frontend import Parser
 import pytest
 
-from fogros2 import AWSCloudInstance, ContainerInstance, KubeInstance, SSHInstance, StreamTopic
-from fogros2.actions import keywords
+from fogros2 import (
+    AWSCloudInstance,
+    CloudInstance,
+    ContainerInstance,
+    KubeInstance,
+    SSHInstance,
+    StreamTopic,
+)
+from fogros2.actions import keywords, words
 from fogros2.actions.coordinator import Coordinator
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.h264 import H264
 from fogros2.testing.plugins import instead
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.actions.machines import Truth, Value
 
 CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'kubernetes': KubeInstance,
            'ssh': SSHInstance}
@@ -181,7 +195,7 @@ launch:
         name='planner', memory='2g', ros_workspace='').spec(LaunchContext())
 
 
-@pytest.mark.parametrize('text, words', [
+@pytest.mark.parametrize('text, expected', [
     ('<fog_machine name="p" provider="awz"/>',
      ["no provider is called 'awz'", "did you mean 'aws'", 'container']),
     ('<fog_machine name="p"/>', ['needs a provider', 'aws, container, kubernetes, robot, ssh']),
@@ -201,7 +215,12 @@ launch:
     ('<fog_machine name="p" provider="aws" on_exit="kepe"/>', ['on_exit', "did you mean 'keep'"]),
     ('<fog_machine name="p" provider="aws" lifetime="1y"/>', ['lifetime', 'no duration']),
     ('<fog_machine name="p" provider="aws" regions="[a"/>', ['regions:', 'no list']),
-    ('<fog_machine name="p" provider="aws"><docker_container/></fog_machine>', ['needs a cmd']),
+    ('<fog_machine name="p" provider="aws"><docker_container/></fog_machine>',
+     ['a cmd, or an image']),
+    ('<fog_machine name="p" provider="aws"><docker_container imag="a"/></fog_machine>',
+     ["docker_container has no 'imag'", "did you mean 'image'"]),
+    ('<fog_machine name="p" provider="aws"><docker_container cmd="docker run a" name="b"/>'
+     '</fog_machine>', ['a cmd, or an image']),
     ('<fog_machine name="p" provider="kubernetes"><tolerations kye="a"/></fog_machine>',
      ["tolerations has no 'kye'", "did you mean 'key'"]),
     ('launch: [{fog_machine: {name: p, provider: aws, spot: 3}}]', ["spot can't be 3",
@@ -220,14 +239,15 @@ launch:
     ('<stream_topic transport="h264"/>', ['needs a topic']),
     ('<stream_topic topic="/a" bitrate="3"/>', ["stream_topic has no 'bitrate'"]),
     ('<stream_topic topic="/a"><param name="bitrate"/></stream_topic>', ['a name', 'value']),
+    ('<stream_topic topic="/a"><param name="topic" value="/b"/></stream_topic>', ['a name']),
     ('<fogros_launch robot_nodes="never"/>', ["robot_nodes='never' is unknown"]),
     ('<fogros_launch robot_node="x"/>', ["did you mean 'robot_nodes'"]),
     ('<cloud_group machine="p"><stream_topic topic="/a" if="true"/></cloud_group>',
      ['/a', 'condition']),
 ])
-def test_what_is_wrong_is_refused_with_a_word_on_what_is_right(text, words):
+def test_what_is_wrong_is_refused_with_a_word_on_what_is_right(text, expected):
     said = refused(text)
-    for word in words:
+    for word in expected:
         assert word in said, said
 
 
@@ -357,12 +377,50 @@ def test_a_machine_that_nobody_described_is_refused(run, fake):
     assert fake.noted('prepare') == []
 
 
-def test_docker_containers_of_a_machine():
-    found = machine(xml("""
+def test_docker_containers_of_a_machine(run, fake):
+    there = []
+    description = xml("""
+      <arg name="image" default="redis"/>
       <fog_machine name="planner" provider="container" ros_workspace="">
         <docker_container cmd="docker run --rm $(var image)"/>
-      </fog_machine>"""), image='redis')
-    assert found.containers == ('docker run --rm redis',)
+        <docker_container image="$(var image)" name="db" ports="1:2, 3:4" command="serve --fast">
+          <environment name="A" value="b $(var image)"/>
+        </docker_container>
+      </fog_machine>""")
+    description.add_action(OpaqueFunction(function=lambda context: there.append(
+        Coordinator.of(context)._by_name('planner').spec(context))))
+    assert run(description) == 0
+    assert there[0].containers == (
+        'docker run --rm redis',
+        "docker run -p 1:2 -p 3:4 -e 'A=b redis' --name db redis serve --fast")
+
+
+# -- machines of others --------------------------------------------------------------------------
+
+class Mine(CloudInstance):
+    provider = 'mine'
+
+    def __init__(self, size: Value, *, fast: Optional[Truth] = None,
+                 places: Optional[Sequence[SomeSubstitutionsType]] = None, **common: Any) -> None:
+        super().__init__(options={
+            'size': size, 'fast': fast, 'places': words.items(places)}, **common)
+
+
+class Unclear(Mine):
+    provider = 'unclear'
+
+    def __init__(self, size: NobodyKnows, **common: Any) -> None:  # noqa: F821
+        super().__init__(size, **common)
+
+
+def test_a_provider_of_another_package_has_its_keywords_as_attributes(monkeypatch):
+    instead(monkeypatch, 'fogros2.machine', {'mine': Mine, 'unclear': Unclear})
+    found = machine(xml('<fog_machine name="p" provider="mine" size="3" fast="true" places="a,b" '
+                        'ros_workspace=""/>'))
+    assert (found.provider, found.options) == (
+        'mine', {'size': 3, 'fast': True, 'places': ['a', 'b']})
+    assert 'needs size' in refused('<fog_machine name="p" provider="mine"/>')
+    assert 'NobodyKnows' in refused('<fog_machine name="p" provider="unclear" size="3"/>')
 
 
 # -- the documentation ---------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from launch import Action
 from launch.actions import GroupAction
 from launch_ros.actions import Node
 
-from fogros2.actions import keywords
+from fogros2.actions import keywords, words
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.cloud_node import CloudNode
 from fogros2.actions.fog_machine import FogMachine
@@ -22,6 +22,7 @@ from fogros2.actions.frontend.entity import (
     text,
     value,
 )
+from fogros2.containers import described
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.streams import StreamTopic
 
@@ -37,6 +38,7 @@ _NODE = (
     'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args', 'shell', 'sigkill_timeout',
     'sigterm_timeout')
 _GROUP = ('forwarding', 'keep', 'scoped')
+_STREAM = ('topic', 'transport', 'direction', 'source')
 
 
 def fog_machine(entity: Entity, parser: Parser) -> Parsed:
@@ -53,13 +55,7 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         known = {name: keyword for each in keywords.providers() if _loads(each)
                  for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
-    containers = []
-    for child in children(entity, 'docker_container'):
-        command = attribute(child, parser, 'cmd')
-        complete(child, ('cmd',))
-        if not command:
-            raise ConfigurationError('a docker_container needs a cmd', 'docker run ...')
-        containers.append(command)
+    containers = [_container(child, parser) for child in children(entity, 'docker_container')]
     what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
     complete(entity, (*known, 'provider', 'docker_container', *CONDITIONS), what)
     if given['name'] is None:
@@ -67,6 +63,19 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
     kwargs.update(provider=provider, containers=containers, given={
         name: content for name, content in given.items() if content is not None})
     return FogMachine, kwargs
+
+
+def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
+    """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and the rest by name."""
+    known = {'cmd': keywords.Keyword('cmd', 'text'), **keywords.parameters_of(described)}
+    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+    complete(entity, known)
+    found = {name: words.items(content) if known[name].kind == 'list' else content
+             for name, content in given.items() if content is not None}
+    if ('cmd' in found) == ('image' in found) or ('cmd' in found and len(found) > 1):
+        raise ConfigurationError('a docker_container takes a cmd, or an image and what it needs',
+                                 'cmd="docker run --net=host IMAGE", or image="IMAGE"')
+    return found
 
 
 def _loads(provider: str) -> bool:
@@ -116,13 +125,13 @@ def stream_topic(entity: Entity, parser: Parser) -> Parsed:
         name = attribute(child, parser, 'name')
         content = value(child, parser, keywords.Keyword('value', 'scalar'))
         complete(child, ('name', 'value'))
-        if not name or not isinstance(name, str) or content is None:
+        if not name or not isinstance(name, str) or content is None or name in _STREAM:
             raise ConfigurationError('a param of a stream_topic takes a name, written out, and a '
                                      'value', '<param name="bitrate" value="2000000"/>')
         parameters[name] = content
     said: dict[str, Any] = {
-        name: attribute(entity, parser, name) for name in ('transport', 'direction', 'source')}
-    complete(entity, ('topic', 'param', *said, *CONDITIONS))
+        name: attribute(entity, parser, name) for name in _STREAM if name != 'topic'}
+    complete(entity, ('param', *_STREAM, *CONDITIONS))
     kwargs['entry'] = StreamTopic(
         topic, **{name: content for name, content in said.items() if content is not None},
         **parameters)
