@@ -40,8 +40,9 @@ PORT_BASE = 7410
 PORTS_PER_DOMAIN = 250
 #: RTPS 2.5, 9.6.2.4.
 DISCOVERY_GROUP = '239.255.0.1'
-#: Seconds between a participant's announcements.
-ANNOUNCEMENT = 1
+#: Seconds between a participant's announcements, which go to each one that it knows: in all they
+#: grow with the square of the participants.
+ANNOUNCEMENT = 3
 #: Seconds a silent participant is kept: what a cut may last without being discovered anew.
 LEASE_DURATION = 60
 #: Bytes of receive buffer asked for; the kernel gives what its rmem_max allows.

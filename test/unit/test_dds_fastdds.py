@@ -88,7 +88,7 @@ def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
     assert root.find('data_writer', NS) is not None
     assert len(root.findall('participant', NS)) == 1
     assert root.findtext('.//leaseDuration/sec', '', NS) == '5'
-    assert root.findtext('.//leaseAnnouncement/sec', '', NS) == '1'
+    assert root.findtext('.//leaseAnnouncement/sec', '', NS) == '3'
 
 
 @pytest.mark.parametrize(('content', 'words'), [
