@@ -160,7 +160,12 @@ class Node(NodeParameters, NodeGraph):
             log = Log(level=int(severity), name=name, msg=message, file=file,
                       function=function, line=line)
             log.stamp.sec, log.stamp.nanosec = divmod(stamp, S_TO_NS)
-            target.publish(log)
+            try:
+                target.publish(log)
+            except RCLError:
+                if self_context.ok():
+                    raise
+                # a signal came in between: it went to the console, nobody is told any more
 
         self_context = self._context
         self._rosout = publish
