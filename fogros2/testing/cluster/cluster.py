@@ -17,7 +17,9 @@ from typing import Any, Optional
 from fogros2 import process
 from fogros2.model import Command, Result
 from fogros2.testing.cluster import certificates, images, node, services
+from fogros2.testing.cluster.client import Client
 from fogros2.testing.cluster.node_process import ask, ClusterError, run_node
+from fogros2.testing.cluster.pod_security import make_policies
 
 #: Users besides the administrator; none has a right until somebody gives it one.
 USERS = ('robot', 'limited')
@@ -139,7 +141,9 @@ def cluster(
     try:
         if started.await_line(120.0) is None:
             raise ClusterError('the node ended before it had begun')
-        yield Cluster(started.folder, layout, store)
+        running = Cluster(started.folder, layout, store)
+        make_policies(Client(running.kubeconfig))
+        yield running
     finally:
         started.stop()
 

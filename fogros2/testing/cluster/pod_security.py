@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pod Security's level "baseline" for a cluster that is older than it, as an admission webhook.
+What may keep a pod from having NET_ADMIN.
 
-Kubernetes 1.20 has no Pod Security admission; 1.25 and later have it in the API server. What is
-tested is how we take the refusal, and a webhook can give that in the words of the newer ones.
+Kubernetes 1.20 has PodSecurityPolicy in its API server: a namespace's service account may use the
+policy ``ALL``, or only one that allows no capability. From 1.25 on there is Pod Security admission
+instead; its level "baseline" is played here by an admission webhook, in the words of the newer
+ones, as how we take the refusal is what is tested.
 """
 
 from __future__ import annotations
@@ -21,12 +23,28 @@ from typing import Any
 
 from fogros2.testing.cluster.certificates import Authority
 from fogros2.testing.cluster.client import Client
-from fogros2.testing.cluster.cluster import Cluster
 
 #: What baseline lets a container add (Kubernetes: Pod Security Standards).
 ALLOWED = {'AUDIT_WRITE', 'CHOWN', 'DAC_OVERRIDE', 'FOWNER', 'FSETID', 'KILL', 'MKNOD',
            'NET_BIND_SERVICE', 'SETFCAP', 'SETGID', 'SETPCAP', 'SETUID', 'SYS_CHROOT'}
 LABEL = 'pod-security.kubernetes.io/enforce'
+#: Names of policies, and of cluster roles that let them be used.
+ALL, NO_CAPABILITIES = 'all', 'no-capabilities'
+
+
+def make_policies(client: Client) -> None:
+    """Make the policies, without which no pod would be admitted."""
+    anyone: dict[str, Any] = {'rule': 'RunAsAny'}
+    rules = {'volumes': ['*'], 'runAsUser': anyone, 'seLinux': anyone, 'fsGroup': anyone,
+             'supplementalGroups': anyone}
+    rights = '/apis/rbac.authorization.k8s.io/v1'
+    for name, more in ((ALL, {'privileged': True, 'allowedCapabilities': ['*']}),
+                       (NO_CAPABILITIES, {})):
+        client.create('/apis/policy/v1beta1/podsecuritypolicies',
+                      'policy/v1beta1 PodSecurityPolicy', name, spec={**rules, **more})
+        client.create(f'{rights}/clusterroles', 'rbac.authorization.k8s.io/v1 ClusterRole', name,
+                      rules=[{'apiGroups': ['policy'], 'resources': ['podsecuritypolicies'],
+                              'verbs': ['use'], 'resourceNames': [name]}])
 
 
 def verdict(pod: dict[str, Any]) -> str:
@@ -61,11 +79,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 
 @contextlib.contextmanager
-def pod_security(cluster: Cluster, client: Client) -> Iterator[None]:
-    """Enforce the level in namespaces that carry its label, for the time of the block."""
+def pod_security(host: str, client: Client) -> Iterator[None]:
+    """
+    Enforce the level in namespaces that carry its label, for the time of the block.
+
+    :param host: this computer's address, as the node sees it.
+    """
     authority = Authority('pod security')
-    pair = authority.issue('pod-security', [cluster.layout.host])
-    server = http.server.ThreadingHTTPServer((cluster.layout.host, 0), _Handler)
+    pair = authority.issue('pod-security', [host])
+    server = http.server.ThreadingHTTPServer((host, 0), _Handler)
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'pair.pem')
@@ -85,7 +107,7 @@ def pod_security(cluster: Cluster, client: Client) -> Iterator[None]:
                 'rules': [{'operations': ['CREATE'], 'apiGroups': [''], 'apiVersions': ['v1'],
                            'resources': ['pods']}],
                 'clientConfig': {
-                    'url': f'https://{cluster.layout.host}:{server.server_port}/',
+                    'url': f'https://{host}:{server.server_port}/',
                     'caBundle': base64.b64encode(authority.certificate).decode()}}])
         yield
     finally:

@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from fogros2 import kubernetes_api
-from fogros2.errors import NameTaken, PrerequisiteError, ProviderError, ShellError
+from fogros2.errors import NameTaken, ProviderError, ShellError
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.shell.kubernetes import KubernetesShell
@@ -130,49 +130,6 @@ def test_an_agent_s_word_ends_the_pod(place):
                    timeout=30.0, what='the pod to end')
     finally:
         provider.destroy(machine_id)
-
-
-@pytest.mark.parametrize('options, told, hint', [
-    ({'gpus': 1}, 'FailedScheduling: 0/1 nodes are available: 1 Insufficient nvidia.com/gpu',
-     'device plugin'),
-    ({'container_image': 'fogros2.test/nothing:here'}, 'ErrImagePull', ''),
-    ({'container_image': 'Fogros2.test/A B'}, "can't be", 'such as')])
-def test_what_can_not_run_is_told_with_the_event_s_text(place, monkeypatch, options, told, hint):
-    monkeypatch.setattr('fogros2.provider.kubernetes.start.PATIENCE', 3.0)
-    error = raised(RuntimeError, lambda: run('hopeless', **options))
-    assert told in str(error)
-    assert hint in error.hint
-    assert left(place, 'hopeless') == []
-
-
-def test_a_quota_that_is_used_up_is_told(place, client):
-    base = f'/api/v1/namespaces/{place.name}/resourcequotas'
-    client.create(base, 'v1 ResourceQuota', 'none', spec={'hard': {'pods': '0'}})
-    try:
-        wait_until(lambda: 'status' in client.ask('GET', f'{base}/none') and client.ask(
-            'GET', f'{base}/none')['status'].get('hard'), timeout=20.0, what='the quota')
-        error = raised(ProviderError, lambda: run('poor'))
-    finally:
-        client.ask('DELETE', f'{base}/none')
-    assert 'exceeded quota: none' in str(error)
-    assert 'quota' in error.hint
-    assert left(place, 'poor') == []
-
-
-@pytest.mark.parametrize('resource, verb', [
-    ('jobs', 'create'), ('jobs', 'delete'), ('pods/exec', 'create'), ('pods', 'watch')])
-def test_a_right_that_lacks_is_named_before_anything_is_made(
-        namespaces, monkeypatch, resource, verb):
-    def change(role):
-        rule, = (rule for rule in role['rules'] if rule['resources'] == [resource])
-        rule['verbs'] = [each for each in rule['verbs'] if each != verb]
-
-    place = namespaces(change)
-    monkeypatch.setenv('KUBECONFIG', str(place.kubeconfig))
-    error = raised(PrerequisiteError, lambda: run('forbidden'))
-    assert f'may not {verb} {resource}' in str(error)
-    assert 'role.yaml' in error.hint
-    assert place.left() == []
 
 
 @pytest.mark.parametrize('expose', ['node_port', 'pod_dials_robot', 'pod_ip'])

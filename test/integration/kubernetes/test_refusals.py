@@ -14,7 +14,7 @@ from fogros2.deploy import Launch
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
 from fogros2.testing.cluster import BARE
-from fogros2.testing.cluster.pod_security import LABEL, pod_security
+from fogros2.testing.cluster.pod_security import LABEL, NO_CAPABILITIES, pod_security
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -48,11 +48,13 @@ def refused(timeout: float, *machines: dict[str, object]) -> list[str]:
     return said
 
 
-def test_what_keeps_pods_from_running(namespace):
+def test_what_keeps_pods_from_running(namespace, monkeypatch):
+    # what time might mend is given less of it than usual
+    monkeypatch.setattr('fogros2.provider.kubernetes.start.PATIENCE', 4.0)
     gpu, labels, image = refused(
         40.0, {'gpus': 1}, {'node_selector': {'kind': 'moon'}},
         {'container_image': 'fogros2.test/nothing:1'})
-    assert 'Insufficient nvidia.com/gpu' in gpu, gpu
+    assert 'FailedScheduling: 0/1 nodes are available: 1 Insufficient nvidia.com/gpu' in gpu, gpu
     assert 'device plugin' in gpu, gpu
     assert 'node_selector=' in labels, labels
     assert 'fogros2.test/nothing:1' in image and 'Pull' in image, image
@@ -64,7 +66,7 @@ def test_the_quota_is_used_up(namespace):
         f'/api/v1/namespaces/{namespace.name}/resourcequotas', 'v1 ResourceQuota', 'small',
         spec={'hard': {'limits.memory': '100Mi'}})
     (said,) = refused(15.0, {'mb': 200})
-    assert 'exceeded quota' in said and 'mb=' in said, said
+    assert 'exceeded quota: small' in said and 'mb=' in said, said
     assert namespace.left() == []
 
 
@@ -86,10 +88,20 @@ def test_the_role_is_a_verb_short(namespaces, monkeypatch, group, resource, verb
     assert space.left() == []
 
 
-def test_net_admin_is_refused(kubernetes, client, namespaces, monkeypatch):
+def test_net_admin_is_refused_by_the_api_server_s_own_plugin(namespaces, monkeypatch):
+    space = namespaces(policy=NO_CAPABILITIES)
+    monkeypatch.setenv('KUBECONFIG', str(space.kubeconfig))
+    (said,) = refused(15.0, {})
+    assert 'PodSecurityPolicy' in said and 'NET_ADMIN' in said, said
+    assert 'whose allowedCapabilities has it' in said, said
+    assert space.left() == []
+
+
+def test_net_admin_is_refused_as_by_pod_security_admission(
+        kubernetes, client, namespaces, monkeypatch):
     space = namespaces(labels={LABEL: 'baseline'})
     monkeypatch.setenv('KUBECONFIG', str(space.kubeconfig))
-    with pod_security(kubernetes, client):
+    with pod_security(kubernetes.layout.host, client):
         (said,) = refused(15.0, {})
     assert 'violates PodSecurity "baseline:latest"' in said, said
     assert f'kubectl label namespace {space.name} {LABEL}=privileged' in said, said
