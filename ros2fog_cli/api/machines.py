@@ -7,14 +7,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 from decimal import Decimal
+import threading
 import time
 from typing import Any, Optional, Protocol, runtime_checkable
 
 from fogros2 import plugin_system
-from fogros2.errors import ConfigurationError, FogError, MachineNotFound, Unsupported
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    Unsupported,
+)
 from fogros2.model import Machine, MachineState
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import Record, robot_name, Store
+from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
 
@@ -184,9 +192,10 @@ def survey(
         records = {key: value for key, value in records.items() if key == name}
     tags = {} if name is None else {TAG_NAME: name}
     providers = plugin_system.names('fogros2.provider')
-    with ThreadPoolExecutor(max(1, len(providers)), 'fog-list') as pool:
-        answers = list(pool.map(
-            lambda provider: _ask(provider, tags, regions, records.values(), warn), providers))
+    with interruptible() as cancel, \
+            ThreadPoolExecutor(max(1, len(providers)), 'fog-list') as pool:
+        answers = list(pool.map(lambda provider: _ask(
+            provider, tags, regions, records.values(), warn, cancel), providers))
     entries: list[Entry] = []
     matched: set[str] = set()
     for machines in answers:
@@ -228,17 +237,20 @@ def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Reco
 
 def _ask(
     name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
-    records: Iterable[Record], warn: Warn,
+    records: Iterable[Record], warn: Warn, cancel: threading.Event,
 ) -> Optional[list[Machine]]:
     """Return a provider's machines, None if it can't be asked."""
     try:
         if not any(record.provider == name for record in records) and not wanted(name, regions):
             return []
         provider = load(name, regions)
+        provider.cancel = cancel
         try:
             return list(provider.find(tags))
         except Unsupported:
             return _described(provider, [r for r in records if r.provider == name])
+    except Cancelled:
+        return None  # by a Ctrl-C, which ends everything
     except FogError as error:
         warn(f'{name}: {error}')
         return None

@@ -37,15 +37,18 @@ class PriceVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; the first row is what a launch would take."""
         from fogros2.provider.aws import choices
+        from fogros2.provider.aws.clients import usual
         from fogros2.provider.aws.prices import Market
         from ros2fog_cli.api import table
+        from ros2fog_cli.api.interrupts import interruptible
         asked = choices.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
             max_price=args.max_price, spot=args.spot)
-        regions = choices.regions_named(args.region)
-        choice = choices.choose(regions, asked, Market(refresh=args.refresh),
-                                spot_too=True)
+        with interruptible() as cancel:
+            regions = choices.regions_named(args.region, usual().until(cancel))
+            choice = choices.choose(
+                regions, asked, Market(refresh=args.refresh, cancel=cancel), spot_too=True)
         for region, reason in choice.left_out:
             warn(f'{region}: {reason}')
         shown = choice.offers[:args.limit or None]

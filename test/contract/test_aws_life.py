@@ -568,6 +568,15 @@ def test_the_end_of_a_launch_gets_through_choices_and_looks(aws):
     assert left() == NOTHING
 
 
+def test_who_gives_up_looking_for_machines_waits_for_no_region(aws):
+    aws.refuse('DescribeInstances', *THROTTLED)
+    aws.provider.cancel = cancelled_in(0.3)
+    begin = time.monotonic()
+    with pytest.raises(Cancelled):
+        list(aws.provider.find({}))
+    assert time.monotonic() - begin < 3.0
+
+
 def test_an_instance_that_is_being_made_when_the_launch_ends_is_known(aws):
     """Its request was on its way; an answer that comes soon is the better one."""
     spec, request = ask()

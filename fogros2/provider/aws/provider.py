@@ -291,8 +291,10 @@ class AWSProvider(Provider):
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the instances that carry all of ``tags``, of all regions at once."""
+        account = self._rising()
+
         def ask(region: str) -> list[Machine]:
-            found = instances.instances_in(self._account.pages(
+            found = instances.instances_in(account.pages(
                 'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
                 Filters=[*instances.tag_filters(tags),
                          {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]))
@@ -421,8 +423,8 @@ class AWSProvider(Provider):
         named = self._named_regions()
         if named and 'all' not in named:
             return named
-        found = self._account.call('ec2', self._base_region(), 'describe_regions',
-                                   'asking for the regions of the account')['Regions']
+        found = self._rising().call('ec2', self._base_region(), 'describe_regions',
+                                    'asking for the regions of the account')['Regions']
         return sorted(str(entry['RegionName']) for entry in found)
 
     def _in_regions(self, ask: Callable[[str], T]) -> Iterable[T]:

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C while several threads ask: each has to hear of it, or the first to come waits for all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import signal
+import threading
+from types import FrameType
+from typing import Optional
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """Yield an event that a Ctrl-C in the block sets, just before it is raised as ever."""
+    event = threading.Event()
+
+    def interrupted(number: int, frame: Optional[FrameType]) -> None:
+        event.set()
+        signal.default_int_handler(number, frame)
+
+    if threading.current_thread() is not threading.main_thread() \
+            or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield event
+        return
+    signal.signal(signal.SIGINT, interrupted)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
