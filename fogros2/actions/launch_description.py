@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 
 #: What only sets something for what comes after it.
 _SETTINGS = (
-    AppendEnvironmentVariable, DeclareLaunchArgument, LogInfo, SetEnvironmentVariable,
-    SetLaunchConfiguration, UnsetEnvironmentVariable, UnsetLaunchConfiguration,
+    AppendEnvironmentVariable, DeclareLaunchArgument, FogMachine, LogInfo,
+    SetEnvironmentVariable, SetLaunchConfiguration, UnsetEnvironmentVariable,
+    UnsetLaunchConfiguration,
 )
 
 

@@ -16,6 +16,7 @@ from launch.actions import (
     TimerAction,
 )
 from launch.event_handlers import OnProcessExit, OnProcessStart
+from launch.launch_description_sources import AnyLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 import pytest
@@ -202,6 +203,7 @@ def test_nodes_run_here_and_nothing_is_made(run, fake, capfd, program, wrapped, 
     assert 'here: ' in said and '__node:=first' in said and '__node:=second' in said
     assert said.count(' []') == 2, 'DDS was told of a VPN that there is not'
     assert fake.notes == []
+    assert fake.report is None, 'a VPN was to be had'
     assert ended == [0]
 
 
@@ -255,11 +257,11 @@ def test_an_included_file_is_looked_through(run, fake, tmp_path, program, capfd)
     path.write_text("""<launch>
         <fog_machine name="planner" provider="aws" region="nearest"/>
         <cloud_node machine="planner" pkg="demo" exec="talker" output="screen"/></launch>""")
-    from launch.launch_description_sources import AnyLaunchDescriptionSource
     outer = LaunchDescription([IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path)))])
     assert run(elsewhere(outer, 'planner=robot')) == 0
     assert 'here: ' in capfd.readouterr().out
     assert fake.notes == []
+    assert fake.report is None, 'a VPN was to be had'
 
 
 def test_a_machine_may_be_the_robot_in_the_file_itself(run, fake, tmp_path, program, capfd):
@@ -271,11 +273,27 @@ launch:
 - fogros_launch:
   - cloud_node: {machine: planner, pkg: demo, exec: talker, output: screen}
 """)
-    from launch.launch_description_sources import AnyLaunchDescriptionSource
     assert run(LaunchDescription(
         [IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path)))])) == 0
     assert 'here: ' in capfd.readouterr().out
     assert fake.notes == []
+    assert fake.report is None, 'a VPN was to be had'
+
+
+def test_a_launch_file_is_run_once(run, fake, tmp_path, program):
+    path = tmp_path / 'outer.launch.py'
+    path.write_text(f"""
+from launch import LaunchDescription
+from fogros2 import CloudNode, ContainerInstance
+
+def generate_launch_description():
+    open({str(tmp_path / 'times')!r}, 'a').write('once')
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    return LaunchDescription([CloudNode(machine=machine, package='demo', executable='talker')])
+""")
+    assert run(elsewhere(LaunchDescription([IncludeLaunchDescription(
+        AnyLaunchDescriptionSource(str(path)))]), 'planner=robot')) == 0
+    assert (tmp_path / 'times').read_text() == 'once'
 
 
 def test_what_is_described_tells_launch_what_is_in_it():
