@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 import contextlib
 import dataclasses
 import threading
@@ -57,6 +57,15 @@ class Job:
         #: Set when the launch's is, or when a step failed: those beside it needn't go on.
         self.cancel = Either(launch.cancel)
 
+    @contextlib.contextmanager
+    def failing(self) -> Iterator[None]:
+        """End what runs beside the block if that fails."""
+        try:
+            yield
+        except BaseException:
+            self.cancel.set()
+            raise
+
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
         return step(self.launch.report, self.name, name)
@@ -89,9 +98,11 @@ class Job:
                 hint = f'the next launch may take the machine, or: ros2 fog delete {self.name}'
             else:
                 ends, hint = 'ends all of that and leaves', 'nothing needs to be done'
+            # one whose agent was about to start may have none
+            agent = 'its agent' if self.ask is not None else 'its agent, if it has one by now,'
             raise ConnectError(
                 f"'{self.name}' does not answer, so what it has of this launch stays there "
-                f"({', '.join(dict.fromkeys(self._left))}): its agent {ends} by itself, "
+                f"({', '.join(dict.fromkeys(self._left))}): {agent} {ends} by itself, "
                 f'{self.spec.robot_timeout:g} s after it last heard of the launch', hint)
 
         if self._left:
