@@ -8,7 +8,7 @@ import dataclasses
 import fnmatch
 from typing import Any, Optional, TYPE_CHECKING
 
-from launch import Action, LaunchContext, LaunchDescriptionEntity
+from launch import Action, LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
 from fogros2.actions import keywords
@@ -129,9 +129,19 @@ class OverrideMachines(Action):
         from fogros2.actions.coordinator import Coordinator
         coordinator = Coordinator.of(context)
         machines: list[SomeMachine] = []
+        _load(self._entities, context)
         whole = _look_through(self._entities, machines)
         coordinator.override(self._overrides, machines, whole=whole)
         return wrap(self._entities, _mention)
+
+
+def _load(entities: Iterable[LaunchDescriptionEntity], context: LaunchContext) -> None:
+    """Load the launch file now, for good: a look through an include loads it for that alone."""
+    for entity in entities:
+        if isinstance(entity, LaunchDescription):
+            _load(entity.entities, context)
+        elif isinstance(entity, IncludeLaunchDescription):
+            entity.launch_description_source.get_launch_description(context)
 
 
 def _look_through(
