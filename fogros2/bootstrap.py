@@ -9,7 +9,7 @@ returns is carried out in this order: ``tools``, the wheels into ``wheels_target
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import functools
@@ -138,6 +138,7 @@ def dependencies(spec: MachineSpec, under: Underlay) -> str:
 def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None, wheel_folder: Optional[Path] = None,
+    on_plan: Callable[[RosInstall], object] = lambda install: None,
 ) -> tuple[RosInstall, str]:
     """
     Make a machine ready for ROS 2 nodes, by what it has and by ``spec.bootstrap``.
@@ -145,6 +146,8 @@ def ensure(
     :param under: the environment of the robot's launch.
     :param timeout: seconds that each command may take.
     :param wheel_folder: the robot's wheel cache, if not the usual one.
+    :param on_plan: is told how things will run there as soon as files can be sent and the VPN set
+        up, which needs nothing of what takes longest.
     :returns: how things run there, and a few words on what was done.
     :raises PrerequisiteError: the machine can't be made ready.
     :raises WorkspaceError: the workspace can't go there, built or not.
@@ -167,6 +170,7 @@ def ensure(
         todo = plan(spec, facts, robot, under, wheels, workspace)
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
+    on_plan(todo.install)
     if todo.send_wheels:
         shell.run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'),
                   timeout=timeout, cancel=cancel)

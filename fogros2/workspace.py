@@ -187,6 +187,7 @@ def transfer(
     cancel: Optional[threading.Event] = None,
     on_progress: Optional[Callable[[int, int], None]] = None,
     on_output: Optional[Callable[[str], None]] = None,
+    before_build: Callable[[], object] = lambda: None,
 ) -> str:
     """
     Take a workspace to a machine, the same path there, and build it where it has to be.
@@ -194,6 +195,7 @@ def transfer(
     :param path: the workspace, as ``destination.workspace`` was planned for.
     :param on_progress: gets bytes sent and bytes in all.
     :param on_output: gets each line that the build prints.
+    :param before_build: returns when there is what it is built with.
     :returns: a few words on what was done.
     """
     way = destination.workspace
@@ -209,6 +211,8 @@ def transfer(
     report = shell.sync(
         way.source, way.target, includes=way.includes, excludes=way.excludes,
         timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
+    if way.commands:
+        before_build()
     for command in way.commands:
         shell.run(command, timeout=timeouts.build, cancel=cancel, on_output=on_output)
     sent = f'{report.files} files, {_size(report.bytes)}'

@@ -3,14 +3,21 @@
 
 from __future__ import annotations
 
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    FIRST_EXCEPTION,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from fogros2 import bootstrap, workspace
 from fogros2.agent_client import AgentClient
-from fogros2.deploy import routing
+from fogros2.deploy import beside, routing
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.equipping import Equipment
@@ -44,21 +51,28 @@ class Deployment:
         with job.undo:
             job.undo.enter_context(job.folder.lock())
             # the robot's side needs nothing of the machine's: it comes up meanwhile
-            with ThreadPoolExecutor(5, f'fog-{job.name}') as pool:
+            with ThreadPoolExecutor(6, f'fog-{job.name}') as pool:
                 robot = pool.submit(self.launch.robot_vpn().ensure)
                 machine = self.creation.run()
                 shell = self.entrance.connect(machine)
                 interface = self.joining.interface()
                 agent = self.guard.arm(machine, shell)
-                ros = self.prepare_host(shell)
-                interface = self.joining.fit(interface, ros.facts.routes)
                 robot.result()
+                planned: Future[bootstrap.RosInstall] = Future()
+                installing = pool.submit(self.prepare_host, shell, planned.set_result)
+                wait([planned, installing], return_when=FIRST_COMPLETED)
+                ros = planned.result() if planned.done() else installing.result()
+                # while it is installed there
+                with job.failing():
+                    interface = self.joining.fit(interface, ros.facts.routes)
                 joining = pool.submit(self.joining.join, machine, shell, agent, interface)
-                syncing = pool.submit(self.sync, shell, ros)
+                syncing = pool.submit(self.sync, shell, ros, installing)
                 configuring = pool.submit(self.configure_dds, shell, interface)
                 equipment = Equipment(job, shell, ros)
-                equipping = pool.submit(self.equip, equipment)
-                self._all_of(joining, syncing, configuring, equipping)
+                equipping = pool.submit(_after, installing, self.equip, equipment)
+                containers = pool.submit(_after, installing, beside.start, job, shell)
+                self._all_of(
+                    installing, joining, syncing, configuring, equipping, containers)
                 public_key = joining.result().place.peer.public_key
                 dds = configuring.result()
             with job.step('agent') as detail:
@@ -85,13 +99,15 @@ class Deployment:
 
     # -- step 4: ROS on the machine -------------------------------------------------------------
 
-    def prepare_host(self, shell: Shell) -> bootstrap.RosInstall:
+    def prepare_host(
+        self, shell: Shell, on_plan: Callable[[bootstrap.RosInstall], object],
+    ) -> bootstrap.RosInstall:
         """Make the machine ready for ROS 2 nodes; see :func:`fogros2.bootstrap.ensure`."""
         job = self.job
         with job.step('ROS 2') as detail:
             ros, note = bootstrap.ensure(
                 shell, self.launch.underlay(job.spec.workspace), job.spec,
-                timeout=job.timeouts.install, cancel=job.cancel)
+                timeout=job.timeouts.install, cancel=job.cancel, on_plan=on_plan)
             detail.append(note)
             return ros
 
@@ -101,15 +117,17 @@ class Deployment:
 
     # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
 
-    def sync(self, shell: Shell, ros: bootstrap.RosInstall) -> None:
-        """Send the workspace, and build it there where it has to be."""
+    def sync(
+        self, shell: Shell, ros: bootstrap.RosInstall, installed: Future[bootstrap.RosInstall],
+    ) -> None:
+        """Send the workspace, and build it where it has to be, with what is installed by then."""
         job = self.job
         if job.spec.workspace is None:
             return
         with job.step('workspace') as detail:
             note = workspace.transfer(
                 shell, Path(job.spec.workspace), ros, timeouts=job.timeouts,
-                cancel=job.cancel,
+                cancel=job.cancel, before_build=installed.result,
                 on_progress=lambda done, total: self.launch.report(
                     Progress(job.name, 'workspace', done, total)))
             detail.append(note)
@@ -138,3 +156,9 @@ class Deployment:
                 f"'{name}' is one machine too many: the robot's router knows {routing.MACHINES}",
                 'spread them over several launches, or use another RMW_IMPLEMENTATION')
         agent.request('start', nodes=[json.loads(to_json(routing.node(router, name)))])
+
+
+def _after(ready: Future[bootstrap.RosInstall], do: Callable[..., None], *words: Any) -> None:
+    """Do something when ROS is there; raises what kept it from getting there."""
+    ready.result()
+    do(*words)

@@ -36,6 +36,7 @@ from fogros2.errors import (
     FogError,
     HostKeyError,
     NameTaken,
+    PrerequisiteError,
     ProviderError,
     StoreError,
     VpnError,
@@ -194,6 +195,34 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
         launch.up(SPEC)
     assert time.monotonic() - begin < 20
     assert not launch.cancel.is_set(), 'other machines of the launch go on'
+
+
+def test_the_workspace_travels_and_the_vpn_comes_up_while_ros_is_installed(
+        launch, provider, monkeypatch):
+    travelling, joining = threading.Event(), threading.Event()
+    equipped = []
+
+    def prepare_host(self, shell, on_plan):
+        on_plan(RosInstall('ros', ()))
+        assert travelling.wait(10) and joining.wait(10)
+        assert not equipped
+        raise PrerequisiteError('no such package')
+
+    def sync(self, shell, ros, installed):
+        travelling.set()
+        installed.result()
+
+    for part, name, value in [
+            (Creation, 'run', None), (Entrance, 'connect', None), (Joining, 'interface', None),
+            (Joining, 'fit', None), (Guard, 'arm', None), (Deployment, 'configure_dds', {})]:
+        monkeypatch.setattr(part, name, lambda self, *_, value=value: value)
+    monkeypatch.setattr(Joining, 'join', lambda self, *arguments: joining.set())
+    monkeypatch.setattr(Deployment, 'prepare_host', prepare_host)
+    monkeypatch.setattr(Deployment, 'sync', sync)
+    monkeypatch.setattr(Deployment, 'equip', lambda self, equipment: equipped.append(equipment))
+    with pytest.raises(PrerequisiteError, match='no such package'):
+        launch.up(SPEC)
+    assert not equipped
 
 
 class BusyAgent(FakeStream):
