@@ -329,14 +329,15 @@ def test_a_connection_that_falls_silent_is_given_up(make):
     mute = ScriptedStream(lambda request: [
         {'id': request['id'], 'ok': True, 'next': 1}] if request['command'] == 'log' else [])
     second = agent()
-    client = make(mute, second, silence=0.2)
+    # a busy computer may take a while over a thread's turn
+    client = make(mute, second, silence=0.8)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
     until(lambda: len(seen) == 2)
     assert 'ping' in [request['command'] for request in mute.asked]
     assert [e['state'] for e in seen] == ['lost', 'back']
     # one that answers is kept
-    until(lambda: sum(request['command'] == 'ping' for request in second.asked) > 6)
+    until(lambda: sum(request['command'] == 'ping' for request in second.asked) > 4)
     assert len(seen) == 2
 
 
