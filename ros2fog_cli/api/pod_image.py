@@ -15,7 +15,7 @@ from fogros2.model import MachineSpec
 from fogros2.provider.kubernetes import image
 
 #: What a pod takes besides, where the node has no module for the VPN.
-PACKAGES = (*bootstrap.APT_PACKAGES, 'wireguard-go', 'nftables')
+PACKAGES = ('wireguard-go', 'nftables')
 
 
 def recipe(
@@ -41,7 +41,8 @@ def recipe(
     spec = MachineSpec('image', 'kubernetes', workspace=root or None)
     more = {'base': base} if base else {}
     return image.recipe(
-        registry, dependencies=bootstrap.dependencies(spec, under), packages=PACKAGES,
+        registry, dependencies=bootstrap.dependencies(spec, under),
+        packages=(*bootstrap.apt_packages(under.rmw), *PACKAGES),
         keys=workspace.dependencies(root) if root else (),
         distro=under.environment.get('ROS_DISTRO') or host.DISTRO, **more)
 
