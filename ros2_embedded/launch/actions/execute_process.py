@@ -25,6 +25,11 @@ class ExecuteProcess(ExecuteLocal):
     Before it executes, ``name``, ``cmd``, ``cwd`` and ``env`` are substitutions; then texts.
     """
 
+    _texts = {'cwd': 'cwd?', 'name': 'name?', 'prefix': 'launch-prefix?', 'output': 'output?',
+              'respawn': 'respawn?'}
+    _typed = {'respawn_delay': float, 'sigkill_timeout': float, 'sigterm_timeout': float,
+              'respawn_max_retries': int, 'shell': bool, 'emulate_tty': bool}
+
     def __init__(
         self, *, cmd: Iterable[SomeSubstitutionsType],
         prefix: SomeSubstitutionsType | None = None, name: SomeSubstitutionsType | None = None,
@@ -73,34 +78,22 @@ class ExecuteProcess(ExecuteLocal):
         """
         _, kwargs = super().parse(entity, parser)
         ignored = ignore or ()
+        kwargs = {name: value for name, value in kwargs.items() if name not in ignored}
         if 'cmd' not in ignored:
             kwargs['cmd'] = cls._parse_cmdline(entity.get_attr('cmd'), parser)
-        for name, kind in (
-            ('cwd', None), ('name', None), ('prefix', None), ('output', None), ('respawn', None),
-            ('on_exit', str), ('respawn_delay', float), ('sigkill_timeout', float),
-            ('sigterm_timeout', float), ('respawn_max_retries', int), ('shell', bool),
-            ('emulate_tty', bool)
-        ):
-            value = None if name in ignored else entity.get_attr(
-                'launch-prefix' if name == 'prefix' else name, data_type=kind or str,
-                optional=True)
-            if value is None:
-                continue
-            if kind is None:
-                value = parser.parse_substitution(value)
-            elif name == 'on_exit':
-                if value != 'shutdown':
-                    raise ValueError(
-                        'Attribute on_exit of Entity node expected to be shutdown but got '
-                        f'`{value}`Other on_exit actions not yet supported')
-                value = [Shutdown()]
-            elif kind is float:
-                if value < 0.0:
-                    raise ValueError(
-                        f'Attribute {name} of Entity node expected to be a non-negative value '
-                        f'but got `{value}`')
-                value = value if name == 'respawn_delay' else str(value)
-            kwargs[name] = value
+        for name in {'respawn_delay', 'sigkill_timeout', 'sigterm_timeout'} & kwargs.keys():
+            if kwargs[name] < 0.0:
+                raise ValueError(
+                    f'Attribute {name} of Entity node expected to be a non-negative value '
+                    f'but got `{kwargs[name]}`')
+            if name != 'respawn_delay':
+                kwargs[name] = str(kwargs[name])
+        on_exit = None if 'on_exit' in ignored else entity.get_attr('on_exit', optional=True)
+        if on_exit not in (None, 'shutdown'):
+            raise ValueError('Attribute on_exit of Entity node expected to be shutdown but got '
+                             f'`{on_exit}`Other on_exit actions not yet supported')
+        if on_exit is not None:
+            kwargs['on_exit'] = [Shutdown()]
         if 'additional_env' not in ignored:
             kwargs['additional_env'] = parse_pairs(entity, parser, 'env')
         return cls, kwargs

@@ -99,7 +99,7 @@ class LaunchConfig:
 
     def get_screen_handler(self) -> Any:
         if self.screen_handler is None:
-            self.screen_handler = handlers.StreamHandler(_Screen())
+            self.screen_handler = handlers.StreamHandler(sys.stdout)
             self.screen_handler.setFormatter(_formatter('SCREEN'))
         return self.screen_handler
 
@@ -113,20 +113,6 @@ class LaunchConfig:
             handler.setFormatter(_formatter('LOG'))
             self.file_handlers[file_name] = handler
         return self.file_handlers[file_name]
-
-
-class _Screen:
-    """Standard output, with replacements for what its encoding lacks."""
-
-    def __init__(self) -> None:
-        self.__stream = sys.stdout
-
-    def write(self, text: str) -> None:
-        encoding = getattr(self.__stream, 'encoding', None) or 'utf-8'
-        self.__stream.write(text.encode(encoding, 'replace').decode(encoding))
-
-    def flush(self) -> None:
-        self.__stream.flush()
 
 
 launch_config = LaunchConfig()

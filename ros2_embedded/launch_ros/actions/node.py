@@ -42,8 +42,8 @@ class Node(ExecuteProcess):
     :param arguments: what goes to the executable itself.
     """
 
-    _texts = {'executable': 'exec', 'package': 'pkg?', 'name': 'name?', 'exec_name': 'exec_name?',
-              'namespace': 'namespace?'}
+    _texts = {**ExecuteProcess._texts, 'executable': 'exec', 'package': 'pkg?',
+              'exec_name': 'exec_name?', 'namespace': 'namespace?'}
     UNSPECIFIED_NODE_NAME = '<node_name_unspecified>'
     UNSPECIFIED_NODE_NAMESPACE = '<node_namespace_unspecified>'
 
@@ -132,7 +132,7 @@ class Node(ExecuteProcess):
     def parse(
         cls, entity: Entity, parser: Parser, ignore: list[str] | None = None
     ) -> ParsedAction:
-        _, kwargs = super().parse(entity, parser, ignore=['cmd', 'name', *(ignore or ())])
+        _, kwargs = super().parse(entity, parser, ignore=['cmd', *(ignore or ())])
         for name, attribute in (('arguments', 'args'), ('ros_arguments', 'ros_args')):
             text = entity.get_attr(attribute, optional=True)
             if text is not None:

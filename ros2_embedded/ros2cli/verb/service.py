@@ -6,32 +6,13 @@ import time
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
-from ros2cli.node.strategy import add_arguments, NodeStrategy
-from ros2cli.verb import VerbExtension
+from ros2cli.verb import topic, VerbExtension
 
 
-class ListVerb(VerbExtension):
+class ListVerb(topic.ListVerb):
     """Output a list of available services."""
 
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        add_arguments(parser)
-        parser.add_argument('-t', '--show-types', action='store_true',
-                            help='Additionally show the service type')
-        parser.add_argument('-c', '--count-services', action='store_true',
-                            help='Only display the number of services discovered')
-        parser.add_argument('--include-hidden-services', action='store_true',
-                            help='Consider hidden services as well')
-
-    def main(self, *, args: Any) -> Any:
-        from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
-        with NodeStrategy(args) as node:
-            services = [(name, types) for name, types in node.get_service_names_and_types()
-                        if args.include_hidden_services or not topic_or_service_is_hidden(name)]
-        if args.count_services:
-            print(len(services))
-            return
-        for name, types in services:
-            print(f"{name} [{', '.join(types)}]" if args.show_types else name)
+    WHAT = 'service'
 
 
 class CallVerb(VerbExtension):

@@ -31,15 +31,6 @@ def message_class(name: str, error: str = 'The passed message type is invalid') 
         raise RuntimeError(error) from None
 
 
-def get_topic_names_and_types(
-    node: Any, include_hidden_topics: bool = False
-) -> list[tuple[str, list[str]]]:
-    """List topics with their types; hidden ones if asked for."""
-    from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
-    return [(name, types) for name, types in node.get_topic_names_and_types()
-            if include_hidden_topics or not topic_or_service_is_hidden(name)]
-
-
 def get_msg_class(node: Any, topic: str, blocking: bool = False) -> Any:
     """
     Find the class of a topic's messages.
@@ -107,35 +98,43 @@ def qos_from_arguments(args: Any) -> Any:
 class ListVerb(VerbExtension):
     """Output a list of available topics."""
 
+    WHAT = 'topic'
+
     def add_arguments(self, parser: Any, cli_name: str) -> None:
         add_arguments(parser)
+        what = self.WHAT
         parser.add_argument('-t', '--show-types', action='store_true',
-                            help='Additionally show the topic type')
-        parser.add_argument('-c', '--count-topics', action='store_true',
-                            help='Only display the number of topics discovered')
-        parser.add_argument('--include-hidden-topics', action='store_true',
-                            help='Consider hidden topics as well')
-        parser.add_argument('-v', '--verbose', action='store_true',
-                            help='List full details about each topic')
+                            help=f'Additionally show the {what} type')
+        parser.add_argument('-c', f'--count-{what}s', action='store_true', dest='count',
+                            help=f'Only display the number of {what}s discovered')
+        parser.add_argument(f'--include-hidden-{what}s', action='store_true', dest='hidden',
+                            help=f'Consider hidden {what}s as well')
+        if what == 'topic':
+            parser.add_argument('-v', '--verbose', action='store_true',
+                                help='List full details about each topic')
 
     def main(self, *, args: Any) -> Any:
+        from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
         with NodeStrategy(args) as node:
-            topics = get_topic_names_and_types(node, args.include_hidden_topics)
-            counts = [('Published', 'publisher', node.count_publishers),
-                      ('Subscribed', 'subscriber', node.count_subscribers)]
-            if args.count_topics:
-                print(len(topics))
-            elif args.verbose and topics:
-                for title, what, count_of in counts:
-                    print(f'{title} topics:')
-                    for name, types in topics:
-                        if count := count_of(name):
-                            what_s = what + 's' * (count > 1)
-                            print(f" * {name} [{', '.join(types)}] {count} {what_s}")
-                    print()
+            pairs = getattr(node, f'get_{self.WHAT}_names_and_types')()
+            pairs = [(name, types) for name, types in pairs
+                     if args.hidden or not topic_or_service_is_hidden(name)]
+            if args.count:
+                print(len(pairs))
+            elif pairs and getattr(args, 'verbose', False):
+                self._print_counts('Published', 'publisher', node.count_publishers, pairs)
+                self._print_counts('Subscribed', 'subscriber', node.count_subscribers, pairs)
             else:
-                for name, types in topics:
+                for name, types in pairs:
                     print(f"{name} [{', '.join(types)}]" if args.show_types else name)
+
+    @staticmethod
+    def _print_counts(title: str, one: str, count_of: Any, pairs: Any) -> None:
+        print(f'{title} topics:')
+        for name, types in pairs:
+            if count := count_of(name):
+                print(f" * {name} [{', '.join(types)}] {count} {one}{'s' * (count > 1)}")
+        print()
 
 
 class InfoVerb(VerbExtension):
