@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import os
 from pathlib import Path
@@ -97,6 +98,43 @@ class Robot:
         self.settled()
         return total
 
+    def bare(self, number: int) -> float:
+        """
+        Return the seconds that the cluster itself takes for as many pods: what can't be undercut.
+
+        Jobs with a Service each, as for machines, of the same image; nothing of ours runs in them.
+        """
+        client, base = self._space.client, f'/api/v1/namespaces/{self._space.name}'
+        jobs = f'/apis/batch/v1/namespaces/{self._space.name}/jobs'
+        begin = time.perf_counter()
+
+        def make(each: int) -> None:
+            name = f'bare-{each}'
+            client.create(jobs, 'batch/v1 Job', name, spec={
+                'backoffLimit': 0, 'template': {'metadata': {'labels': {'bare': name}}, 'spec': {
+                    'restartPolicy': 'Never', 'automountServiceAccountToken': False,
+                    'enableServiceLinks': False, 'terminationGracePeriodSeconds': 0,
+                    'containers': [{'name': 'machine', 'image': READY,
+                                    'command': ['sleep', '600']}]}}})
+            client.create(f'{base}/services', 'v1 Service', name, spec={
+                'type': 'NodePort', 'selector': {'bare': name},
+                'ports': [{'port': 51820, 'protocol': 'UDP'}]})
+
+        def running() -> bool:
+            found = self._space.all('pods')
+            return sum('running' in status['state'] for pod in found
+                       for status in pod['status'].get('containerStatuses', ())) == number
+
+        with ThreadPoolExecutor(number) as pool:
+            list(pool.map(make, range(number)))
+        wait_until(running, timeout=300.0, interval=0.1, longest=0.1, what='the bare pods to run')
+        total = time.perf_counter() - begin
+        for each in range(number):
+            client.ask('DELETE', f'{jobs}/bare-{each}', propagationPolicy='Background')
+            client.ask('DELETE', f'{base}/services/bare-{each}')
+        self.settled()
+        return total
+
     def delete(self, name: str) -> None:
         """Delete a machine that was kept."""
         done = ros2('fog', 'delete', '--yes', name, environment=self.environment)
@@ -135,6 +173,10 @@ def rows(here: Robot, runs: int) -> Iterator[Row]:
     yield Row('1 pod: until it is heard', one, 's', runs=runs)
     yield Row(f'{MANY} pods: until all are heard', many, 's', runs=runs)
     yield Row(f'{MANY} pods', many / one, 'times one', 4.0, runs=runs)
+    floor = statistics.median(here.bare(MANY) for _ in range(runs))
+    yield Row(f'{MANY} bare pods, with nothing of FogROS2: until they run', floor, 's', runs=runs)
+    yield Row(f'{MANY} pods, without what the cluster takes for bare ones', (many - floor) / MANY,
+              's each', runs=runs)
 
 
 @contextlib.contextmanager
