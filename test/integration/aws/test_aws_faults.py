@@ -31,8 +31,8 @@ def test_a_launch_gets_round_what_passes(robot, box, name):
     """No room in the first zones, throttling, and an answer to what was done that gets lost."""
     box.fail('InsufficientInstanceCapacity', action='RunInstances', times=2)
     box.fail('InternalError', action='RunInstances', after=True)
-    box.fail('RequestLimitExceeded', action='CreateSecurityGroup')
-    box.fail('RequestLimitExceeded', action='DescribeInstances')
+    # late: boto3 goes slowly for a while after it
+    box.fail('RequestLimitExceeded', action='DeleteKeyPair')
     before = {found.id for found in box.instances()}
     run = robot.launch(*TALKER, f'name:={name}', 'count:=1')
     assert run.ended() == 0, run.text
@@ -80,7 +80,7 @@ from launch_ros.actions import Node
 
 
 def generate_launch_description():
-    machine = AWSCloudInstance(name={name!r}, robot_timeout=8, **{options!r})
+    machine = AWSCloudInstance(name={name!r}, robot_timeout=6, **{options!r})
     words = {{'package': 'fogros2_examples', 'output': 'screen'}}
     return FogROSLaunchDescription([
         CloudNode(machine=machine, executable='talker', **words),
@@ -94,13 +94,14 @@ import sys
 from fogros2.deploy import Launch
 from fogros2.model import MachineSpec
 from fogros2.waiting import Timeouts
-Launch(timeouts=Timeouts(boot=6.0, ssh=4.0)).up(MachineSpec(sys.argv[1], 'aws'))
+Launch(timeouts=Timeouts(boot=2.0, ssh=2.0)).up(MachineSpec(sys.argv[1], 'aws'))
 '''
 
 UBUNTU = 'ID=ubuntu\nVERSION_ID="24.04"\nVERSION_CODENAME=noble\nUBUNTU_CODENAME=noble\n'
 SLEEPS = '#!/bin/sh\necho "$0 $*" >>/tmp/slow.$(id -u)\nexec sleep 600\n'
 
 
+@pytest.mark.timeout(240)
 def test_a_machine_ends_whose_robot_was_killed(robot, box, name, tmp_path):
     """In the boot, while ROS is installed, while the workspace is on its way, and at work."""
     installing, syncing = 'ami-0bbbbbbbbbbbbbbbb', 'ami-0cccccccccccccccc'
@@ -109,7 +110,7 @@ def test_a_machine_ends_whose_robot_was_killed(robot, box, name, tmp_path):
     box.publish(syncing, region='us-east-1', files={'/usr/local/bin/rsync': SLEEPS})
     package = f'fogt_{uuid.uuid4().hex[:6]}'
     variables = colcon_workspace(tmp_path / 'workspace', package, programs={'nothing': 'pass'})
-    box.set_boot_delay(2.0)
+    box.set_boot_delay(1.0)
     phases = {
         'install': {'ami_image': installing, 'bootstrap': 'apt'},
         'sync': {'ami_image': syncing, 'ros_workspace': str(tmp_path / 'workspace')},
@@ -125,7 +126,7 @@ def test_a_machine_ends_whose_robot_was_killed(robot, box, name, tmp_path):
             return next((found for found in box.instances()
                          if found.tags.get('fogros2-name') == f'{name}-{phase}'), None)
 
-        wait_until(lambda: instance('boot'), timeout=30, what='a machine that boots')
+        wait_until(lambda: instance('boot'), timeout=60, what='a machine that boots')
     finally:
         os.killpg(booting.pid, signal.SIGKILL)
         booting.wait(10)
@@ -136,10 +137,10 @@ def test_a_machine_ends_whose_robot_was_killed(robot, box, name, tmp_path):
 
     runs['run'].wait_for('I heard: ')
     for phase, word in (('install', 'apt-get'), ('sync', 'rsync')):
-        wait_until(lambda p=phase, w=word: slow(p, w), timeout=30, what=f'the {phase} to begin')
+        wait_until(lambda p=phase, w=word: slow(p, w), timeout=60, what=f'the {phase} to begin')
     for run in runs.values():
         run.kill()
-    wait_until(lambda: not box.alive(), timeout=45, what='the machines to end by themselves')
+    wait_until(lambda: not box.alive(), timeout=60, what='the machines to end by themselves')
     for phase in (*phases, 'boot'):
         assert instance(phase).reason == 'Client.InstanceInitiatedShutdown'
     # what a machine can't take along goes when the robot forgets it; of the one that was killed
