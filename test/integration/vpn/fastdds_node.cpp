@@ -12,6 +12,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/prctl.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -166,6 +167,8 @@ int main(int argc, char ** argv)
   std::string suffix;
   for (int copy = 1; copy < copies; ++copy) {
     if (fork() == 0) {
+      // not to outlive the one that would end it
+      prctl(PR_SET_PDEATHSIG, SIGKILL);
       suffix = "_" + std::to_string(copy);
       break;
     }
