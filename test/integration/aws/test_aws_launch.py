@@ -58,7 +58,7 @@ def test_the_talker_from_nothing_to_nothing(robot, box, name):
     assert run.ended() == 0, run.text
     assert clean(run), run.text
     asked = [call for call in box.calls() if call.region == 'us-east-1']
-    assert f"{name}: " in run.text and 'h at $0.0416 an hour, $' in run.text
+    assert f'{name}: ' in run.text and 'h at $0.0416 an hour, $' in run.text
     # what this test has asked itself comes on top
     assert len(asked) - 5 <= CALLS, asked
 
