@@ -71,8 +71,10 @@ class Registry:
         config.write_text(
             f'version: 0.1\nstorage: {{filesystem: {{rootdirectory: {folder}/data}}}}\n'
             f"http: {{addr: '{self.name}', secret: none}}\n{auth}")
-        self.child = subprocess.Popen(['docker-registry', 'serve', str(config)],
-                                      stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        # gone with this process, even if that is killed
+        self.child = subprocess.Popen(
+            ['setpriv', '--pdeathsig', 'KILL', 'docker-registry', 'serve', str(config)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         stack.callback(self.child.wait)
         stack.callback(self.child.kill)
         wait_until(self.listens, timeout=30.0, what='the registry')
