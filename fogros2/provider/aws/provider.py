@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
-import os
 import threading
 import time
-from typing import Any, ClassVar, Optional, TypeVar
+from typing import Any, ClassVar, Optional
 
 from fogros2.errors import (
     ConfigurationError,
@@ -25,51 +23,24 @@ from fogros2.provider import Provider
 from fogros2.provider.aws import (
     clients,
     ending,
+    everywhere,
     images,
     instances,
     network,
     patience,
+    spot,
     user_data,
 )
 from fogros2.provider.aws import regions as places
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.creation import Creation
-from fogros2.provider.aws.failures import AwsError, code_of, DENIED, GONE
+from fogros2.provider.aws.failures import AwsError, code_of, GONE
 from fogros2.provider.aws.instances import MachineId
 from fogros2.provider.aws.options import check_spec, DEFAULT_TYPE, NEAREST, Options
 from fogros2.waiting import wait_until
 
-T = TypeVar('T')
-
-#: Names the regions that 'all regions' means, such as 'eu-central-1 us-east-1'.
-REGIONS_VARIABLE = 'FOGROS2_AWS_REGIONS'
-#: Regions asked at once.
-PARALLEL = 20
-#: Regions beside the nearest one to go on in where it has no room.
-NEIGHBOURS = 2
 #: One for all providers of this process, or each machine of a launch would ask anew.
 _ROBOT_ADDRESS = network.RobotAddress()
-
-# Runs on the machine every few seconds; asks AWS's metadata service there, with a token. By a
-# plain socket: the library for it takes five times as long to load as this to run.
-_NOTICE = """\
-import socket, sys
-def ask(method, path, head):
-    with socket.create_connection((sys.argv[1], int(sys.argv[2])), 2) as link:
-        link.settimeout(2)
-        lines = f'{method} /latest/{path} HTTP/1.0', 'Host: ' + sys.argv[1], head, '', ''
-        link.sendall('\\r\\n'.join(lines).encode())
-        answer = b''.join(iter(lambda: link.recv(4096), b''))
-    top, _, body = answer.partition(b'\\r\\n\\r\\n')
-    if top.split(b' ')[1:2] != [b'200']:
-        sys.exit(1)
-    return body.decode()
-try:
-    token = ask('PUT', 'api/token', 'X-aws-ec2-metadata-token-ttl-seconds: 60')
-    print(ask('GET', 'meta-data/spot/instance-action', 'X-aws-ec2-metadata-token: ' + token))
-except OSError:
-    sys.exit(1)
-"""
 
 
 class AWSProvider(Provider):
@@ -85,8 +56,7 @@ class AWSProvider(Provider):
     agent_program: ClassVar[str] = user_data.AGENT_PROGRAM
     firewall: ClassVar[bool] = True
     one_time_host_key: ClassVar[bool] = True
-    notice: ClassVar[tuple[str, ...]] = (
-        'python3', '-ISc', _NOTICE, '169.254.169.254', '80')
+    notice: ClassVar[tuple[str, ...]] = spot.NOTICE
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or clients.usual()
@@ -108,7 +78,7 @@ class AWSProvider(Provider):
 
     def answers(self) -> str:
         """Ask AWS who we are, which no policy can refuse."""
-        region = self._base_region()
+        region = everywhere.base(self._account, self._regions)
         told = self._account.call('sts', region, 'get_caller_identity', 'asking AWS who we are',
                                   hasty=True)
         return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
@@ -132,7 +102,7 @@ class AWSProvider(Provider):
         if region == NEAREST:
             region = choices.nearest_region()
             if not options.regions and not options.ami_image:
-                chosen['regions'] = neighbours(region)
+                chosen['regions'] = places.neighbours(region)
         kind = options.ec2_instance_type
         market = Market(self._account.client, cancel=cancel)
         if options.chooses_type:
@@ -299,7 +269,7 @@ class AWSProvider(Provider):
                 Filters=[*instances.tag_filters(tags),
                          {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]))
             return [instances.machine_of(region, instance) for instance in found]
-        for machines in self._in_regions(ask):
+        for machines in everywhere.ask(account, self._regions, ask):
             yield from machines
 
     def destroy(self, machine_id: str) -> None:
@@ -340,7 +310,8 @@ class AWSProvider(Provider):
             for attempt in found:
                 ending.sweep(self._account, region, attempt)
             return [f"security group and key of '{name}' in {region}" for name in found.values()]
-        return [words for found in self._in_regions(ask) for words in found]
+        return [words for found in everywhere.ask(self._account, self._regions, ask)
+                for words in found]
 
     def notice_for(self, machine: Machine) -> tuple[str, ...]:
         """Return what asks for the notice of a spot instance; no other is taken away."""
@@ -387,7 +358,9 @@ class AWSProvider(Provider):
 
     def images(self) -> Iterator[Image]:
         """Yield the AMIs that were baked, of all regions."""
-        for found in self._in_regions(lambda r: list(images.images_in(self._account, r))):
+        account = self._rising()
+        for found in everywhere.ask(
+                account, self._regions, lambda r: list(images.images_in(account, r))):
             yield from found
 
     def delete_image(self, image_id: str) -> None:
@@ -408,53 +381,3 @@ class AWSProvider(Provider):
                 'no region is named for a machine at AWS',
                 "region='eu-central-1', region='nearest', or: aws configure")
         return region
-
-    def _base_region(self) -> str:
-        """Return a region to ask what belongs to none."""
-        named = [region for region in self._named_regions() if region != 'all']
-        return self._account.region() or (named[0] if named else 'us-east-1')
-
-    def _named_regions(self) -> list[str]:
-        return list(self._regions) or os.environ.get(
-            REGIONS_VARIABLE, '').replace(',', ' ').split()
-
-    def _all_regions(self) -> list[str]:
-        """Return the regions to look in: those that were named, or all that are enabled."""
-        named = self._named_regions()
-        if named and 'all' not in named:
-            return named
-        found = self._rising().call('ec2', self._base_region(), 'describe_regions',
-                                    'asking for the regions of the account')['Regions']
-        return sorted(str(entry['RegionName']) for entry in found)
-
-    def _in_regions(self, ask: Callable[[str], T]) -> Iterable[T]:
-        """
-        Return what each region answers, asked all at once.
-
-        A region that an organisation closes to these credentials can hold no machine of theirs:
-        it counts only where it was named, or none is open.
-        """
-        regions = self._all_regions()
-        named = bool(self._named_regions()) and 'all' not in self._named_regions()
-
-        def try_region(region: str) -> tuple[Optional[T], Optional[FogError]]:
-            try:
-                return ask(region), None
-            except FogError as error:
-                return None, error
-
-        with ThreadPoolExecutor(min(PARALLEL, len(regions)), 'fog-aws') as pool:
-            answers = list(pool.map(try_region, regions))
-        found = [answer for answer, error in answers if answer is not None]
-        for _, error in answers:
-            if error is not None and (named or not found or code_of(error) not in DENIED):
-                raise error
-        return found
-
-
-def neighbours(region: str) -> list[str]:
-    """Return the regions beside one, the nearest on the globe first."""
-    here = places.REGIONS.get(region)
-    others = [name for name in places.ENABLED if name != region]
-    return [] if here is None else [
-        found.region for found in places.by_distance(others, here[:2])][:NEIGHBOURS]

@@ -59,6 +59,8 @@ REGIONS: dict[str, tuple[float, float, str, bool]] = {
 }
 #: Regions that every account may use.
 ENABLED = tuple(name for name, (*_, enabled) in REGIONS.items() if enabled)
+#: Regions beside one to go on in where that has no room.
+NEIGHBOURS = 2
 #: Connections to each region, of which the median counts.
 ATTEMPTS = 3
 #: Seconds after which one connection counts as failed.
@@ -207,6 +209,14 @@ def by_distance(regions: Iterable[str], here: tuple[float, float]) -> list[Laten
     found = [Latency(name, place_of(name), distance_km=distance_km(here, REGIONS[name][:2]))
              for name in regions if name in REGIONS]
     return sorted(found, key=lambda latency: (latency.distance_km or 0.0, latency.region))
+
+
+def neighbours(region: str) -> list[str]:
+    """Return a few regions beside one, the nearest on the globe first; to go on in."""
+    here = REGIONS.get(region)
+    others = [name for name in ENABLED if name != region]
+    return [] if here is None else [
+        found.region for found in by_distance(others, here[:2])][:NEIGHBOURS]
 
 
 def table(
