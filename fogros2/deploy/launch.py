@@ -15,7 +15,7 @@ import threading
 import time
 from typing import Optional
 
-from fogros2 import model, plan, plugin_system, process, workspace
+from fogros2 import containers, model, plan, plugin_system, process, workspace
 from fogros2 import shell as shells
 from fogros2.dds import DdsVendor
 from fogros2.deploy import routing
@@ -103,6 +103,13 @@ class Launch:
                 raise ConfigurationError(
                     f"'{spec.name}' is a computer that exists already: no launch switches it off",
                     "use on_exit='delete' to leave nothing there, or 'keep'")
+            for line in spec.containers:
+                containers.parse(line)
+                if not machines.runs_containers:
+                    raise ConfigurationError(
+                        f"'{spec.name}' can't run containers: a machine of the provider "
+                        f"'{spec.provider}' hasn't the rights that an engine takes",
+                        'run them on an EC2 instance or a computer that is reached by SSH')
             if spec.workspace is not None:
                 workspace.inspect(Path(spec.workspace))
             for package, executable in programs.get(spec.name, ()):

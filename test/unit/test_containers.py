@@ -8,7 +8,9 @@ import pytest
 from fogros2 import containers
 from fogros2.actions.machines import ContainerInstance
 from fogros2.containers import Container, parse
+from fogros2.deploy import Launch
 from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec
 
 
 @pytest.mark.parametrize(('line', 'meant'), [
@@ -65,3 +67,11 @@ def test_what_a_machine_is_given_is_checked_where_it_is_written():
         with pytest.raises(ConfigurationError) as error:
             machine.add_docker_container(**wrong)
     assert 'ports' in error.value.hint
+
+
+def test_a_machine_that_can_not_run_them_is_refused_before_it_is_made():
+    launch = Launch()
+    spec = MachineSpec('m', 'container', containers=('docker run image',))
+    with pytest.raises(ConfigurationError, match='rights that an engine takes'):
+        launch.prepare([spec])
+    launch.down()
