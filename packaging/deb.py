@@ -13,9 +13,14 @@ table below, as rosdep would say. ``dpkg-deb`` puts the package together; no net
 from __future__ import annotations
 
 import argparse
+import base64
 from collections.abc import Iterator
+import csv
 import email
+import gzip
 import hashlib
+import io
+import os
 from pathlib import Path
 import shutil
 import subprocess
@@ -43,8 +48,23 @@ UBUNTU = {
     'rsync': 'rsync',
     'wireguard': 'wireguard-tools',
 }
+#: What bloom adds to all packages: the folder's setup.bash.
+WORKSPACE = 'ros-jazzy-ros-workspace'
 #: What not every robot needs, and rosdep has no key for.
 RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'wireguard-go')
+
+#: Run before removal and upgrade: a Python of root's has compiled modules, which dpkg knows
+#: nothing of, so that their folders would stay.
+PRERM = """\
+#!/bin/sh
+set -e
+dpkg -L ros-jazzy-fogros2 | sed -n 's/\\.py$//p' | while read -r module; do
+    folder=${module%/*}/__pycache__
+    [ -d "$folder" ] || continue
+    rm -f -- "$folder/${module##*/}".*.pyc
+    rmdir --ignore-fail-on-non-empty -- "$folder"
+done
+"""
 
 
 def dependencies(manifests: list[Path]) -> list[str]:
@@ -57,7 +77,7 @@ def dependencies(manifests: list[Path]) -> list[str]:
             for kind in ('depend', 'exec_depend')
             for element in ElementTree.parse(manifest).getroot().iter(kind)
             if element.get('condition') is None}
-    return sorted(_debian(key) for key in keys - OWN)
+    return sorted({WORKSPACE, *(_debian(key) for key in keys - OWN)})
 
 
 def _debian(key: str) -> str:
@@ -100,21 +120,49 @@ def unpack(built: Path, stage: Path) -> str:
                 target = stage / SITE_PACKAGES / path
             if path.name == 'METADATA':
                 version = email.message_from_bytes(archive.read(entry))['Version']
+            if path.name == 'RECORD':
+                record = target
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(archive.read(entry))
             # what ROS 2 runs
             executable = target.is_relative_to(stage / PREFIX / 'lib') and \
                 not target.is_relative_to(stage / SITE_PACKAGES)
             target.chmod(0o755 if executable else 0o644)
+    installed(record)
     return version
 
 
-def documents(stage: Path, version: str) -> None:
+def installed(record: Path) -> None:
+    """
+    Turn a wheel's list of files into the list of an installed one, as pip does.
+
+    ``.data/data`` becomes the place below the prefix, and INSTALLER says to pip that apt removes
+    it. Without, the wheel that goes from the robot to a machine would lack nodes and launch files.
+    See PyPA's "Recording installed projects".
+    """
+    name = b'debian\n'
+    installer = record.with_name('INSTALLER')
+    installer.write_bytes(name)
+    installer.chmod(0o644)
+    up = os.path.relpath(PREFIX, SITE_PACKAGES)
+    rows = []
+    for path, digest, size in csv.reader(io.StringIO(record.read_text())):
+        top, _, rest = path.partition('/data/')
+        rows.append((f'{up}/{rest}' if top.endswith('.data') else path, digest, size))
+    digest = base64.urlsafe_b64encode(hashlib.sha256(name).digest()).rstrip(b'=').decode()
+    rows.append((f'{record.parent.name}/INSTALLER', f'sha256={digest}', str(len(name))))
+    out = io.StringIO()
+    csv.writer(out, lineterminator='\n').writerows(rows)
+    record.write_text(out.getvalue())
+
+
+def documents(stage: Path) -> None:
     """Write what Debian's policy wants beside the files: licence and change log."""
     folder = stage / 'usr/share/doc/ros-jazzy-fogros2'
     folder.mkdir(parents=True)
     shutil.copy(ROOT / 'LICENSE', folder / 'copyright')
-    shutil.copy(ROOT / 'CHANGELOG.rst', folder / 'changelog')
+    (folder / 'changelog.gz').write_bytes(
+        gzip.compress((ROOT / 'CHANGELOG.rst').read_bytes(), 9, mtime=0))
     for path in folder.iterdir():
         path.chmod(0o644)
 
@@ -147,7 +195,7 @@ def build(output: Path) -> Path:
         folder = Path(name)
         stage = folder / 'stage'
         version = unpack(wheel(folder), stage)
-        documents(stage, version)
+        documents(stage)
         files = sorted(path for path in stage.rglob('*') if path.is_file())
         debian = stage / 'DEBIAN'
         lines = list(control(stage, version))
@@ -156,6 +204,8 @@ def build(output: Path) -> Path:
         (debian / 'md5sums').write_text(''.join(
             f'{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  '
             f'{path.relative_to(stage)}\n' for path in files))
+        (debian / 'prerm').write_text(PRERM)
+        (debian / 'prerm').chmod(0o755)
         for path in (stage, *stage.rglob('*')):
             if path.is_dir():
                 path.chmod(0o755)
