@@ -24,6 +24,10 @@ if [ $# = 0 ]; then
     fi
 fi
 
+# for tests that hold the embedded default against ROS 2
+ros=$(ros_setup)
+[ -z "$ros" ] || export ROS2_SETUP="$ros"
+
 suite() {
     name=$1; shift
     say "Tests on $name"
@@ -33,7 +37,7 @@ suite() {
 # so that their output is seen as it comes.
 [ $# = 0 ] && set -- -n 2 --dist loadgroup --no-loadscope-reorder
 suite 'the embedded default' embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
-if [ -n "$(ros_setup)" ]; then
+if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them; linters
     # read the same sources again
     suite 'ROS 2 Jazzy' ros -- pytest -p no:launch_testing -p no:launch_ros -p no:launch_pytest \
