@@ -68,6 +68,14 @@ sshd openssh-server
 ssh openssh-client
 sudo sudo
 LIST
+    # Fast DDS's own library judges the profile that ours writes for it
+    if [ "$target" = test ]; then
+        have g++ || echo g++
+        [ -d /usr/include/fastdds ] || for name in libfastrtps-dev libfastdds-dev; do
+            if known "$name"; then echo "$name"; break; fi
+        done
+        have busybox || echo busybox
+    fi
     # FFmpeg's own programs judge the streams that ours make
     [ "$target" = demo ] || have ffmpeg || echo ffmpeg
     # Podman's networks: netavark since 4.0, the CNI plugins before; its package may bring neither.
