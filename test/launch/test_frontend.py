@@ -332,12 +332,13 @@ def test_nodes_groups_and_streams_become_processes_of_the_machine(
     assert 'image:=/fogros2/planner/back' in there['back_other_encoder'].arguments
 
 
-def test_a_stream_of_the_whole_launch_and_robot_nodes_at_once(run, fake):
+def test_what_holds_for_the_whole_launch(run, fake):
     coordinators = []
     description = xml("""
       <arg name="when" default="immediately"/>
+      <arg name="vendor" default="cyclonedds"/>
       <fog_machine name="planner" provider="container" ros_workspace=""/>
-      <fogros_launch robot_nodes="$(var when)">
+      <fogros_launch robot_nodes="$(var when)" dds="$(var vendor)">
         <stream_topic topic="/camera"/>
         <cloud_node machine="planner" pkg="demo" exec="talker"/>
       </fogros_launch>
@@ -352,6 +353,7 @@ def test_a_stream_of_the_whole_launch_and_robot_nodes_at_once(run, fake):
     assert [entries for entries, _ in coordinator._stream_everywhere] == [
         [StreamTopic('/camera')], [StreamTopic('/third')]]
     assert coordinator.gate is None, 'robot nodes wait'
+    assert coordinator._dds == 'cyclonedds'
 
 
 def test_of_two_machines_of_one_name_the_condition_chooses(run, fake):

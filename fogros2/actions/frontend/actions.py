@@ -42,20 +42,22 @@ class FogROSLaunch(Action):
     A FogROSLaunchDescription that stands in another description.
 
     :param actions: the content.
-    :param robot_nodes: see there.
+    :param robot_nodes: see there, and ``dds``.
     """
 
     def __init__(
         self, actions: Iterable[Action], *,
         robot_nodes: SomeSubstitutionsType = 'after_cloud',
-        stream_topics: Sequence[StreamTopic] = (), **kwargs: Any,
+        stream_topics: Sequence[StreamTopic] = (),
+        dds: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         self._actions = list(actions)
         self._robot_nodes: Union[SomeSubstitutionsType, RobotNodes] = robot_nodes
         self._stream_topics = list(stream_topics)
+        self._dds = dds
         if isinstance(robot_nodes, str):
-            self._description(robot_nodes)
+            self._description(robot_nodes, None)
 
     def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
         """Return the content, for launch's own look ahead."""
@@ -63,12 +65,13 @@ class FogROSLaunch(Action):
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action: yields the description."""
-        return [self._description(words.resolve(context, self._robot_nodes))]
+        return [self._description(words.resolve(context, self._robot_nodes),
+                                  words.resolve(context, self._dds))]
 
-    def _description(self, robot_nodes: str) -> FogROSLaunchDescription:
+    def _description(self, robot_nodes: str, dds: Optional[str]) -> FogROSLaunchDescription:
         return FogROSLaunchDescription(
             self._actions, robot_nodes=cast('RobotNodes', robot_nodes),
-            stream_topics=self._stream_topics)
+            stream_topics=self._stream_topics, dds=dds)
 
 
 def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopic]]:

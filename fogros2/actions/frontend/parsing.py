@@ -139,12 +139,13 @@ def stream_topic(entity: Entity, parser: Parser) -> Parsed:
 
 
 def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
-    """Read ``<fogros_launch robot_nodes="after_cloud">`` with its content."""
+    """Read ``<fogros_launch robot_nodes="after_cloud" dds="fastdds">`` with its content."""
     _, kwargs = Action.parse(entity, parser)
-    robot_nodes = entity.get_attr('robot_nodes', optional=True)
-    if robot_nodes is not None:
-        kwargs['robot_nodes'] = text(parser, robot_nodes)
+    for name in ('robot_nodes', 'dds'):
+        value = entity.get_attr(name, optional=True)
+        if value is not None:
+            kwargs[name] = text(parser, value)
     kwargs['actions'], kwargs['stream_topics'] = instead_of(
         parser.parse_action(child) for child in entity.children)
-    complete(entity, ('robot_nodes', *CONDITIONS))
+    complete(entity, ('robot_nodes', 'dds', *CONDITIONS))
     return FogROSLaunch, kwargs
