@@ -94,6 +94,9 @@ class FakeLaunch:
         self.cancel = cancel
         return self
 
+    def use_dds(self, name):
+        self.note('dds', name)
+
     def note(self, *what):
         with self.lock:
             self.notes.append(what)
