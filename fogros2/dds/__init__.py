@@ -6,9 +6,11 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping, Sequence
 import dataclasses
+import ipaddress
 from types import MappingProxyType
 from typing import ClassVar, Optional
 
+from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 
 
@@ -31,7 +33,8 @@ class DdsVendor(abc.ABC):
     """
     A ROS middleware that can be told its interfaces and peers; pure.
 
-    Made with ``domain=``, the ROS domain of the launch.
+    :param domain: ROS_DOMAIN_ID of the launch.
+    :raises DdsError: the middleware has no such domain.
     """
 
     #: Value of RMW_IMPLEMENTATION.
@@ -42,14 +45,21 @@ class DdsVendor(abc.ABC):
     by_address: ClassVar[bool] = False
     #: What the configuration's file is called, where the middleware minds.
     file_name: ClassVar[str] = 'dds.xml'
+    #: The last domain; DDS has ports for no more. Those above 101 take ports that Linux hands out.
+    last_domain: ClassVar[int] = 232
 
-    @abc.abstractmethod
+    def __init__(self, domain: int = 0) -> None:
+        if not 0 <= domain <= self.last_domain:
+            raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
+        self.domain = domain
+
     def ask_lan(self) -> Command:
-        """Return the command, for the robot, whose output ``parse_lan`` reads."""
+        """Return the command, for the robot, whose output ``parse_lan`` reads; unless it minds."""
+        return Command(('true',), what='look at the network interfaces')
 
-    @abc.abstractmethod
     def parse_lan(self, output: str) -> Optional[str]:
         """Return the interface that nodes would take by themselves, None where there is none."""
+        return None
 
     @abc.abstractmethod
     def robot_interfaces(
@@ -106,3 +116,12 @@ class DdsVendor(abc.ABC):
 def static_peers(user: Mapping[str, str]) -> list[str]:
     """Return the hosts of ROS_STATIC_PEERS, which has ``;`` between them."""
     return [host.strip() for host in user.get('ROS_STATIC_PEERS', '').split(';') if host.strip()]
+
+
+def is_address(text: str) -> bool:
+    """Return whether a text is an IP address, not a name."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True

@@ -26,7 +26,7 @@ from types import MappingProxyType
 from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
-from fogros2.dds import DdsVendor
+from fogros2.dds import DdsVendor, is_address
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 
@@ -39,7 +39,6 @@ ASKED = 10
 #: RTPS 2.5, 9.6.2.3: participant i of a domain is asked at 7410 + 250 * domain + 2 * i.
 PORT_BASE = 7410
 PORTS_PER_DOMAIN = 250
-MAX_DOMAIN = 232
 #: Seconds between a participant's announcements: how soon a host is found again whose lease
 #: ended in a long cut, or whose first one was lost. Fifty processes send 210 kB/s by it.
 SPDP_INTERVAL = 3
@@ -73,11 +72,6 @@ class CycloneDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_cyclonedds_cpp'
-
-    def __init__(self, domain: int = 0) -> None:
-        if not 0 <= domain <= MAX_DOMAIN:
-            raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
-        self.domain = domain
 
     def ask_lan(self) -> Command:
         """Return the command whose output :meth:`parse_lan` reads."""
@@ -280,7 +274,7 @@ def _has_multicast(interface: str) -> bool:
 
 
 def _interface(interface: DdsInterface) -> str:
-    attribute = 'address' if _is_address(interface.name) else 'name'
+    attribute = 'address' if is_address(interface.name) else 'name'
     return (
         f'<NetworkInterface {attribute}={quoteattr(interface.name)}'
         f' priority="{interface.priority}" multicast="{_boolean(interface.multicast)}"'
@@ -295,15 +289,7 @@ def _boolean(value: bool) -> str:
     return 'true' if value else 'false'
 
 
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _is_loopback(interface: DdsInterface) -> bool:
-    if _is_address(interface.name):
+    if is_address(interface.name):
         return ipaddress.ip_address(interface.name).is_loopback
     return interface.name == 'lo'

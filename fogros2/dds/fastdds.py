@@ -14,7 +14,6 @@ cross the VPN by multicast (see ``vpn/wireguard.py``), and machines ask each oth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import ipaddress
 from pathlib import Path
 import re
 from types import MappingProxyType
@@ -22,14 +21,13 @@ from typing import ClassVar, Optional
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from fogros2.dds import DdsVendor, static_peers
+from fogros2.dds import DdsVendor, is_address, static_peers
 from fogros2.errors import DdsError
-from fogros2.model import Command, DdsInterface
+from fogros2.model import DdsInterface
 
 #: Where Fast DDS looks for its profiles.
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
-MAX_DOMAIN = 232
 #: Processes that a host is asked for: each has a port, which each participant asks in each
 #: interval. Who is asked answers, so only two that both come later don't find each other.
 ASKED = 10
@@ -68,19 +66,6 @@ class FastDds(DdsVendor):
     #: Where each process hears which nodes others have (``ros_discovery_info``), in every domain:
     #: the middleware asks for a port of its own for that.
     ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
-
-    def __init__(self, domain: int = 0) -> None:
-        if not 0 <= domain <= MAX_DOMAIN:
-            raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
-        self.domain = domain
-
-    def ask_lan(self) -> Command:
-        """Return a command that says nothing: every interface is used."""
-        return Command(('true',), what='look at the network interfaces')
-
-    def parse_lan(self, output: str) -> Optional[str]:
-        """Return None: there is no interface that Fast DDS prefers."""
-        return None
 
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
@@ -243,7 +228,7 @@ def _own_transports(
           netmask_filter='ON')
     allowed = _child(udp, 'interfaceWhiteList')
     for one in sorted(interfaces, key=lambda one: -one.priority):
-        kind = 'address' if _is_address(one.name) else 'interface'
+        kind = 'address' if is_address(one.name) else 'interface'
         ElementTree.SubElement(allowed, kind).text = one.name
     _text(ElementTree.SubElement(descriptors, 'transport_descriptor'),
           transport_id=_SHM, type='SHM')
@@ -273,11 +258,3 @@ def _sort(rtps: Element) -> None:
     """Put transports before what uses them, as the schema's examples have it."""
     order = ('userTransports', 'useBuiltinTransports')
     rtps[:] = sorted(rtps, key=lambda child: child.tag not in order)
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True

@@ -18,12 +18,11 @@ from typing import Any, ClassVar, Optional
 
 from fogros2.dds import DdsVendor, Router, static_peers
 from fogros2.errors import DdsError
-from fogros2.model import Command, DdsInterface
+from fogros2.model import DdsInterface
 
 #: TCP port of routers in the VPN; 7447 is the one that rmw_zenoh's own takes on all interfaces.
 PORT = 7448
 USERS_ROUTER = 'tcp/127.0.0.1:7447'
-MAX_DOMAIN = 232
 #: Milliseconds between attempts to dial a router, doubled up to the second.
 RETRY, RETRY_MAX = 250, 2000
 #: Milliseconds without a sign of life after which a link is taken for broken and dialled anew.
@@ -42,19 +41,6 @@ class Zenoh(DdsVendor):
     rmw: ClassVar[str] = 'rmw_zenoh_cpp'
     by_address: ClassVar[bool] = True
     file_name: ClassVar[str] = 'dds.json5'
-
-    def __init__(self, domain: int = 0) -> None:
-        if not 0 <= domain <= MAX_DOMAIN:
-            raise DdsError(f'ROS_DOMAIN_ID {domain} is none', 'use 0 to 232')
-        self.domain = domain
-
-    def ask_lan(self) -> Command:
-        """Return a command that says nothing: nodes know their router alone."""
-        return Command(('true',), what='look at the network interfaces')
-
-    def parse_lan(self, output: str) -> Optional[str]:
-        """Return None: nodes use no interface but their router's."""
-        return None
 
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
