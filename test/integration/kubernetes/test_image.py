@@ -141,6 +141,13 @@ def test_an_image_is_built_and_pushed_and_a_pod_runs_it(builder, namespace):
         provider.destroy(machine_id)
 
 
+@pytest.mark.skipif(shutil.which('buildah') is None, reason='needs buildah')
+def test_buildah_does_the_same(builder):
+    made = builder('--registry', f'{builder.registry.name}/buildah', '--engine', 'buildah')
+    assert made.returncode == 0, made
+    assert made.stdout.startswith(f'pushed {builder.registry.name}/buildah/fogros2:'), made
+
+
 def test_the_image_holds_what_was_asked_for(builder):
     made = builder('--registry', 'localhost/fogt', '--no-push')
     assert made.returncode == 0 and made.stdout.startswith('built localhost/fogt/fogros2:'), made
