@@ -53,6 +53,11 @@ WORKSPACE = 'ros-jazzy-ros-workspace'
 #: What not every robot needs, and rosdep has no key for.
 RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'wireguard-go')
 
+#: What apt shows below the first line, one line each.
+DESCRIPTION = (
+    'Machines (EC2 instances, pods of a Kubernetes cluster, SSH hosts, containers) are',
+    'created as the launch begins, get the workspace, ROS 2 and a VPN, and are deleted as',
+    'it ends. The examples and the image transport H.264 are in this package, too.')
 #: Run before removal and upgrade: a Python of root's has compiled modules, which dpkg knows
 #: nothing of, so that their folders would stay.
 PRERM = """\
@@ -156,11 +161,21 @@ def installed(record: Path) -> None:
     record.write_text(out.getvalue())
 
 
+def maintainer() -> ElementTree.Element:
+    """Return who looks after the package, as ``package.xml`` has it."""
+    found = ElementTree.parse(ROOT / 'package.xml').getroot().find('maintainer')
+    if found is None:
+        raise LookupError('package.xml names no maintainer')
+    return found
+
+
 def documents(stage: Path) -> None:
     """Write what Debian's policy wants beside the files: licence and change log."""
     folder = stage / 'usr/share/doc/ros-jazzy-fogros2'
     folder.mkdir(parents=True)
-    shutil.copy(ROOT / 'LICENSE', folder / 'copyright')
+    (folder / 'copyright').write_text(
+        f'Copyright: {maintainer().text}\nLicense: Apache-2.0\n\nThe whole licence is in '
+        '/usr/share/common-licenses/Apache-2.0 on Debian and Ubuntu.\n')
     (folder / 'changelog.gz').write_bytes(
         gzip.compress((ROOT / 'CHANGELOG.rst').read_bytes(), 9, mtime=0))
     for path in folder.iterdir():
@@ -172,21 +187,22 @@ def control(stage: Path, version: str) -> Iterator[str]:
     manifests = [ROOT / 'package.xml', *(
         ROOT / name / 'package.xml' for name in sorted(OWN - {'fogros2'}))]
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
-    maintainer = root.find('maintainer')
-    assert maintainer is not None
+    who = maintainer()
     size = sum(path.stat().st_size for path in stage.rglob('*') if path.is_file())
     yield 'Package: ros-jazzy-fogros2'
     yield f'Version: {version}'
     yield 'Architecture: all'
     yield 'Section: misc'
     yield 'Priority: optional'
-    yield f'Maintainer: {maintainer.text} <{maintainer.get("email")}>'
+    yield f'Maintainer: {who.text} <{who.get("email")}>'
     yield f'Installed-Size: {-(-size // 1024)}'
     yield f'Depends: {", ".join(["python3 (>= 3.12)", *dependencies(manifests)])}'
     others = (_debian(name) for name in sorted(OWN - {'fogros2'}))
     yield f'Provides: {", ".join(f"{name} (= {version})" for name in others)}'
     yield f'Recommends: {", ".join(RECOMMENDS)}'
-    yield f'Description: {(root.findtext("description") or "").strip()}'
+    # apt's first line is no sentence
+    yield f'Description: {(root.findtext("description") or "").strip().rstrip(".")}'
+    yield from (f' {line}' for line in DESCRIPTION)
 
 
 def build(output: Path) -> Path:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import email
 from email.message import Message
+import gzip
 import hashlib
 import importlib.util
 import io
@@ -68,6 +69,8 @@ def test_says_what_it_is(built: Path) -> None:
     assert built.name == f'ros-jazzy-fogros2_{field(built, "Version")}_all.deb'
     assert field(built, 'Maintainer').endswith('>')
     assert 0 < int(field(built, 'Installed-Size')) < 10_000  # KiB
+    first, *rest = field(built, 'Description').splitlines()
+    assert first and not first.endswith('.') and len(rest) > 1
 
 
 def test_depends_on_what_the_manifests_say(built: Path) -> None:
@@ -117,6 +120,15 @@ def test_files_are_where_bloom_puts_them(
     assert f'{SITE}/fogros2/py.typed' in paths
     assert not [name for name in paths if '__pycache__' in name or '.data/' in name]
     assert not [name for name in paths if name.startswith((f'{SITE}/test', f'{SITE}/rclpy'))]
+
+
+def test_documents_are_what_debian_looks_for(
+    files: dict[str, tuple[tarfile.TarInfo, bytes]],
+) -> None:
+    folder = 'usr/share/doc/ros-jazzy-fogros2/'
+    assert b'License: Apache-2.0' in files[f'{folder}copyright'][1]
+    assert gzip.decompress(files[f'{folder}changelog.gz'][1]) == \
+        (ROOT / 'CHANGELOG.rst').read_bytes()
 
 
 def test_owners_and_modes(files: dict[str, tuple[tarfile.TarInfo, bytes]]) -> None:
