@@ -15,6 +15,9 @@ import threading
 import time
 from typing import Any, Optional
 
+#: Seconds in which a registry has to answer.
+PATIENCE = 40.0
+
 
 def install(source: Path, cache: Path) -> str:
     """
@@ -34,11 +37,16 @@ def install(source: Path, cache: Path) -> str:
             if npm is None:
                 return 'needs npm'
             shutil.copy(source / 'package.json', cache)
-            made = subprocess.run(
-                [npm, 'install', '--no-package-lock', '--no-audit', '--no-fund', '--silent'],
-                cwd=cache, env=_environment(), capture_output=True, text=True)
+            try:
+                made = subprocess.run(
+                    [npm, 'install', '--no-package-lock', '--no-audit', '--no-fund',
+                     '--fetch-retries=1', f'--fetch-timeout={PATIENCE * 500:.0f}'],
+                    cwd=cache, env=_environment(), capture_output=True, text=True,
+                    stdin=subprocess.DEVNULL, timeout=PATIENCE)
+            except subprocess.TimeoutExpired:
+                return f'npm reaches no registry within {PATIENCE:g} s'
             if made.returncode:
-                return f'npm could not install the client: {made.stderr or made.stdout}'
+                return f'npm could not install the client: {(made.stderr or made.stdout)[-300:]}'
             done.write_bytes(wanted)
         for program in source.glob('*.mjs'):
             shutil.copy(program, cache)  # to where its modules are found from
@@ -50,9 +58,10 @@ def _program(name: str) -> Optional[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return variables with the Node that the tests brought first."""
+    """Return variables with the computer's own Node, which knows its registry, before the tests'."""
     own = os.path.dirname(sys.executable)
-    return {**os.environ, 'PATH': own + os.pathsep + os.environ.get('PATH', '')}
+    others = [folder for folder in os.environ.get('PATH', '').split(os.pathsep) if folder != own]
+    return {**os.environ, 'PATH': os.pathsep.join([*others, own])}
 
 
 class Viewer:

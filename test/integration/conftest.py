@@ -32,7 +32,8 @@ def domain() -> str:
 def no_dds_of_others() -> Iterator[None]:
     """Forget what tests that run nodes in this process have set, for launches of a module too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv('CYCLONEDDS_URI', raising=False)
+        for name in ('CYCLONEDDS_URI', 'RMW_IMPLEMENTATION'):
+            patch.delenv(name, raising=False)
         yield
 
 
