@@ -58,7 +58,7 @@ def _program(name: str) -> Optional[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return variables with the computer's own Node, which knows its registry, before the tests'."""
+    """Return variables with the computer's own Node first: it knows its registry."""
     own = os.path.dirname(sys.executable)
     others = [folder for folder in os.environ.get('PATH', '').split(os.pathsep) if folder != own]
     return {**os.environ, 'PATH': os.pathsep.join([*others, own])}
