@@ -142,9 +142,9 @@ class Copy:
 
 
 def needed_by(programs: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the names of all that (package, executable) pairs need."""
-    return tuple(dict.fromkeys(
-        name for program in programs for name in NEEDS.get(program, ())))
+    """Return the names of the modules that (package, executable) pairs need, in one order."""
+    needed = {name for program in programs for name in NEEDS.get(program, ())}
+    return tuple(name for name in MODULES if name in needed)
 
 
 def lacking_here(names: Iterable[str]) -> list[Module]:

@@ -36,6 +36,8 @@ HERE = modules.Answer(
     ([('fogros2_examples', 'talker'), ('image_transport_h264', 'decoder')],
      ('numpy', 'av', 'cv2')),
     ([('fogros2_examples', 'image_processor')], ('numpy', 'cv2')),
+    ([('fogros2_examples', 'image_processor'), ('image_transport_h264', 'decoder')],
+     ('numpy', 'av', 'cv2')),
     ([('fogros2_examples', 'camera'), ('fogros2', 'bridge')], ('numpy', 'cv2', 'foxglove'))])
 def test_who_needs_what(programs: list[tuple[str, str]], needed: tuple[str, ...]) -> None:
     assert modules.needed_by(programs) == needed
