@@ -47,10 +47,10 @@ def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) 
     """
     Return what ``work`` returns, in a thread of its own that is left alone once ``cancel`` is set.
 
-    :param cancel: None to wait for the work, however long it takes.
     A request that is on its way at that moment is waited for a little, and its answer returned:
     it may have made something.
 
+    :param cancel: None to wait for the work, however long it takes.
     :raises Cancelled: ``cancel`` was set first; ``refused`` is set where AWS has done nothing.
     """
     if cancel is None:
