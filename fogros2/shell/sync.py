@@ -41,6 +41,8 @@ BULK = 64 << 20
 VANISHED = 24
 #: Errors in the socket or in the protocol's stream, and the remote shell's own.
 _LOST = (10, 12, 255)
+#: Exit status of rsync whose other side could not write a file.
+_NOT_WRITTEN = 11
 
 
 class Connection(Protocol):
@@ -232,6 +234,10 @@ def explained(result: Result, source: Path, where: str) -> FogError:
     text = result.stderr
     if 'No space left on device' in text or 'Disk quota exceeded' in text:
         return ShellError(f'the disk of {where} is full: {source} did not fit',
+                          'make room there, or leave more out')
+    if result.returncode == _NOT_WRITTEN and not re.search('^rsync: ', text, re.MULTILINE):
+        # why may be lost on the way, as the other side ends before all it said has been read
+        return ShellError(f'the disk of {where} is full, or fails: {source} was not written there',
                           'make room there, or leave more out')
     if 'command not found' in text or 'remote command not found' in text:
         return missing_there(where)
