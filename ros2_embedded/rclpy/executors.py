@@ -6,6 +6,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import AbstractContextManager
 import inspect
 import os
+import sys
 import threading
 import time
 from types import TracebackType
@@ -113,8 +114,9 @@ class Executor(AbstractContextManager['Executor']):
         self._tasks.clear()
         return True
 
-    def __del__(self) -> None:
-        if hasattr(self, '_waiting'):
+    def __del__(self, is_finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
+        # at the interpreter's end what this calls may be gone, and with the process all goes
+        if hasattr(self, '_waiting') and not is_finalizing():
             self._context._wakers.discard(self._guard.trigger)
             self._waiting.close()
             self._guard.close()
