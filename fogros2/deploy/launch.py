@@ -355,25 +355,28 @@ class Launch:
         with self._lock:
             self._closed = True
         self.cancel.set()
-        ups = list(self._ups.values())
+        ups = dict(self._ups)
         with ThreadPoolExecutor(max(1, len(ups)), 'fog-down') as pool:
-            ended = [pool.submit(_end, up) for up in ups]
+            ended = {name: pool.submit(_end, up) for name, up in ups.items()}
+        known: dict[str, FogError] = {}
+        unexpected: Optional[BaseException] = None
+        for name, future in ended.items():
+            error = future.exception()
+            if isinstance(error, FogError):
+                known[name] = error
+            else:
+                unexpected = unexpected or error
         with self._lock:
             self._ups.clear()
-            try:
-                for future in ended:
-                    self._note(future.exception())
-            finally:
-                # whatever it was that went wrong there: the interface goes
-                self.undo.close()
-            failures, self._failures = self._failures, []
+            # whatever it was that went wrong there: the interface goes
+            self.undo.close()
+            failures, self._failures = self._failures + list(known.values()), []
+        if unexpected is not None:
+            for name, error in known.items():
+                # nobody gets these any more to tell them
+                self.report(StepFailed(name, 'end', 0.0, str(error), fatal=False))
+            raise unexpected
         return failures
-
-    def _note(self, error: Optional[BaseException]) -> None:
-        if isinstance(error, FogError):
-            self._failures.append(error)
-        elif error is not None:
-            raise error
 
     def attempt(self, machine: str, name: str, undo: Callable[[], None]) -> None:
         """Run an undo step; if it fails, report and remember it, so that the others still run."""

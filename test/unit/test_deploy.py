@@ -363,6 +363,26 @@ def test_an_interface_that_was_taken_down_does_not_come_up_again(launch, monkeyp
     assert robot.down
 
 
+def test_what_ended_wrongly_is_all_told_before_an_error_that_nobody_expected(launch):
+    steps, gone = [], []
+    launch.report = steps.append
+    launch.undo.callback(gone.append, 'interface')
+
+    def machine(error):
+        def close():
+            raise error
+
+        up = Future()
+        up.set_result(SimpleNamespace(close=close))
+        return up
+
+    launch._ups = {'a': machine(ValueError('odd')), 'b': machine(ProviderError('still there'))}
+    with pytest.raises(ValueError, match='odd'):
+        launch.down()
+    assert [(step.machine, step.reason) for step in steps] == [('b', 'still there')]
+    assert gone == ['interface']
+
+
 class Members:
     """Machines of a VPN whose commands a test answers."""
 
