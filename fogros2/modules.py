@@ -56,6 +56,10 @@ MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
                    'opencv-contrib-python')),
     Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),
+    # what the applications compute with; their wheels need nothing else but NumPy
+    Module('gtsam', ('gtsam',)),
+    Module('ompl', ('ompl',), (2,)),
+    Module('fcl', ('python-fcl',)),
 )}
 IMAGES = ('numpy', 'av', 'cv2')
 #: What (package, executable) pairs need.
@@ -64,6 +68,9 @@ NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('image_transport_h264', 'decoder'): IMAGES,
     ('fogros2_examples', 'camera'): ('numpy', 'cv2'),
     ('fogros2_examples', 'image_processor'): ('numpy', 'cv2'),
+    ('fogros2_examples', 'slam'): ('numpy', 'cv2', 'gtsam'),
+    ('fogros2_examples', 'grasp_planner'): ('numpy', 'cv2', 'fcl'),
+    ('fogros2_examples', 'motion_planner'): ('numpy', 'ompl', 'fcl'),
     ('fogros2', 'bridge'): ('foxglove',),
 }
 
