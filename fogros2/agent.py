@@ -39,7 +39,7 @@ it: the VPN's, and the one that ends the machine.
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
 ``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where
-the nodes' launch process ended without having been told to.
+the nodes' launch process ended without having been told to; ``said`` is how its log ends then.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ MAX_LINE = 16 << 20
 #: Bytes of one generation of the log; two are kept.
 LOG_BYTES = 64 << 20
 LAUNCH_LOG_BYTES = 8 << 20
+#: Bytes of its end that are told when the launch process fails.
+LAST_WORDS = 1000
 BLOCK = 1 << 18
 CLIENTS = 64
 #: Seconds after SIGINT at which what the launch process left behind gets the next signal.
@@ -613,7 +615,7 @@ class Agent:
         self.every(10.0, self._trim_launch_log)
         if self.log.next > 1:
             # nodes of an agent that died here ended with it, and nobody could say so
-            self.emit('launch_exited', returncode=-int(signal.SIGKILL))
+            self.emit('launch_exited', returncode=-int(signal.SIGKILL), said='')
         while not self.done:
             now = self.clock()
             if not self.ending:
@@ -1283,7 +1285,8 @@ class Agent:
                                    'returncode': -number, 'respawns': False})[1:])
             if not expected:
                 say(f'the launch process ended with status {status}')
-                lines.append(dump({'event': 'launch_exited', 'returncode': status})[1:])
+                lines.append(dump({'event': 'launch_exited', 'returncode': status,
+                                   'said': self._last_words()})[1:])
             if lines:
                 self.write(lines)
             self._remove_files()
@@ -1322,6 +1325,14 @@ class Agent:
             for name in os.listdir(self.directory):
                 if name.startswith('files-'):
                     remove_tree(self.path(name))
+
+    def _last_words(self) -> str:
+        """Return how the launch process's log ends: why it failed, as a traceback's last lines."""
+        with contextlib.suppress(OSError), open(self.path('launch.log'), 'rb') as log:
+            log.seek(max(0, os.fstat(log.fileno()).st_size - LAST_WORDS))
+            lines = log.read().decode(errors='replace').split('\n')
+            return '\n'.join(line for line in lines if line.strip()).strip()
+        return ''
 
     def _trim_launch_log(self) -> None:
         with contextlib.suppress(OSError):

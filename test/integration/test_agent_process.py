@@ -622,6 +622,15 @@ def test_a_launch_process_that_dies_takes_its_nodes_along_and_comes_back(rig):
     assert rig.wait('exited', node='again')['returncode'] == 0
 
 
+def test_why_a_launch_process_could_not_begin_is_told(rig):
+    rig.serve(ros_command=['sh', '-c', 'echo before >&2; echo no such library >&2; exit 3'])
+    client = rig.client()
+    client.request('launch')
+    event = rig.wait('launch_exited')
+    assert event['returncode'] == 3
+    assert event['said'] == 'before\nno such library'
+
+
 def test_starting_twice_runs_once(rig):
     rig.serve()
     client = rig.client()
