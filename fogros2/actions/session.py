@@ -315,7 +315,8 @@ class Session:
         if what in _NOTICES:
             level, text = _NOTICES[what]
             # an agent of another version may say less
-            self._logger.log(level, f'{self.spec.name}: ' + text.format_map(_Told(event)))
+            said = f": {event['said']}" if event.get('said') else ''
+            self._logger.log(level, f'{self.spec.name}: {text.format_map(_Told(event))}{said}')
         if what in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
             self._ending = True
             self._loop.call_later(_HOLD, self._let_go)

@@ -408,11 +408,12 @@ def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
 
 
 def test_the_agents_launch_may_end(run, fake, planner, capfd):
-    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9)
+    fake.on_start = lambda machine, node: machine.say(
+        'launch_exited', returncode=-9, said='no such library')
     node = talker(planner)
     assert run(LaunchDescription([node])) == 0
     assert node.return_code == -9
-    assert 'planner: the launch on the machine ended with exit status -9' in (
+    assert 'planner: the launch on the machine ended with exit status -9: no such library' in (
         capfd.readouterr().out)
 
 
