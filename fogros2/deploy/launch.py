@@ -32,6 +32,7 @@ from fogros2.errors import (
     PrerequisiteError,
     StoreError,
 )
+from fogros2.journal import Journal
 from fogros2.model import Command, MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, StepFailed
@@ -55,7 +56,8 @@ class Launch:
     ) -> None:
         self.id = secrets.token_hex(3)
         self.store = store or Store()
-        self.report = report
+        # `ros2 fog status --watch` and the dashboard read what is kept
+        self.report: Reporter = Journal(report, self.store.root / 'launches' / self.id)
         self.timeouts = timeouts or Timeouts()
         self.cancel = cancel or threading.Event()
         self.user_environment = dict(os.environ if environment is None else environment)
@@ -66,7 +68,7 @@ class Launch:
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
         self._programs: dict[str, Sequence[tuple[str, str]]] = {}
-        self.choices = Choices(self.provider, report)
+        self.choices = Choices(self.provider, self.report)
         self._robot: Optional[RobotVpn] = None
         self._rmw = ''
         self._robot_environment: Optional[dict[str, str]] = None
@@ -235,6 +237,7 @@ class Launch:
                     path, vendor.render(interfaces, (), self.user_environment).encode())
                 # for terminals that join
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
+                write_private(path.with_name('domain'), str(self.domain).encode())
                 robot.ensure()
                 self._route(vendor, path.parent)
                 self._robot_environment = dict(

@@ -43,6 +43,7 @@ class LogsVerb(VerbExtension):
 
 def show(event: dict[str, Any], node: Optional[str]) -> None:
     """Print one event of the agent's log."""
+    from ros2fog_cli.api.log import describe
     text = describe(event)
     if text is None or (node and event.get('name') not in (node, None)):
         return
@@ -50,23 +51,3 @@ def show(event: dict[str, Any], node: Optional[str]) -> None:
     stream = sys.stderr if event.get('stream') == 'stderr' else sys.stdout
     for line in text.splitlines() or ['']:
         print(f'{name}{line}', file=stream, flush=True)
-
-
-def describe(event: dict[str, Any]) -> Optional[str]:
-    """Return an event as text, None for those that people needn't see."""
-    kind = event.get('event')
-    if kind == 'output':
-        return str(event.get('text', ''))
-    if kind == 'started':
-        return f"process started with pid [{event.get('pid')}]"
-    if kind == 'exited':
-        return f"process has finished with exit code {event.get('returncode')}"
-    if kind == 'refused':
-        return f"could not be started: {event.get('error')}"
-    if kind == 'watchdog':
-        return f"watchdog: {event.get('reason')}, {event.get('action')}"
-    if kind == 'notice':
-        return f"the provider takes the machine away: {event.get('reason')}"
-    if kind == 'gap':
-        return f"{event.get('count')} older events are not kept any more"
-    return None

@@ -20,11 +20,22 @@ class StatusVerb(VerbExtension):
         add_name(parser)
         add_region(parser)
         add_json(parser)
+        parser.add_argument('--watch', '-w', action='store_true',
+                            help='go on until Ctrl-C; also before the machine is there')
+        parser.add_argument('--interval', type=float, default=1.0, metavar='SECONDS',
+                            help='of --watch, from one look to the next (1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print it; 1 if the machine doesn't run, or an agent that it should have is silent."""
-        from fogros2.errors import FogError
+        from fogros2.errors import ConfigurationError, FogError
         from ros2fog_cli.api import reach
+        if args.watch:
+            from ros2fog_cli.api.watching import watch
+            if not 0.1 <= args.interval <= 3600:
+                raise ConfigurationError(f'--interval {args.interval:g} makes no sense',
+                                         'give 0.1 to 3600 seconds')
+            return watch(args.name, interval=args.interval, regions=args.region,
+                         as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'agent': None}
         problems: list[str] = []
@@ -75,7 +86,8 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
         ('state', status['state']),
         ('address', status['address'] or '-'),
-        *((key, status[key]) for key in ('place', 'kind') if status[key]),
+        *((key.replace('_', ' '), status[key])
+          for key in ('place', 'kind', 'monitor', 'monitor_open') if status[key]),
         ('age', duration(status['age'])),
         ('time left', duration(status['time_left'])),
         ('launch', 'none: it is kept for the next one' if idle else status['launch'] or '-'),

@@ -19,7 +19,7 @@ LAYERS = [
     {'model'},
     {'errors'},
     {'waiting', 'report', 'process', 'plugin_system'},
-    {'store', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
+    {'store', 'journal', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
      'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',
      'kubernetes_cancel', 'kubernetes_config', 'kubernetes_watch', 'workspace', 'wheels',
      'modules', 'bootstrap', 'containers'},

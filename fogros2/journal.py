@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The steps of a launch, kept in its folder while it runs, so that other programs can show them.
+
+A file of JSON lines, one for each event. It goes with the folder when the launch ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import json
+import os
+from pathlib import Path
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2.report import Event, Progress, Reporter, StepDone, StepFailed, StepStarted
+
+#: The file's name in the launch's folder.
+FILE = 'steps.jsonl'
+#: Seconds between two lines on how far a step is.
+PROGRESS_INTERVAL = 0.25
+#: Events that may wait for the folder; a launch that never makes one reports a handful.
+_WAITING = 1000
+
+
+class Journal:
+    """
+    A Reporter that writes down what it hands on; from any thread.
+
+    A line that can't be written (a full disk, the folder gone at the end) is left out: what is
+    shown of a launch must not stop it.
+
+    :param report: gets each event as it comes.
+    :param folder: the launch's; until it exists, events are held back.
+    """
+
+    def __init__(
+        self, report: Reporter, folder: Path, clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._report = report
+        self._folder = folder
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._waiting: list[str] = []
+        self._begun = False
+        self._told: dict[tuple[str, str], float] = {}
+
+    def __call__(self, event: Event) -> None:
+        """Hand an event on, and write it down."""
+        try:
+            self._report(event)
+        finally:
+            self._write(event)
+
+    def _write(self, event: Event) -> None:
+        now = self._clock()
+        with self._lock:
+            line = self._line(event, now)
+            if line is None:
+                return
+            if not self._begun and not self._folder.is_dir():
+                self._waiting = [*self._waiting, line][-_WAITING:]
+                return
+            lines, self._waiting, self._begun = [*self._waiting, line], [], True
+            try:
+                handle = os.open(self._folder / FILE,
+                                 os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+                try:
+                    os.write(handle, ''.join(lines).encode())
+                finally:
+                    os.close(handle)
+            except OSError:
+                return
+
+    def _line(self, event: Event, now: float) -> Optional[str]:
+        about: dict[str, Any]
+        if isinstance(event, StepStarted):
+            about = {'event': 'started'}
+        elif isinstance(event, StepDone):
+            about = {'event': 'done', 'seconds': event.seconds, 'detail': event.detail}
+        elif isinstance(event, StepFailed):
+            about = {'event': 'failed', 'seconds': event.seconds, 'detail': event.reason}
+        elif isinstance(event, Progress):
+            key = (event.machine, event.step)
+            if now - self._told.get(key, 0.0) < PROGRESS_INTERVAL and event.done < event.total:
+                return None
+            self._told[key] = now
+            about = {'event': 'progress', 'done': event.done, 'total': event.total}
+        else:
+            return None
+        return json.dumps({'time': round(now, 3), 'machine': event.machine, 'step': event.step,
+                           **about}) + '\n'
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """
+    A step as it stands.
+
+    :param machine: '' for the robot.
+    :param begin: in seconds since the epoch.
+    :param state: 'running', 'done' or 'failed'.
+    :param seconds: that it took, None while it runs.
+    :param detail: a few words, of one that failed the reason.
+    :param done: bytes of ``total``; both 0 where nobody counts.
+    """
+
+    machine: str
+    step: str
+    begin: float
+    state: str = 'running'
+    seconds: Optional[float] = None
+    detail: str = ''
+    done: int = 0
+    total: int = 0
+
+
+def read(folder: Path) -> list[Step]:
+    """Return a launch's steps in the order in which they began; none where nothing is there."""
+    try:
+        lines = (folder / FILE).read_text(errors='replace').splitlines()
+    except OSError:
+        return []
+    return steps(lines)
+
+
+def steps(lines: list[str]) -> list[Step]:
+    """Return what the lines of a journal tell; a line that is damaged is left out."""
+    found: list[Step] = []
+    for line in lines:
+        try:
+            event = json.loads(line)
+            machine, name = str(event['machine']), str(event['step'])
+            kind, at = event['event'], float(event['time'])
+            if kind == 'started':
+                found.append(Step(machine, name, at))
+                continue
+            index = next((i for i in reversed(range(len(found))) if found[i].state == 'running'
+                          and (found[i].machine, found[i].step) == (machine, name)), None)
+            if kind == 'progress':
+                if index is not None:
+                    found[index] = dataclasses.replace(
+                        found[index], done=int(event['done']), total=int(event['total']))
+            elif kind in ('done', 'failed'):
+                seconds = float(event['seconds'])
+                if index is None:
+                    # an undo that failed is told in the end alone
+                    found.append(Step(machine, name, at - seconds))
+                    index = len(found) - 1
+                found[index] = dataclasses.replace(
+                    found[index], state=kind, seconds=seconds, detail=str(event['detail']))
+        except (ValueError, TypeError, KeyError, RecursionError):
+            continue
+    return found

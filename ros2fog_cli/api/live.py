@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What goes on, kept up to date: this robot's launches, their machines, steps, nodes and links.
+
+``ros2 fog status --watch`` prints it, ``ros2 fog dashboard`` serves it. Nothing is asked while
+nobody looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import dataclasses
+import json
+from pathlib import Path
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2 import journal
+from fogros2.errors import FogError, MachineNotFound
+from fogros2.store import process_alive, Record, robot_name, Store
+from ros2fog_cli.api import endings, machines
+from ros2fog_cli.api.follower import Follower, LogLine
+from ros2fog_cli.api.machines import Entry
+
+#: Seconds between two looks at the store, and two questions to the providers: with machines there
+#: and with none; and for how long somebody who looked counts as looking.
+LOOK, ASK, ASK_SELDOM, PRESENT = 0.25, 15.0, 60.0, 20.0
+#: Seconds for which a machine that has gone, and a launch that is over, are still shown.
+KEPT = 900.0
+#: Steps after which a machine is up, and steps of its way down.
+UP, DOWN = 'agent', ('delete', 'stop', 'keep', 'let go')
+
+
+@dataclasses.dataclass
+class _Shown:
+    """A machine, and all that is known of it; what it was when it has gone."""
+
+    entry: Entry
+    follower: Optional[Follower] = None
+    steps: tuple[journal.Step, ...] = ()
+    launch: str = ''
+    ended: float = 0.0
+    deleting: bool = False
+    trouble: str = ''
+
+
+@dataclasses.dataclass
+class _Launch:
+    """A launch: its process and its steps."""
+
+    pid: int = 0
+    alive: bool = True
+    stamp: tuple[int, int] = (0, 0)
+    steps: tuple[journal.Step, ...] = ()
+    ended: float = 0.0
+
+
+class Live:
+    """
+    The state, kept by threads; :meth:`start` begins, :meth:`close` ends them.
+
+    :param name: of the one machine to look at, None for all.
+    :param regions: places to ask where a provider has some.
+    :param more: what else belongs to the state, asked for each look.
+    """
+
+    def __init__(
+        self, store: Optional[Store] = None, *, name: Optional[str] = None,
+        regions: Optional[list[str]] = None, interval: float = 1.0,
+        more: Optional[Callable[[Live], dict[str, Any]]] = None,
+    ) -> None:
+        self.store = store or Store()
+        self._name, self._regions, self._interval, self._more = name, regions, interval, more
+        self._shown: dict[str, _Shown] = {}
+        self._launches: dict[str, _Launch] = {}
+        self._warnings: list[str] = []
+        self._asked = -1e9
+        self._known: frozenset[tuple[str, Optional[str]]] = frozenset()
+        self._entries: list[Entry] = []
+        self._lock = threading.RLock()
+        self._news = threading.Condition(self._lock)
+        self._wake, self._stopped = threading.Event(), threading.Event()
+        self._version, self._last = 0, ''
+        self._state: dict[str, Any] = {'version': 0}
+        self._looked = -1e9
+        self._threads = [
+            threading.Thread(target=self._keep, name='fog-live', daemon=True),
+            threading.Thread(target=self._keep_asking, name='fog-live-ask', daemon=True)]
+
+    def start(self) -> None:
+        """Begin to look."""
+        self.present()
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End it, and the connections."""
+        self._stopped.set()
+        self._wake.set()
+        with self._lock:
+            followers = [shown.follower for shown in self._shown.values() if shown.follower]
+            self._news.notify_all()
+        for follower in followers:
+            follower.stop()
+        for follower in followers:
+            follower.join(2.0)
+
+    # -- what others ask ------------------------------------------------------------------------
+
+    def present(self) -> None:
+        """Say that somebody looks."""
+        away = not self.watched
+        self._looked = time.monotonic()
+        if away:
+            self._wake.set()
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody has looked of late."""
+        return time.monotonic() - self._looked < PRESENT
+
+    def state(self, after: int = -1, timeout: float = 0.0) -> dict[str, Any]:
+        """
+        Return the state as JSON values, once it is a later one than ``after``.
+
+        :param timeout: seconds after which the same is returned.
+        """
+        self.present()
+        with self._news:
+            self._news.wait_for(
+                lambda: self._version > after or self._stopped.is_set(), timeout)
+            return {**self._state, 'now': time.time()}
+
+    def lines(self, name: str, after: int) -> list[LogLine]:
+        """Return the newer lines of a machine's log."""
+        with self._lock:
+            shown = self._shown.get(name)
+        return shown.follower.lines(after) if shown and shown.follower else []
+
+    def delete(self, name: str, *, force: bool = False) -> None:
+        """
+        Begin to end a machine; what comes of it is in the state.
+
+        :raises FogError: there is none of that name, or a launch has it and ``force`` isn't set.
+        """
+        with self._lock:
+            shown = self._shown.get(name)
+            if shown is None or shown.ended:
+                raise MachineNotFound(name)
+            if shown.deleting:
+                return
+            endings.check_free(shown.entry, force=force)
+            shown.deleting, shown.trouble = True, ''
+        threading.Thread(target=self._delete, args=(shown, force), name='fog-live-delete',
+                         daemon=True).start()
+
+    def _delete(self, shown: _Shown, force: bool) -> None:
+        try:
+            # as its provider knows it now
+            for entry in machines.survey(lambda text: None, name=shown.entry.name,
+                                         regions=self._regions, store=self.store):
+                if entry.own:
+                    endings.delete(entry, self.store, lambda event: None, force=force)
+        except FogError as error:
+            shown.trouble = str(error)
+        finally:
+            shown.deleting = False
+            self._asked = -1e9
+            self._wake.set()
+
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Return the names that nodes of the machines that run have in the graph."""
+        with self._lock:
+            return {name: shown.follower.names for name, shown in self._shown.items()
+                    if shown.follower is not None}
+
+    def running(self) -> list[Record]:
+        """Return the records of machines that are up under a launch that runs."""
+        with self._lock:
+            return [shown.entry.record for shown in self._shown.values()
+                    if shown.follower is not None and shown.entry.record is not None]
+
+    # -- the threads ----------------------------------------------------------------------------
+
+    def _keep(self) -> None:
+        while not self._stopped.is_set():
+            if not self.watched:
+                self._wake.wait(1.0)
+            self._wake.clear()
+            self._look()
+            self._wake.wait(LOOK if self.watched else 0.0)
+
+    def _keep_asking(self) -> None:
+        while not self._stopped.wait(LOOK):
+            if self.watched and time.monotonic() - self._asked >= (
+                    ASK if self._shown else ASK_SELDOM):
+                self._asked = time.monotonic()
+                warnings: list[str] = []
+                entries = machines.survey(warnings.append, name=self._name,
+                                          regions=self._regions, store=self.store)
+                with self._lock:
+                    self._entries, self._warnings = entries, warnings
+                self._wake.set()
+
+    def _look(self) -> None:
+        """Read the store, and tell those who wait if anything is new."""
+        records = {record.name: record for record in self.store.machines()
+                   if self._name in (None, record.name)}
+        known = frozenset((record.name, record.machine_id) for record in records.values())
+        if known != self._known:
+            self._known, self._asked = known, -1e9
+        now = time.time()
+        with self._lock:
+            self._look_at_launches(now)
+            entries = {entry.name: entry for entry in self._entries
+                       if entry.own and entry.record is None}
+            for record in records.values():
+                entries[record.name] = self._entry(record)
+            for name, entry in entries.items():
+                shown = self._shown.setdefault(name, _Shown(entry))
+                shown.entry, shown.ended = entry, 0.0
+            for name, shown in list(self._shown.items()):
+                self._update(shown, now, there=name in entries)
+                if shown.ended and now - shown.ended > KEPT:
+                    del self._shown[name]
+            state = self._make()
+        state.update(self._more(self) if self._more is not None else {})
+        text = json.dumps(state, sort_keys=True)
+        with self._news:
+            if text != self._last:
+                self._version, self._last = self._version + 1, text
+                self._state = {**state, 'version': self._version}
+                self._news.notify_all()
+
+    def _entry(self, record: Record) -> Entry:
+        """Return a record with what its provider said of it last."""
+        for entry in self._entries:
+            if entry.name == record.name and entry.own and (
+                    entry.machine is None or entry.machine.id == record.machine_id):
+                # one that the provider didn't know yet is asked for again
+                asked = entry.asked and (entry.machine is not None or entry.record is not None
+                                         and entry.record.machine_id == record.machine_id)
+                return dataclasses.replace(entry, record=record, asked=asked)
+        return Entry(record.name, record.provider or '?', None, record, False)
+
+    def _look_at_launches(self, now: float) -> None:
+        folder = self.store.root / 'launches'
+        there = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
+        for name, path in there.items():
+            launch = self._launches.setdefault(name, _Launch())
+            launch.pid, launch.alive = _process(path)
+            stamp = _stamp(path / journal.FILE)
+            if stamp != launch.stamp:
+                launch.stamp, launch.steps = stamp, tuple(journal.read(path))
+        for name, launch in list(self._launches.items()):
+            if name not in there:
+                launch.alive = False
+                launch.ended = launch.ended or now
+                if now - launch.ended > KEPT:
+                    del self._launches[name]
+
+    def _update(self, shown: _Shown, now: float, *, there: bool) -> None:
+        record = shown.entry.record
+        if there and record is not None and record.launch:
+            shown.launch = record.launch
+        launch = self._launches.get(shown.launch)
+        if launch is not None:
+            shown.steps = tuple(step for step in launch.steps
+                                if step.machine == shown.entry.name)
+        if not there:
+            shown.ended = shown.ended or now
+        up = there and record is not None and record.launch_alive and bool(record.agent) and (
+            not (launch and launch.steps) or phase(shown.steps) == 'running')
+        if up and shown.follower is None:
+            shown.follower = Follower(shown.entry, self._wake.set, self._interval)
+        elif up and shown.follower is not None:
+            shown.follower.know(shown.entry)
+        elif shown.follower is not None and (
+                record is None or not record.launch_alive or not there):
+            shown.follower.stop()
+            shown.follower = None
+
+    # -- as JSON --------------------------------------------------------------------------------
+
+    def _make(self) -> dict[str, Any]:
+        return {
+            'robot': robot_name(),
+            'warnings': list(self._warnings),
+            'launches': [
+                {'id': name, 'pid': launch.pid, 'alive': launch.alive and not launch.ended,
+                 'steps': [as_json(step) for step in launch.steps if not step.machine]}
+                for name, launch in sorted(
+                    self._launches.items(), key=lambda item: item[1].ended or 1e12)],
+            'machines': [machine_json(shown) for _, shown in sorted(self._shown.items())],
+        }
+
+
+def machine_json(shown: _Shown) -> dict[str, Any]:
+    """Return a machine as JSON values: times in seconds since the epoch, money in US dollars."""
+    entry, follower, record = shown.entry, shown.follower, shown.entry.record
+    agent = follower.agent if follower is not None else None
+    steps = [as_json(step, ended=bool(shown.ended)) for step in shown.steps]
+    return {
+        'name': entry.name, 'provider': entry.provider, 'id': entry.machine_id,
+        'state': 'gone' if shown.ended else entry.state, 'phase': _phase(shown),
+        'launch': shown.launch,
+        'launch_pid': record.pid if record is not None and record.launch_alive else 0,
+        'launch_alive': record is not None and record.launch_alive and not shown.ended,
+        'created': entry.created, 'expires': entry.expires, 'ended': shown.ended or None,
+        'address': entry.address, 'place': entry.place, 'kind': entry.kind,
+        'cost_per_hour': None if entry.cost is None else str(entry.cost),
+        'on_exit': record.spec.on_exit if record is not None else '',
+        'bridge': record.monitor if record is not None else 0,
+        'steps': steps,
+        'vpn': _vpn(follower.vpn) if follower is not None else None,
+        'agent': None if agent is None else {
+            'since': agent.get('since'), 'rss': 1000 * int(agent.get('rss_kb') or 0),
+            'heartbeat_age': agent.get('heartbeat_age')},
+        'nodes': [{key: node.get(key) for key in (
+            'name', 'state', 'pid', 'returncode', 'restarts', 'error')}
+            for node in (agent or {}).get('nodes') or []],
+        'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
+        if follower is not None else [],
+        'log': follower.last if follower is not None else 0,
+        'deleting': shown.deleting, 'trouble': shown.trouble,
+    }
+
+
+def _vpn(vpn: Optional[Mapping[str, Any]]) -> Optional[dict[str, Any]]:
+    if vpn is None:
+        return None
+    age = vpn['handshake_age']
+    return {**{key: vpn[key] for key in (
+        'address', 'interface', 'received', 'sent', 'latency', 'receiving', 'sending')},
+        'handshake': None if age is None else round(time.time() - age)}
+
+
+def as_json(step: journal.Step, *, ended: bool = False) -> dict[str, Any]:
+    """
+    Return a step as JSON values.
+
+    :param ended: the launch is over, and nothing runs any more.
+    """
+    state = 'done' if ended and step.state == 'running' else step.state
+    return {**dataclasses.asdict(step), 'state': state}
+
+
+def phase(steps: tuple[journal.Step, ...]) -> str:
+    """Return where a machine is on its way, by its steps: 'coming', 'running', 'ending'."""
+    found = 'coming'
+    for step in steps:
+        if step.step in DOWN:
+            return 'ending'
+        if step.step == UP and step.state == 'done':
+            found = 'running'
+        elif step.state == 'failed' and found == 'coming':
+            return 'ending'
+    return found
+
+
+def _phase(shown: _Shown) -> str:
+    record = shown.entry.record
+    if shown.ended:
+        return 'gone'
+    if shown.deleting:
+        return 'ending'
+    if record is not None and record.launch_alive:
+        return phase(shown.steps) if shown.steps or not record.agent else 'running'
+    return shown.entry.state.partition(' ')[0]
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_mtime_ns, status.st_size
+
+
+def _process(folder: Path) -> tuple[int, bool]:
+    """Return a launch's process and whether it lives, by what it has written."""
+    try:
+        data = json.loads((folder / 'process.json').read_text())
+        pid = int(data['pid'])
+        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, True  # it has just been made

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine's state as a screenful of text that is drawn anew, or as lines where nobody draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+from decimal import Decimal
+import os
+import shutil
+from typing import Any, TextIO
+
+from ros2fog_cli.api.follower import LogLine
+from ros2fog_cli.api.table import cost, duration, size, table
+
+#: Into the alternate screen and out of it, with the cursor hidden meanwhile.
+_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l', '\x1b[?25h\x1b[?1049l'
+_HOME, _REST, _LINE = '\x1b[H', '\x1b[J', '\x1b[K'
+#: Select graphic rendition: bold, dim, and what states are shown in.
+_STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'bad': '31'}
+_OF_STATE = {
+    'running': 'good', 'done': 'good', 'coming': 'busy', 'starting': 'busy', 'ending': 'busy',
+    'exited': 'dim', 'gone': 'dim', 'failed': 'bad', 'refused': 'bad'}
+_WORDS = {'coming': 'coming up'}
+
+Paint = Callable[[str, str], str]
+
+
+def painter(stream: TextIO) -> Paint:
+    """Return what gives a text a style, where the stream shows any and nobody objects."""
+    if not stream.isatty() or os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb':
+        return plain
+
+    def paint(text: str, style: str) -> str:
+        return f'\x1b[{_STYLES[style]}m{text}\x1b[0m' if style in _STYLES else text
+
+    return paint
+
+
+def plain(text: str, style: str) -> str:
+    """Return the text as it is."""
+    return text
+
+
+def clean(text: str) -> str:
+    """Return a text of others without what a terminal would obey."""
+    return ''.join(c if c.isprintable() else ' ' if c == '\t' else '\N{REPLACEMENT CHARACTER}'
+                   for c in text)
+
+
+def frame(
+    machine: dict[str, Any], lines: Sequence[LogLine], now: float, *, columns: int = 80,
+    rows: int = 24, paint: Paint = plain,
+) -> list[str]:
+    """
+    Return a screenful: no more lines than ``rows``, none longer than ``columns``.
+
+    :param machine: as :func:`ros2fog_cli.api.live.machine_json` has it.
+    :param lines: of its log, of which the last ones are shown.
+    :param now: in seconds since the epoch.
+    """
+    parts: list[tuple[str, str]] = [
+        (f"{machine['name']} ({machine['provider']} {(machine['id'] or '-')[:20]})  "
+         f'{_word(machine["phase"])}{_more(machine, now)}', 'bold')]
+    parts += [(f'{name:10}  {text}', '') for name, text in _about(machine, now)]
+    parts += [(f'! {text}', 'bad') for text in (
+        *machine['problems'], *([machine['trouble']] if machine['trouble'] else []))]
+    if machine['steps']:
+        parts.append(('', ''))
+        parts += _table(('STEP', 'STATE', 'SECONDS', ''), [
+            (step['step'], step['state'], _seconds(step, now), _detail(step))
+            for step in machine['steps']], column=1)
+    if machine['nodes']:
+        parts.append(('', ''))
+        parts += _table(('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS'), [
+            (str(node['name']), str(node['state']), str(node['pid'] or '-'),
+             '-' if node['returncode'] is None else str(node['returncode']),
+             str(node['restarts'] or 0)) for node in machine['nodes']], column=1)
+    room = rows - len(parts) - 1
+    if lines and room > 0:
+        parts.append(('', ''))
+        parts += [(f'[{line.node}] {line.text}' if line.node else line.text, 'dim')
+                  for line in lines[-room:]]
+    # without what a terminal would obey, and cut before it is painted, as colours take no room
+    return [paint(clean(text)[:columns], style) for text, style in parts[:rows]]
+
+
+def _more(machine: dict[str, Any], now: float) -> str:
+    found = ''
+    if machine['created'] is not None:
+        found += f"  {duration(max(0.0, (machine['ended'] or now) - machine['created']))}"
+    if machine['cost_per_hour'] is not None and machine['created'] is not None:
+        rate = Decimal(machine['cost_per_hour'])
+        spent = rate * Decimal(max(0.0, now - machine['created'])) / 3600
+        found += f'  {cost(spent, 4)} so far'
+    return found
+
+
+def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
+    where = '  '.join(machine[key] for key in ('address', 'place', 'kind') if machine[key])
+    if where:
+        yield 'address', where
+    launch = f"{machine['launch']}, process {machine['launch_pid']}" \
+        if machine['launch_alive'] else f"{machine['launch'] or '-'} (over)"
+    left = '' if machine['expires'] is None \
+        else f", {duration(machine['expires'] - now)} left"
+    yield 'launch', launch + left
+    vpn, agent = machine['vpn'], machine['agent']
+    if vpn is not None:
+        shaken = 'none yet' if vpn['handshake'] is None \
+            else f"{duration(max(0.0, now - vpn['handshake']))} ago"
+        latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"
+        yield 'VPN', (f"{vpn['address']} on {vpn['interface']}, handshake {shaken}, "
+                      f'round trip {latency}')
+        yield 'traffic', (
+            f"received {size(vpn['received'])}{_rate(vpn['receiving'])}, "
+            f"sent {size(vpn['sent'])}{_rate(vpn['sending'])}")
+    if agent is not None:
+        beat = agent['heartbeat_age']
+        yield 'agent', (f"since {duration(max(0.0, now - float(agent['since'] or now)))}, "
+                        f"{size(agent['rss'])}, heartbeat "
+                        + ('-' if beat is None else f'{duration(beat)} ago'))
+
+
+def _rate(rate: Any) -> str:
+    return '' if rate is None else f' ({size(rate)}/s)'
+
+
+def _word(state: str) -> str:
+    return _WORDS.get(state, state)
+
+
+def _seconds(step: dict[str, Any], now: float) -> str:
+    if step['seconds'] is not None:
+        return f"{step['seconds']:.2f}"
+    return f"{max(0.0, now - step['begin']):.1f}" if step['state'] == 'running' else '-'
+
+
+def _detail(step: dict[str, Any]) -> str:
+    if step['state'] == 'running' and step['done']:
+        return f"{size(step['done'])}" + (f" of {size(step['total'])}" if step['total'] else '')
+    return str(step['detail'])
+
+
+def _table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], *, column: int,
+) -> list[tuple[str, str]]:
+    styles = ['dim', *(_OF_STATE.get(row[column], '') for row in rows)]
+    clean_rows = [[clean(word).replace('\n', ' ') for word in row] for row in rows]
+    return list(zip(table(header, clean_rows).split('\n'), styles))
+
+
+def summary(machine: dict[str, Any]) -> str:
+    """Return what changes seldom, in a line: for a file or a pipe."""
+    parts = [_word(machine['phase'])]
+    parts += [f"{step['step']} {step['state']}"
+              + (f" after {step['seconds']:.2f} s" if step['seconds'] is not None else '')
+              for step in machine['steps'][-1:]]
+    parts += [f"{node['name']} {node['state']}"
+              + (f", {node['restarts']} restarts" if node['restarts'] else '')
+              for node in machine['nodes']]
+    return clean(f"{machine['name']}: " + '; '.join([*parts, *machine['problems']]))
+
+
+@contextlib.contextmanager
+def alternate(stream: TextIO) -> Iterator[Callable[[Sequence[str]], None]]:
+    """Yield what draws a screenful in the terminal's other screen; it is left in any case."""
+    stream.write(_ENTER)
+
+    def draw(lines: Sequence[str]) -> None:
+        stream.write(_HOME + '\r\n'.join(f'{line}{_LINE}' for line in lines) + _REST)
+        stream.flush()
+
+    try:
+        yield draw
+    finally:
+        stream.write(_LEAVE)
+        stream.flush()
+
+
+def terminal_size() -> tuple[int, int]:
+    """Return columns and rows of the terminal as it is now."""
+    return shutil.get_terminal_size()

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog status --watch``: a machine's state until Ctrl-C, over one connection."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any, Optional
+
+from fogros2.store import check_name
+from ros2fog_cli.api import screen
+from ros2fog_cli.api.live import Live
+
+_WAITING = 'no such machine yet'
+
+
+def watch(
+    name: str, *, interval: float = 1.0, regions: Optional[list[str]] = None,
+    as_json: bool = False,
+) -> int:
+    """
+    Show a machine's state each ``interval`` seconds; of a pipe or a file, what changes.
+
+    :param as_json: a line of JSON for each change instead.
+    :raises ConfigurationError: no machine can be called so.
+    """
+    live = Live(name=check_name(name), regions=regions, interval=max(0.5, interval))
+    live.start()
+    try:
+        if as_json or not sys.stdout.isatty():
+            _lines(live, name, interval, as_json)
+        else:
+            _screen(live, name, interval)
+    except KeyboardInterrupt:
+        pass  # the way out
+    finally:
+        live.close()
+    return 0
+
+
+def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
+    return next((one for one in state.get('machines', []) if one['name'] == name), None)
+
+
+def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
+    said: Optional[str] = None
+    version = -1
+    while True:
+        state = live.state(version, 3600.0)
+        version = state['version']
+        machine = _machine(state, name)
+        if as_json:
+            text = json.dumps(machine)
+        else:
+            text = screen.summary(machine) if machine is not None else f'{name}: {_WAITING}'
+        if text != said and version > 0:
+            said = text
+            print(text if as_json else f'{time.strftime("%H:%M:%S")} {text}', flush=True)
+        time.sleep(interval)
+
+
+def _screen(live: Live, name: str, interval: float) -> None:
+    paint = screen.painter(sys.stdout)
+    with screen.alternate(sys.stdout) as draw:
+        while True:
+            begin = time.monotonic()
+            state = live.state()
+            columns, rows = screen.terminal_size()
+            machine = _machine(state, name)
+            if machine is None:
+                shown = [f'{name}: {_WAITING}']
+            else:
+                shown = screen.frame(machine, live.lines(name, 0), state['now'],
+                                     columns=columns, rows=rows - 1, paint=paint)
+            foot = f'{time.strftime("%H:%M:%S")}, each {interval:g} s; Ctrl-C leaves'
+            draw([*shown, *[''] * (rows - 1 - len(shown)), paint(foot[:columns], 'dim')])
+            time.sleep(max(0.05, interval - (time.monotonic() - begin)))

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a live view shows of a launch: its steps by the journal, and a machine as text."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import re
+import threading
+from typing import Any
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import journal
+from fogros2.journal import Journal, Step
+from fogros2.report import (
+    Event,
+    OutputLine,
+    Progress,
+    silent,
+    step,
+    StepDone,
+    StepFailed,
+    StepStarted,
+)
+from ros2fog_cli.api import live, screen
+from ros2fog_cli.api.follower import LogLine, node_name, rates
+from ros2fog_cli.api.reach import Link
+
+
+def test_a_journal_hands_on_and_keeps(tmp_path: Path) -> None:
+    heard: list[Event] = []
+    times = iter([100.0, 101.0, 102.0, 103.0, 103.1, 104.0])
+    folder = tmp_path / 'launch'
+    keep = Journal(heard.append, folder, clock=lambda: next(times))
+    keep(StepStarted('', 'VPN'))
+    assert journal.read(folder) == []
+    folder.mkdir()
+    keep(StepStarted('a', 'workspace'))
+    keep(StepDone('', 'VPN', 2.0, 'up'))
+    keep(Progress('a', 'workspace', 10, 100))
+    keep(Progress('a', 'workspace', 20, 100))  # too soon after the other
+    keep(StepFailed('a', 'workspace', 3.0, 'no room'))
+    assert len(heard) == 6
+    assert journal.read(folder) == [
+        Step('', 'VPN', 100.0, 'done', 2.0, 'up'),
+        Step('a', 'workspace', 101.0, 'failed', 3.0, 'no room', 10, 100)]
+    assert (folder / journal.FILE).stat().st_mode & 0o777 == 0o600
+
+
+def test_a_journal_without_a_place_stops_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / 'launch'
+    folder.mkdir()
+    keep = Journal(silent, folder)
+    with step(keep, 'a', 'machine'):
+        pass
+    (folder / journal.FILE).unlink()
+    folder.rmdir()  # as at the end of a launch
+    with pytest.raises(ValueError, match='why'), step(keep, 'a', 'delete'):
+        raise ValueError('why')
+    keep(OutputLine('a', 'not kept'))
+    assert not folder.exists()
+
+
+def test_a_journal_takes_events_of_several_threads(tmp_path: Path) -> None:
+    keep = Journal(silent, tmp_path)
+
+    def many(name: str) -> None:
+        for _ in range(50):
+            with step(keep, name, 'machine'):
+                pass
+
+    threads = [threading.Thread(target=many, args=(name,)) for name in 'abcd']
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [s.state for s in journal.read(tmp_path)] == ['done'] * 200
+
+
+@pytest.mark.parametrize('line', [
+    '', 'x', '[]', '{}', '{"time": 1, "machine": "a", "step": "s", "event": "done"}',
+    '{"time": "x", "machine": "a", "step": "s", "event": "started"}',
+    '{"time": 1, "machine": "a", "step": "s", "event": "progress", "done": 1, "total": 2}',
+    '{"time": 1, "machine": "a", "st', '[' * 100_000])
+def test_a_damaged_line_is_left_out(line: str) -> None:
+    good = '{"time": 1, "machine": "a", "step": "s", "event": "started"}'
+    assert journal.steps([line, good, line]) in (
+        [Step('a', 's', 1.0)], [Step('a', 's', 1.0, done=1, total=2)])
+
+
+def test_an_undo_that_failed_is_told_alone() -> None:
+    line = ('{"time": 10, "machine": "a", "step": "left there", "event": "failed", '
+            '"seconds": 2, "detail": "silent"}')
+    assert journal.steps([line]) == [Step('a', 'left there', 8.0, 'failed', 2.0, 'silent')]
+
+
+@pytest.mark.parametrize(('steps', 'expected'), [
+    ([], 'coming'),
+    ([('machine', 'done'), ('agent', 'running')], 'coming'),
+    ([('machine', 'failed'), ('undo', 'done')], 'ending'),
+    ([('agent', 'done')], 'running'),
+    ([('agent', 'done'), ('Python modules', 'failed')], 'running'),
+    ([('agent', 'done'), ('delete', 'running')], 'ending'),
+    ([('agent', 'done'), ('let go', 'done')], 'ending'),
+])
+def test_the_phase_by_the_steps(steps: list[tuple[str, str]], expected: str) -> None:
+    assert live.phase(tuple(Step('a', name, 1.0, state) for name, state in steps)) == expected
+
+
+@pytest.mark.parametrize(('words', 'expected'), [
+    (['/usr/bin/python3', '/opt/ros/lib/p/talker', '--ros-args', '-r', '__node:=speaker'],
+     'speaker'),
+    (['/usr/bin/python3', '/opt/ros/lib/p/talker.py', '-x'], 'talker'),
+    (['/opt/ros/lib/p/listener', '--ros-args', '-p', 'a:=/b'], 'listener'),
+    (['sleep', '1'], ''), ([], '')])
+def test_the_name_of_a_process_in_the_graph(words: list[str], expected: str) -> None:
+    assert node_name(words) == expected
+
+
+def test_rates_between_two_looks() -> None:
+    first = Link('198.18.0.2', 'fog1', received=1000.0, sent=50.0)
+    before = {**rates(None, first, 10.0), **dataclasses.asdict(first)}
+    assert (before['receiving'], before['sending']) == (None, None)
+    second = dataclasses.replace(first, received=3000.0, sent=10.0)
+    assert rates(before, second, 12.0) == {'at': 12.0, 'receiving': 1000.0, 'sending': None}
+    assert rates(before, second, 10.1)['at'] == 10.0
+
+
+def machine(**changes: Any) -> dict[str, Any]:
+    return {
+        'name': 'planner', 'provider': 'aws', 'id': 'i-1', 'state': 'running',
+        'phase': 'running', 'launch': 'abc123', 'launch_pid': 7, 'launch_alive': True,
+        'created': 1000.0, 'expires': 4600.0, 'ended': None, 'address': '198.51.100.7',
+        'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '3.6',
+        'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
+        'log': 0, 'agent': {'since': 1010.0, 'rss': 14_000_000, 'heartbeat_age': 1.0},
+        'vpn': {'address': '198.18.0.2', 'interface': 'fogabc', 'received': 5e6, 'sent': 1e3,
+                'latency': 20.5, 'receiving': 2e5, 'sending': None, 'handshake': 1090},
+        'steps': [{'step': 'machine', 'state': 'done', 'seconds': 12.3, 'begin': 1000.0,
+                   'detail': 'there', 'done': 0, 'total': 0},
+                  {'step': 'workspace', 'state': 'running', 'seconds': None, 'begin': 1095.0,
+                   'detail': '', 'done': 5_000_000, 'total': 10_000_000}],
+        'nodes': [{'name': 'slam-1', 'state': 'running', 'pid': 12, 'returncode': -9,
+                   'restarts': 2, 'error': None}], **changes}
+
+
+def test_a_machine_as_a_screenful() -> None:
+    lines = [LogLine(n, 1.0, 'slam-1', False, f'line {n}') for n in range(1, 100)]
+    shown = screen.frame(machine(), lines, 1100.0, columns=90, rows=20)
+    text = '\n'.join(shown)
+    assert len(shown) == 20
+    assert shown[0] == 'planner (aws i-1)  running  100 s  $0.1000 so far'
+    assert 'handshake 10 s ago, round trip 20.50 ms' in text
+    assert 'received 5.0 MB (200.0 kB/s), sent 1.0 kB' in text
+    assert re.search(r'^workspace +running +5\.0 +5\.0 MB of 10\.0 MB$', text, re.MULTILINE)
+    assert re.search(r'^slam-1 +running +12 +-9 +2$', text, re.MULTILINE)
+    assert '58 min left' in text and shown[-1] == '[slam-1] line 99'
+    assert [len(line) <= 30 for line in screen.frame(machine(), lines, 1100.0, columns=30,
+                                                     rows=9)] == [True] * 9
+    gone = machine(phase='gone', vpn=None, agent=None, steps=[], nodes=[], ended=1050.0,
+                   launch_alive=False, cost_per_hour=None)
+    assert screen.frame(gone, [], 1100.0)[0] == 'planner (aws i-1)  gone  50 s'
+
+
+def test_what_a_node_prints_commands_no_terminal() -> None:
+    bad = '\x1b]0;owned\x07\x1b[2J\x9b31mred\r\n'
+    lines = [LogLine(1, 1.0, f'n{bad}', True, f'before {bad}after')]
+    shown = screen.frame(machine(problems=[bad], nodes=[
+        {**machine()['nodes'][0], 'name': bad}]), lines, 1100.0, rows=40)
+    assert 'owned' in '\n'.join(shown)
+    for line in [*shown, screen.summary(machine(problems=[bad]))]:
+        assert line.isprintable(), line
+
+
+def test_what_changes_seldom_in_a_line() -> None:
+    assert screen.summary(machine(phase='coming')) == (
+        'planner: coming up; workspace running; slam-1 running, 2 restarts')
+
+
+@pytest.mark.parametrize('seconds', ['0', '-1', 'nan', '1e9'])
+def test_an_interval_that_makes_no_sense(seconds: str) -> None:
+    said = main(argv=['fog', 'status', 'planner', '--watch', '--interval', seconds])
+    assert 'makes no sense' in str(said)
+
+
+def test_a_name_that_no_machine_can_have() -> None:
+    assert 'no name for a machine' in str(main(argv=['fog', 'status', '../up', '--watch']))
+
+
+def test_a_step_as_json_when_all_is_over() -> None:
+    running = Step('a', 'delete', 1.0)
+    assert live.as_json(running)['state'] == 'running'
+    assert live.as_json(running, ended=True)['state'] == 'done'
+    json.dumps(live.as_json(running))
