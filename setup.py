@@ -55,7 +55,7 @@ setup(
     python_requires='>=3.10',
     packages=find_packages(include=[
         'fogros2*', 'fogros2_examples*', 'image_transport_h264*', 'ros2fog_cli*']),
-    package_data={'fogros2': ['py.typed']},
+    package_data={'fogros2': ['py.typed', 'monitor/dashboard/page.html']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
@@ -133,6 +133,7 @@ setup(
         ],
         'fogros2.verb': [
             'connect = ros2fog_cli.verb.connect:ConnectVerb',
+            'dashboard = ros2fog_cli.verb.dashboard:DashboardVerb',
             'delete = ros2fog_cli.verb.delete:DeleteVerb',
             'doctor = ros2fog_cli.verb.doctor:DoctorVerb',
             'env = ros2fog_cli.verb.env:EnvVerb',

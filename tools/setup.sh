@@ -75,6 +75,7 @@ LIST
             if known "$name"; then echo "$name"; break; fi
         done
         have busybox || echo busybox
+        have chromium || have google-chrome || ! known chromium || echo chromium
     fi
     # FFmpeg's own programs judge the streams that ours make
     [ "$target" = demo ] || have ffmpeg || echo ffmpeg

@@ -472,14 +472,14 @@ def test_sizes_and_costs() -> None:
 def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 0
     said = capsys.readouterr().out
-    for verb in ('connect', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs', 'price',
-                 'regions', 'status'):
+    for verb in ('connect', 'dashboard', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs',
+                 'price', 'regions', 'status'):
         assert verb in said
 
 
 @pytest.mark.parametrize('words', [
-    [], ['connect'], ['delete'], ['doctor'], ['env'], ['gc'], ['image'], ['list'], ['logs'],
-    ['price'], ['regions'], ['status']], ids=' '.join)
+    [], ['connect'], ['dashboard'], ['delete'], ['doctor'], ['env'], ['gc'], ['image'], ['list'],
+    ['logs'], ['price'], ['regions'], ['status']], ids=' '.join)
 def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
     # beside what ros2cli loads for a command of its own
     code = ('import sys\nfrom ros2cli.cli import main\n'

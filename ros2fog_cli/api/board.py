@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the dashboard shows: the live state, and the graphs of the launches that run."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Optional
+
+from fogros2.store import Store
+from ros2fog_cli.api.live import Live
+
+
+class Board:
+    """
+    The dashboard's source; see :class:`fogros2.monitor.dashboard.server.Source`.
+
+    :param topics: whether to join launches, for rates of topics and pictures.
+    """
+
+    def __init__(
+        self, store: Optional[Store] = None, *, regions: Optional[list[str]] = None,
+        topics: bool = True,
+    ) -> None:
+        self._live = Live(store, regions=regions)
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._live.start()
+
+    def close(self) -> None:
+        """End all that was begun."""
+        self._live.close()
+
+    def state(self, after: int, timeout: float) -> dict[str, Any]:
+        """Return the state once it is a later one."""
+        return self._live.state(after, timeout)
+
+    def log(self, machine: str, after: int) -> list[dict[str, Any]]:
+        """Return a machine's newer log lines."""
+        return [dataclasses.asdict(line) for line in self._live.lines(machine, after)]
+
+    def picture(self, topic: str) -> Optional[bytes]:
+        """Return the last picture of a topic."""
+        return None
+
+    def delete(self, machine: str, force: bool) -> None:
+        """Begin to end a machine."""
+        self._live.delete(machine, force=force)

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who gets something from the dashboard, and what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import http.client
+import json
+import re
+import socket
+import threading
+from typing import Any, Optional
+
+import pytest
+
+from fogros2.errors import NameTaken
+from fogros2.monitor.dashboard.server import content_policy, Dashboard, PAGE, TOKEN
+
+
+class Canned:
+    """A source that remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+
+    def state(self, after: int, timeout: float) -> dict[str, Any]:
+        self.asked.append(('state', after))
+        return {'version': 1, 'machines': []}
+
+    def log(self, machine: str, after: int) -> list[dict[str, Any]]:
+        self.asked.append(('log', machine, after))
+        return [{'number': after + 1, 'text': '</script><b>'}]
+
+    def picture(self, topic: str) -> Optional[bytes]:
+        return b'\xff\xd8picture' if topic == '/camera' else None
+
+    def delete(self, machine: str, force: bool) -> None:
+        self.asked.append(('delete', machine, force))
+        if machine == 'taken':
+            raise NameTaken('a launch has it', 'end that')
+
+
+@pytest.fixture
+def dashboard() -> Iterator[Dashboard]:
+    made = Dashboard(Canned())
+    thread = threading.Thread(target=made.serve, daemon=True)
+    thread.start()
+    yield made
+    made.close()
+
+
+def ask(
+    dashboard: Dashboard, path: str, *, method: str = 'GET', body: Any = None,
+    **headers: Optional[str],
+) -> tuple[int, bytes, dict[str, str]]:
+    link = http.client.HTTPConnection('127.0.0.1', dashboard.port, timeout=10)
+    told = {TOKEN: dashboard.token, **{
+        key.replace('_', '-'): value for key, value in headers.items()}}
+    if body is not None:
+        told.setdefault('Content-Type', 'application/json')
+    try:
+        link.request(method, path, body=body,
+                     headers={key: value for key, value in told.items() if value is not None})
+        answer = link.getresponse()
+        return answer.status, answer.read(), dict(answer.getheaders())
+    finally:
+        link.close()
+
+
+def asked(dashboard: Dashboard) -> list[tuple[Any, ...]]:
+    source = dashboard.source
+    assert isinstance(source, Canned)
+    return source.asked
+
+
+def test_what_is_there(dashboard: Dashboard) -> None:
+    assert json.loads(ask(dashboard, '/api/state?after=7')[1]) == {'version': 1, 'machines': []}
+    assert json.loads(ask(dashboard, '/api/log?machine=a%20b&after=3')[1])[0]['number'] == 4
+    assert asked(dashboard) == [('state', 7), ('log', 'a b', 3)]
+    status, data, headers = ask(dashboard, '/api/picture?topic=/camera')
+    assert (status, data, headers['Content-Type']) == (200, b'\xff\xd8picture', 'image/jpeg')
+    assert ask(dashboard, '/api/picture?topic=/other')[0] == 404
+    status, data, headers = ask(dashboard, '/', **{TOKEN: None})
+    assert status == 200 and data == PAGE.read_bytes()
+    assert dashboard.token.encode() not in data
+    assert headers['X-Content-Type-Options'] == 'nosniff'
+    assert headers['Cache-Control'] == 'no-store'
+    assert "frame-ancestors 'none'" in headers['Content-Security-Policy']
+
+
+def test_a_machine_is_deleted(dashboard: Dashboard) -> None:
+    wish = json.dumps({'name': 'planner', 'force': True})
+    assert ask(dashboard, '/api/delete', method='POST', body=wish)[0] == 200
+    status, data, _ = ask(dashboard, '/api/delete', method='POST', body='{"name": "taken"}')
+    assert (status, json.loads(data)) == (409, {'error': 'a launch has it', 'hint': 'end that'})
+    assert asked(dashboard) == [('delete', 'planner', True), ('delete', 'taken', False)]
+
+
+@pytest.mark.parametrize(('headers', 'status'), [
+    ({TOKEN: None}, 401),
+    ({TOKEN: 'x' * 32}, 401),
+    ({TOKEN: ''}, 401),
+    ({TOKEN: '\xe4'}, 401),
+    ({'Host': 'evil.example'}, 421),
+    ({'Host': 'evil.example:{port}'}, 421),
+    ({'Host': '127.0.0.1'}, 421),
+    ({'Host': '127.0.0.1.evil.example:{port}'}, 421),
+    ({'Host': ''}, 421),
+    ({'Origin': 'http://evil.example'}, 403),
+    ({'Origin': 'null'}, 403),
+    ({'Origin': 'http://127.0.0.1:1'}, 403),
+    ({'Origin': 'https://127.0.0.1:{port}'}, 403),
+    ({'Origin': 'http://localhost:{port}'}, 403),
+    ({'Sec-Fetch-Site': 'cross-site'}, 403),
+    ({'Sec-Fetch-Site': 'same-site'}, 403),
+    ({'Host': 'localhost:{port}', 'Origin': 'http://localhost:{port}'}, 200),
+    ({'Origin': 'http://127.0.0.1:{port}', 'Sec-Fetch-Site': 'same-origin'}, 200),
+])
+def test_who_gets_in(
+    dashboard: Dashboard, headers: dict[str, Optional[str]], status: int,
+) -> None:
+    told = {key: value and value.replace('{port}', str(dashboard.port))
+            for key, value in headers.items()}
+    assert ask(dashboard, '/api/state', **told)[0] == status
+    wish = json.dumps({'name': 'planner'})
+    assert ask(dashboard, '/api/delete', method='POST', body=wish, **told)[0] == status
+    assert len(asked(dashboard)) == (2 if status == 200 else 0)
+
+
+@pytest.mark.parametrize('body', [
+    '', 'x', '[]', '"planner"', 'null', '{}', '{"name": 1}', '{"name": "a", "force": "yes"}',
+    '[' * 9000, '{"name": "' + 'a' * 20_000 + '"}'], ids=lambda body: body[:12])
+def test_a_wish_that_is_none(dashboard: Dashboard, body: str) -> None:
+    status, data, _ = ask(dashboard, '/api/delete', method='POST', body=body)
+    assert status == 400 and 'wish' in json.loads(data)['error']
+    assert asked(dashboard) == []
+
+
+def test_a_wish_as_a_form_would_send_it(dashboard: Dashboard) -> None:
+    for kind in ('text/plain', 'application/x-www-form-urlencoded', 'multipart/form-data'):
+        assert ask(dashboard, '/api/delete', method='POST', body='{"name": "a"}',
+                   Content_Type=kind)[0] == 415
+    assert ask(dashboard, '/api/delete?name=a')[0] == 404
+    assert ask(dashboard, '/api/delete', method='PUT', body='{}')[0] == 501
+    assert asked(dashboard) == []
+
+
+@pytest.mark.parametrize('path', [
+    '/api/', '/api/states', '/etc/passwd', '/../server.py', '//evil.example/', '/page.html',
+    '/favicon.ico'])
+def test_nothing_else_is_there(dashboard: Dashboard, path: str) -> None:
+    assert ask(dashboard, path)[0] == 404
+
+
+def test_numbers_that_are_none(dashboard: Dashboard) -> None:
+    assert ask(dashboard, '/api/state?after=x')[0] == 400
+    assert ask(dashboard, '/api/log?machine=a&after=')[0] == 200
+
+
+def test_only_the_loopback_hears(dashboard: Dashboard) -> None:
+    own = socket.gethostbyname(socket.gethostname())
+    if own.startswith('127.'):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(('198.51.100.1', 9))  # sends nothing: only asks for our own address
+            own = probe.getsockname()[0]
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((own, dashboard.port), timeout=5).close()
+
+
+def test_each_one_has_a_token_of_its_own() -> None:
+    one, other = Dashboard(Canned()), Dashboard(Canned())
+    try:
+        assert one.token != other.token and len(one.token) >= 32
+        assert one.url == f'http://127.0.0.1:{one.port}/#{one.token}'
+    finally:
+        one.close()
+        other.close()
+
+
+def test_the_page_asks_nobody_else_and_makes_no_markup_of_what_it_is_told() -> None:
+    page = PAGE.read_text()
+    for words in ('innerHTML', 'outerHTML', 'insertAdjacentHTML', 'document.write', 'eval(',
+                  'new Function', 'onclick="'):
+        assert words not in page, words
+    addresses = set(re.findall(r'https?://[^\s\'"]+', page))
+    assert addresses == {'http://www.w3.org/2000/svg'}  # the name of SVG, which nobody asks for
+    assert not re.search(r'<(script|link|img|iframe)[^>]+(src|href)="(?!data:)', page)
+
+
+def test_the_policy_names_the_pages_own_script() -> None:
+    policy = content_policy('<style>a</style><script>b</script>')
+    assert "script-src 'sha256-PiPoFgA5WUoziU9lZOGxNIu9egCI1CxKy3PurtWcAJ0='" in policy
+    assert "default-src 'none'" in policy and 'unsafe' not in policy
