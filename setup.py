@@ -97,7 +97,7 @@ setup(
             'local = fogros2.shell.local:LocalShell',
         ],
         'fogros2.vpn': [
-            'wireguard = fogros2.vpn.wireguard:WireGuard',
+            'wireguard = fogros2.vpn.helped:HelpedWireGuard',
         ],
         'fogros2.dds': [
             'rmw_cyclonedds_cpp = fogros2.dds.cyclonedds:CycloneDds',

@@ -18,6 +18,8 @@ from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, Prerequisi
 from fogros2.model import Command, Result
 
 HERE = 'this computer'
+#: Why sudo gives no root before its password was asked, and what to do about it.
+PASSWORD = 'sudo wants a password', 'run `sudo -v` first'
 #: launch empties ``os.environ`` for a moment whenever a scoped group ends, while our threads run.
 _ENVIRONMENT = dict(os.environ)
 
@@ -66,6 +68,23 @@ def refresh_ticket(*, timeout: float = 10.0) -> bool:
     return not sudo_trouble(timeout=timeout)
 
 
+def ask_for_ticket(what: str) -> bool:
+    """
+    Have sudo ask for the password at the terminal; False if nobody sits there or it is refused.
+
+    :param what: a few words that the question names, such as 'for the VPN interface'.
+    """
+    try:
+        # who is in the background would be stopped for reading
+        if not os.isatty(0) or os.tcgetpgrp(0) != os.getpgrp():
+            return False
+    except OSError:
+        return False
+    prompt = f'[sudo] password for %p, {what}: '
+    # Ctrl-C at the question is for sudo as for us, so it stays in our group
+    return subprocess.run(('sudo', '-v', '-p', prompt), env=_ENVIRONMENT).returncode == 0
+
+
 def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
     """Return why sudo gives no root at this moment and what to do about it, None if it does."""
     if os.geteuid() == 0:
@@ -78,7 +97,7 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
         # it says so to those, too, who may not use it at all; asked for a ticket alone it doesn't
         said = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or said
     if 'password is required' in said or 'terminal is required' in said:
-        return 'sudo wants a password', 'run `sudo -v` first'
+        return PASSWORD
     if 'may not run sudo' in said or 'not in the sudoers' in said or 'not allowed' in said:
         return ('this user may not use sudo',
                 "ask the computer's administrator, or let a user who may launch it")
@@ -230,4 +249,7 @@ def _signal_as_root(group: int, number: signal.Signals) -> None:
         killer.wait()
     if killer.returncode != 0:
         # the ticket is over, or there is nobody left
-        os.killpg(group, number)
+        try:
+            os.killpg(group, number)
+        except PermissionError:
+            pass  # root's, as the helper of the VPN is, which has a time limit of its own

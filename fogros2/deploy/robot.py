@@ -6,13 +6,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import shutil
+import threading
 
 from fogros2 import plugin_system, process
 from fogros2.errors import PrerequisiteError
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step
 from fogros2.store import Record, Store
-from fogros2.vpn import Vpn
+from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 
 #: Programs that the robot's side calls, and the Debian packages that have them.
@@ -20,6 +21,9 @@ ROBOT_PROGRAMS = {
     'ip': 'iproute2', 'wg': 'wireguard-tools', 'nft': 'nftables', 'rsync': 'rsync',
     'ssh-keygen': 'openssh-client',
 }
+
+#: Held while sudo may ask, so that two threads don't ask at once.
+_ASKING = threading.Lock()
 
 
 def provider(name: str) -> Provider:
@@ -39,24 +43,31 @@ def check_robot() -> None:
     :raises PrerequisiteError: a program, a right or a device is missing.
     """
     process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
-    if os.geteuid() != 0:
-        check_sudo()
+    if os.geteuid() != 0 and not helped.permitted():
+        with _ASKING:
+            check_sudo(ask=True)
     if not Path('/dev/net/tun').exists():
         raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
 
 
-def check_sudo() -> None:
+def check_sudo(*, ask: bool = False) -> None:
     """
     Check that root's commands run without a question in the middle of a launch.
 
+    :param ask: have sudo ask for its password now, where somebody sits at a terminal.
     :raises PrerequisiteError: they don't.
     """
     if process.which('sudo') is None:
         raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
                                 'run the launch as root, or install sudo')
     trouble = process.sudo_trouble()
+    if ask and trouble == process.PASSWORD and process.ask_for_ticket('for the VPN interface'):
+        trouble = process.sudo_trouble()
     if trouble is not None:
-        raise PrerequisiteError(f'a VPN interface takes root, and {trouble[0]}', trouble[1])
+        reason, remedy = trouble
+        if Path(helped.HELPER).exists():
+            remedy += f', or have an administrator put you into the group {helped.GROUP}'
+        raise PrerequisiteError(f'a VPN interface takes root, and {reason}', remedy)
 
 
 def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:

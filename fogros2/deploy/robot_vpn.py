@@ -14,7 +14,7 @@ from fogros2 import plan, plugin_system, process
 from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import step, StepFailed
-from fogros2.vpn import addresses, Vpn
+from fogros2.vpn import addresses, helped, Vpn
 
 if TYPE_CHECKING:
     from fogros2.deploy.launch import Launch
@@ -32,6 +32,7 @@ class RobotVpn:
 
     #: Whether nothing of it is on this computer.
     down = True
+    _ticket = True
     _told_of_sudo = False
 
     def __init__(self, launch: Launch, folder: Path) -> None:
@@ -49,6 +50,11 @@ class RobotVpn:
         self.interface = plan.robot_interface(
             launch.id, network, addresses.choose_port(launch.user_environment),
             str(folder / 'vpn.key'))
+        if helped.permitted():
+            self.interface = dataclasses.replace(
+                self.interface, key_file=helped.key_file(self.interface.name))
+            # the ticket then serves container machines alone: who has none needs none
+            self._ticket = process.refresh_ticket()
 
     def ensure(self) -> Peer:
         """
@@ -146,7 +152,7 @@ class RobotVpn:
         asked = time.monotonic()
         pause = 1.0
         while not self._stop.wait(pause):
-            if time.monotonic() - asked > TICKET_REFRESH:
+            if self._ticket and time.monotonic() - asked > TICKET_REFRESH:
                 asked = time.monotonic()
                 self._refresh_ticket()
             with self._lock:

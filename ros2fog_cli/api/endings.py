@@ -30,7 +30,7 @@ from fogros2.errors import (
 from fogros2.model import Command, Machine, MachineState, VpnInterface
 from fogros2.report import Reporter
 from fogros2.store import process_alive, Record, Store
-from fogros2.vpn import Vpn
+from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
@@ -283,9 +283,10 @@ def clear(leftover: Leftover) -> None:
 
     :raises FogError: something could not be taken away.
     """
+    name = f'fog{leftover.launch}'
     interface = VpnInterface(
-        f'fog{leftover.launch}', '127.0.0.1', '127.0.0.1/32', 0,
-        str(leftover.folder / 'vpn.key'), guarded=True)
+        name, '127.0.0.1', '127.0.0.1/32', 0,
+        helped.key_of(name) or str(leftover.folder / 'vpn.key'), guarded=True)
     _take_down(interface, 'wireguard')
     shutil.rmtree(leftover.folder, ignore_errors=True)
 

@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The VPN's helper with real users, real sudo and real interfaces.
+
+All of it happens on a copy of this computer: its files below a throw-away layer, in namespaces of
+their own with no way out. Users, rights and programs are put there as an administrator would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import json
+import os
+from pathlib import Path
+import pty
+import re
+import shlex
+import subprocess
+import sys
+import threading
+from typing import Any
+
+import pytest
+
+from fogros2 import process
+from fogros2.model import Command, Result
+from fogros2.waiting import wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+HELPER = '/usr/libexec/fogros2/vpn'
+RULES = '/etc/sudoers.d/fogros2-vpn'
+NAME, OTHER = 'fog0a1b2c', 'fog0a1b2d'
+KEY = 'Sg3Q0Y1Y0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHo='
+#: Everything is there as on this computer, and nothing that is written reaches it.
+ENTER = """\
+mount -t tmpfs tmpfs "$1"
+mkdir "$1/upper" "$1/work" "$1/root"
+mount -t overlay overlay -o "lowerdir=/,upperdir=$1/upper,workdir=$1/work" "$1/root"
+cd "$1/root"
+mount -t proc proc proc
+mount -t sysfs sysfs sys
+mount --rbind /dev dev
+mount -t tmpfs -o mode=755 tmpfs run
+ip link set lo up
+trap exit TERM
+echo ready
+sleep 600 &
+wait
+"""
+#: Rights as a new computer has them, and two users in the group and one beside it.
+USERS = """\
+printf 'Defaults env_reset\\nroot ALL=(ALL:ALL) ALL\\n@includedir /etc/sudoers.d\\n' >/etc/sudoers
+rm -rf /etc/sudoers.d/*
+getent group fogros2 >/dev/null && groupdel fogros2
+for user in fogada fogbob fogeve; do useradd -m -s /bin/sh $user; done
+"""
+
+pytestmark = pytest.mark.timeout(120)
+
+
+class Copy:
+    """A copy of this computer, entered through a process in its namespaces."""
+
+    def __init__(self, pid: int, root: str) -> None:
+        self.pid = pid
+        self.root = root
+
+    def argv(self, user: str, *words: str) -> list[str]:
+        inside = ['nsenter', '-t', str(self.pid), '-m', '-n', '-p', '-i', 'chroot', self.root]
+        if user == 'root':
+            return [*inside, *words]
+        # not su, which takes the terminal away
+        return [*inside, 'setpriv', f'--reuid={user}', f'--regid={user}', '--init-groups',
+                'env', '-i', 'PATH=/usr/bin:/bin', f'HOME=/home/{user}', *words]
+
+    def run(self, user: str, *words: str, data: bytes = b'', check: bool = False) -> Result:
+        return process.run(Command(tuple(self.argv(user, *words)), sudo=True, input=data or b' '),
+                           timeout=30.0, check=check)
+
+    def ask(self, user: str, verb: str, *more: str, **request: Any) -> Result:
+        """Ask the helper for something, as the product does."""
+        return self.run(user, 'sudo', '-n', '--', HELPER, verb, *more,
+                        data=json.dumps(request).encode())
+
+    def links(self) -> set[str]:
+        return set(self.run('root', 'ls', '/sys/class/net', check=True).stdout.split())
+
+    def launch(self, user: str) -> int:
+        """Start what stands for a user's launch, and return its id in the copy."""
+        return int(self.run(user, 'sh', '-c', 'sleep 500 >/dev/null 2>&1 </dev/null & echo $!',
+                            check=True).stdout)
+
+
+@pytest.fixture(scope='module')
+def copy(tun: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
+    """Return a copy with the helper installed and no interface; all of it goes afterwards."""
+    for program in ('sudo', 'visudo', 'useradd', 'setpriv', 'nsenter'):
+        if process.which(program) is None:
+            pytest.skip(f'needs {program}')
+    folder = tmp_path_factory.mktemp('copy')
+    words = process.argv(Command((
+        'unshare', '--mount', '--net', '--pid', '--ipc', '--fork', '--kill-child',
+        'sh', '-ec', ENTER, 'sh', str(folder)), sudo=True))
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                             preexec_fn=os.setpgrp)
+    assert child.stdout is not None
+    try:
+        if child.stdout.readline() != 'ready\n':
+            pytest.skip(f'no layer over / is to be had here: {child.communicate()[1]}')
+        pid = child.pid if not words[0] == 'sudo' else _child(child.pid)
+        found = Copy(_child(pid), f'{folder}/root')
+        found.run('root', 'sh', '-c', USERS, check=True)
+        for path in (ROOT, Path(sys.executable), Path(sys.executable).resolve()):
+            # a home is closed to others, on the copy too unless it is opened there
+            found.run('root', 'chmod', 'a+x', *map(str, path.parents), check=True)
+        found.run('root', str(ROOT / 'packaging/vpn_helper/install'), 'fogada', 'fogbob',
+                  check=True)
+        yield found
+        for link in found.links():
+            if link.startswith('fog'):
+                found.run('root', HELPER, 'down', data=json.dumps({'name': link}).encode())
+    finally:
+        process.end(child, sudo=words[0] == 'sudo')
+        child.communicate()
+
+
+def _child(pid: int) -> int:
+    """Return the process that another one has started."""
+    return int(Path(f'/proc/{pid}/task/{pid}/children').read_text().split()[0])
+
+
+@contextlib.contextmanager
+def interface(copy: Copy, user: str, name: str, network: str, port: int) -> Iterator[str]:
+    """Have an interface of a user's, and yield its public key."""
+    made = copy.ask(user, 'keys', name=name, pid=copy.launch(user))
+    assert made.returncode == 0, made.stderr
+    try:
+        up = copy.ask(user, 'up', name=name, network=network, port=port, domain=0, ports=[],
+                      peers=[])
+        assert up.returncode == 0, up.stderr
+        yield made.stdout.strip()
+    finally:
+        gone = copy.ask(user, 'down', name=name)
+        assert gone.returncode == 0, gone.stderr
+        assert name not in copy.links()
+
+
+def peer(address: str, key: str = KEY) -> dict[str, object]:
+    return {'key': key, 'address': address, 'endpoint': '127.0.0.1:9'}
+
+
+def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
+    assert copy.ask('fogada', 'check').stdout == '1\n'
+    with interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820) as key:
+        assert re.fullmatch('[A-Za-z0-9+/]{43}=', key)
+        assert NAME in copy.links()
+        shown = copy.run('root', 'ip', '-4', 'addr', 'show', NAME).stdout
+        assert 'inet 198.18.7.1/24' in shown
+        told = copy.ask('fogada', 'peers', name=NAME, peers=[peer('198.18.7.2')])
+        assert told.returncode == 0, told.stderr
+        assert copy.ask('fogada', 'status', name=NAME).stdout.count(KEY) == 2
+        # the program that serves it dies, and is got going again
+        copy.run('root', 'sh', '-c', f'kill -9 $(pgrep -f "^wireguard-go {NAME}$")')
+        again = copy.ask('fogada', 'repair', name=NAME, peers=[peer('198.18.7.2')])
+        assert again.returncode == 0, again.stderr
+        assert copy.ask('fogada', 'status', name=NAME).stdout.count(KEY) == 2
+        # the private key is root's alone, and so is the folder of the records
+        assert copy.run('fogada', 'cat', f'/run/fogros2/{NAME}/key').returncode != 0
+        assert copy.run('fogada', 'touch', '/run/fogros2/x').returncode != 0
+        assert f'table inet {NAME}' in copy.run('root', 'nft', 'list', 'tables').stdout
+    assert copy.run('root', 'ls', '-A', '/run/fogros2').stdout == ''
+    assert f'{NAME}' not in copy.run('root', 'nft', 'list', 'tables').stdout
+    assert copy.ask('fogada', 'down', name=NAME).returncode == 0  # as often as one likes
+
+
+def test_interfaces_of_others_are_refused(copy: Copy) -> None:
+    copy.run('root', 'ip', 'tuntap', 'add', 'dev', OTHER, 'mode', 'tun', check=True)
+    try:
+        with interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820):
+            pid = copy.launch('fogbob')
+            for verb, more in (
+                    ('keys', {'pid': pid}), ('down', {}), ('status', {}),
+                    ('peers', {'peers': []}), ('repair', {'peers': []}),
+                    ('up', {'network': '198.18.8.0/24', 'port': 5000, 'domain': 0, 'ports': [],
+                            'peers': []})):
+                said = copy.ask('fogbob', verb, name=NAME, **more)
+                assert said.returncode == 2 and 'another user' in said.stderr, (verb, said)
+                said = copy.ask('fogbob', verb, name=OTHER, **more)
+                assert said.returncode == 2 and 'not made here' in said.stderr, (verb, said)
+            for name in ('lo', '../fog0a1b2c', 'fog0a1b2cm0'):
+                said = copy.ask('fogbob', 'down', name=name)
+                assert said.returncode == 2 and 'six hexadecimal' in said.stderr, said
+            # networks that lead somewhere already, or aren't the pool's
+            assert copy.ask('fogbob', 'keys', name='fogbbbbbb', pid=pid).returncode == 0
+            for network, why in (('198.18.7.0/24', 'in use'), ('127.0.0.0/24', 'not in'),
+                                 ('10.0.0.0/24', 'not in'), ('0.0.0.0/0', '24 bits')):
+                said = copy.ask('fogbob', 'up', name='fogbbbbbb', network=network, port=5000,
+                                domain=0, ports=[], peers=[])
+                assert said.returncode == 2 and why in said.stderr, said
+            said = copy.ask('fogbob', 'up', name='fogbbbbbb', network='198.18.9.0/24', port=53,
+                            domain=0, ports=[], peers=[])
+            assert said.returncode == 2 and '1024' in said.stderr
+            assert copy.ask('fogbob', 'down', name='fogbbbbbb').returncode == 0
+            # somebody else's process would keep it for ever
+            said = copy.ask('fogbob', 'keys', name='fogbbbbbb', pid=1)
+            assert said.returncode == 2 and 'another user' in said.stderr
+            assert {NAME, OTHER} <= copy.links()
+    finally:
+        copy.run('root', 'ip', 'link', 'delete', OTHER)
+
+
+def test_nothing_else_is_allowed(copy: Copy) -> None:
+    copy.run('root', 'visudo', '-c', check=True)
+    for words in (['true'], ['sh'], [HELPER], [HELPER, 'tidy'], [HELPER, 'down', 'x'],
+                  [HELPER, '-h'], ['/usr/bin/python3', HELPER, 'check'],
+                  ['/run/../usr/libexec/fogros2/vpn', 'tidy'], ['--preserve-env', HELPER, 'check'],
+                  ['PYTHONPATH=/tmp', HELPER, 'check'], ['-u', 'fogbob', HELPER, 'check']):
+        assert copy.run('fogada', 'sudo', '-n', *words).returncode != 0, words
+    # who isn't in the group, and who goes past sudo
+    assert copy.ask('fogeve', 'check').returncode != 0
+    assert copy.run('fogada', HELPER, 'check').returncode == 2
+    # nobody but root may change what is run
+    for path in (HELPER, RULES, '/usr/libexec/fogros2/fogros2/vpn/wireguard.py'):
+        assert copy.run('fogada', 'test', '-w', path).returncode != 0, path
+        assert copy.run('fogada', 'test', '-w', str(Path(path).parent)).returncode != 0, path
+
+
+def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    (tmp_path / 'json.py').write_text('raise SystemExit(77)')
+    for parent in tmp_path.parents[:3]:
+        if parent.name.startswith('pytest-'):
+            parent.chmod(0o755)
+    script = (f'cd {shlex.quote(str(tmp_path))}; ulimit -S -f 0; umask 0; trap "" CHLD PIPE; '
+              f'PYTHONPATH={shlex.quote(str(tmp_path))} PATH=/nowhere SUDO_UID=0 '
+              f'/usr/bin/sudo -n {HELPER} ')
+    made = copy.run('fogada', 'sh', '-c', script + 'keys', data=json.dumps(
+        {'name': NAME, 'pid': copy.launch('fogada')}).encode())
+    assert made.returncode == 0 and len(made.stdout) == 45, made
+    assert copy.run('root', 'stat', '-c%a', '/run/fogros2', f'/run/fogros2/{NAME}',
+                    f'/run/fogros2/{NAME}/key').stdout.split() == ['755', '700', '600']
+    said = copy.run('fogbob', 'sh', '-c', f'SUDO_UID=0 sudo -n {HELPER} down',
+                    data=json.dumps({'name': NAME}).encode())
+    assert 'another user' in said.stderr
+    assert copy.ask('fogada', 'down', name=NAME).returncode == 0
+
+
+def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
+    pid = copy.launch('fogada')
+    assert copy.ask('fogada', 'keys', name='fog000010', pid=pid).returncode == 0
+    copy.run('root', 'sh', '-ec', 'cd /run/fogros2; for n in 1 2 3 4 5 6 7 8 9 a b c d e f; do '
+             'cp -r fog000010 fog00000$n; sed -i s/fog000010/fog00000$n/ fog00000$n/record; done',
+             check=True)
+    said = copy.ask('fogada', 'keys', name='fog000000', pid=pid)
+    assert said.returncode == 2 and '16 interfaces' in said.stderr
+    assert copy.ask('fogada', 'keys', name='fog000010', pid=pid).returncode == 0  # its own
+    # none of them was brought up: their launch ends, and the timer's service takes them away
+    assert copy.run('root', HELPER, 'tidy').stdout == ''
+    copy.run('root', 'kill', '-9', str(pid))
+    wait_until(lambda: copy.run('root', 'kill', '-0', str(pid)).returncode != 0, timeout=5.0,
+               what='the launch to be gone')
+    assert copy.run('root', HELPER, 'tidy').stdout.count('is gone') == 16
+    assert copy.run('root', 'ls', '-A', '/run/fogros2').stdout == ''
+
+
+def without_product(copy: Copy, user: str) -> bool:
+    return copy.run(user, sys.executable, '-c', 'import fogros2').returncode != 0
+
+
+PRODUCT = """\
+import json, sys
+from pathlib import Path
+from fogros2.deploy import check_robot, Launch
+from fogros2.store import Store
+check_robot()
+launch = Launch(store=Store(Path(sys.argv[1])))
+robot = launch.robot_vpn()
+robot.ensure()
+print(json.dumps([robot.interface.name, robot.interface.key_file]), flush=True)
+sys.stdin.readline()
+print(json.dumps([str(error) for error in launch.down()]))
+"""
+
+
+def test_a_launch_takes_it_by_itself(copy: Copy) -> None:
+    if without_product(copy, 'fogada'):
+        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
+    words = process.argv(Command(tuple(copy.argv(
+        'fogada', sys.executable, '-c', PRODUCT, '/home/fogada/state')), sudo=True))
+    child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert child.stdin is not None and child.stdout is not None
+    timer = threading.Timer(60.0, child.kill)
+    timer.start()
+    try:
+        name, key = json.loads(child.stdout.readline())
+        assert key == f'/run/fogros2/{name}/key' and name in copy.links()
+        rest, _ = child.communicate('\n')
+        assert json.loads(rest) == []
+        assert name not in copy.links()
+    finally:
+        timer.cancel()
+        child.kill()
+        child.communicate()
+
+
+def test_without_it_the_question_comes_first(copy: Copy) -> None:
+    """A user who may use sudo with a password, at a terminal, is asked before anything is made."""
+    if without_product(copy, 'fogeve'):
+        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
+    copy.run('root', 'sh', '-c', 'echo fogeve:words | chpasswd; '
+             'echo "fogeve ALL=(ALL) ALL" >/etc/sudoers.d/eve', check=True)
+    twice = 'from fogros2.deploy import check_robot; check_robot(); check_robot(); print("ready")'
+    words = process.argv(Command(
+        tuple(copy.argv('fogeve', sys.executable, '-c', twice)), sudo=True))
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execvp(words[0], words)
+    said = b''
+    with contextlib.suppress(OSError):  # the end of a terminal
+        while chunk := os.read(terminal, 1000):
+            said += chunk
+            if b'for the VPN interface: ' in said and b'words' not in said:
+                os.write(terminal, b'words\n')
+                said += b'(words)'
+    os.close(terminal)
+    assert os.waitpid(pid, 0)[1] == 0, said
+    assert said.count(b'password for fogeve, for the VPN interface') == 1 and b'ready' in said
+
+
+def test_it_is_removed_without_a_trace(copy: Copy) -> None:
+    install = str(ROOT / 'packaging/vpn_helper/install')
+    with contextlib.suppress(AssertionError), \
+            interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820):
+        copy.run('root', install, '--remove', check=True)
+        assert NAME not in copy.links()
+        for path in (HELPER, str(Path(HELPER).parent), RULES, '/run/fogros2'):
+            assert copy.run('root', 'test', '-e', path).returncode == 1, path
+        assert copy.run('root', 'getent', 'group', 'fogros2').returncode != 0
+        copy.run('root', install, 'fogada', 'fogbob', check=True)
+    assert copy.ask('fogada', 'check').stdout == '1\n'

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the helper that runs as root takes from its callers, and what callers ask of it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from fogros2 import process
+from fogros2.deploy import robot
+from fogros2.errors import PrerequisiteError
+from fogros2.model import Peer, Result, VpnInterface
+from fogros2.vpn import helped
+from fogros2.vpn.wireguard import WireGuard
+
+FOLDER = Path(__file__).resolve().parents[2] / 'packaging' / 'vpn_helper'
+KEY = 'Sg3Q0Y1Y0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHo='
+OTHER = 'qD0Xl0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHoSg4='
+NETWORK = '198.18.7.0/24'
+
+
+def load() -> ModuleType:
+    """Return the program as a module; its folder is no package."""
+    spec = importlib.util.spec_from_file_location('vpn_helper', FOLDER / 'vpn.py')
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules['vpn_helper'] = module
+    written, path = sys.dont_write_bytecode, list(sys.path)
+    spec.loader.exec_module(module)
+    sys.dont_write_bytecode, sys.path[:] = written, path
+    return module
+
+
+vpn: Any = load()
+
+#: Values that a caller with bad intent, or a bug, may put anywhere.
+BAD = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.sampled_from([
+        'lo', 'eth0', 'fog', 'fogABCDEF', 'fog12345', 'fog1234567', 'fog12345\n', 'fog../..',
+        '../fog123456', 'fog12345;', '-h', '', '\0', 'fog12345\u0661', '0.0.0.0/0',
+        '198.18.7.0/24 ', '198.18.7.1/24', '198.18.0.0/16', '10.0.0.0/24', '::/24',
+        '/etc/shadow', '$(id)', '`id`', "';id;'", '198.18.7.1', '198.18.7.255', 'a:b', 'a b:1',
+        'host:0', 'host:65536', 'host:1\nPrivateKey = x', '-x:1', '[::1]', '[::1%eth0]:1']),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=6)
+
+
+@given(BAD)
+def test_a_name_is_ours_or_refused(value: object) -> None:
+    try:
+        found = vpn.name_of(value)
+    except vpn.Refused:
+        return
+    assert found == value and found.isalnum() and len(found) == 9 and found.startswith('fog')
+
+
+@given(BAD)
+def test_a_network_is_of_the_pool_or_refused(value: object) -> None:
+    try:
+        found = vpn.network_of(value, ['198.18.0.0/15'])
+    except vpn.Refused:
+        return
+    assert found.startswith(('198.18.', '198.19.')) and found.endswith('.0/24')
+
+
+@given(BAD)
+def test_ports_are_no_service_s(value: object) -> None:
+    try:
+        found = vpn.ports_of(value)
+    except vpn.Refused:
+        return
+    assert all(1024 <= first <= last <= 65535 for first, last in found)
+
+
+@given(st.lists(st.fixed_dictionaries({
+    'key': BAD | st.sampled_from([KEY, OTHER]),
+    'address': BAD | st.sampled_from(['198.18.7.2', '198.18.7.3']),
+    'endpoint': BAD | st.none() | st.just('203.0.113.9:51820')}), max_size=3) | BAD)
+def test_no_peer_brings_a_word_of_its_own_into_a_script(value: object) -> None:
+    try:
+        found = vpn.peers_of(value, NETWORK)
+    except vpn.Refused:
+        return
+    for peer in found:
+        assert peer.public_key in (KEY, OTHER)
+        assert peer.address in ('198.18.7.2', '198.18.7.3')
+        assert peer.endpoint is None or set(peer.endpoint) <= set(
+            'abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-:[]')
+
+
+@given(st.sampled_from(sorted(vpn.FIELDS)), st.binary() | st.builds(
+    lambda value: json.dumps(value).encode(), st.dictionaries(
+        st.sampled_from(['name', 'pid', 'network', 'port', 'peers', 'x']), BAD, max_size=6)))
+def test_a_request_is_whole_or_refused(verb: str, data: bytes) -> None:
+    try:
+        found = vpn.parse(verb, data)
+    except vpn.Refused:
+        return
+    assert set(found) == vpn.FIELDS[verb]
+    assert 'name' not in found or vpn.name_of(found['name']) == found['name']
+
+
+@pytest.mark.parametrize(('value', 'why'), [
+    ([{'key': KEY, 'address': '198.18.7.1', 'endpoint': None}], 'address'),  # the robot's own
+    ([{'key': KEY, 'address': '198.18.8.2', 'endpoint': None}], 'address'),
+    ([{'key': KEY, 'address': '198.18.7.2', 'endpoint': None}] * 2, 'its own'),
+    ([{'key': KEY, 'address': f'198.18.7.{n}', 'endpoint': None} for n in (2, 3)], 'one key'),
+    ([{'key': KEY[:-2] + 'B=', 'address': '198.18.7.2', 'endpoint': None}], 'public key'),
+    ([{'key': KEY, 'address': '198.18.7.2'}], 'has key'),
+    ([{'key': KEY, 'address': '198.18.7.2', 'endpoint': None, 'x': 1}], 'has key'),
+    ([{'key': KEY, 'address': '198.18.7.2', 'endpoint': 'a:1\nb'}], 'endpoint'),
+    ([{}] * 254, 'up to 253')])
+def test_peers_that_are_refused(value: object, why: str) -> None:
+    with pytest.raises(vpn.Refused, match=why):
+        vpn.peers_of(value, NETWORK)
+
+
+@pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9'])
+def test_endpoints_as_providers_give_them(value: str) -> None:
+    (peer,) = vpn.peers_of([{'key': KEY, 'address': '198.18.7.2', 'endpoint': value}], NETWORK)
+    assert peer == Peer('machine', KEY, '198.18.7.2', value)
+
+
+@pytest.mark.parametrize('value', [True, 1.0, '1', 0, 65536, None])
+def test_a_number_is_one_of_its_range(value: object) -> None:
+    with pytest.raises(vpn.Refused):
+        vpn.number(value, 1, 65535, 'x')
+
+
+def test_deep_nesting_is_refused() -> None:
+    with pytest.raises(vpn.Refused, match='no JSON'):
+        vpn.parse('down', b'[' * 100_000)
+
+
+def test_other_pools_are_the_administrator_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(vpn, 'POOLS', tmp_path / 'pools')
+    assert vpn.pools() == ['198.18.0.0/15']
+    vpn.POOLS.write_text('# ours\n10.213.0.0/16\n')
+    vpn.POOLS.chmod(0o666)
+    with pytest.raises(vpn.Refused, match="root's alone"):
+        vpn.pools()
+    vpn.POOLS.chmod(0o644)
+    if os.geteuid() == 0:
+        assert vpn.pools() == ['10.213.0.0/16']
+        vpn.POOLS.write_text('10.213.0.0/16\nall\n')
+        with pytest.raises(vpn.Refused, match='all'):
+            vpn.pools()
+
+
+def test_the_rule_names_each_word_and_nothing_else() -> None:
+    text = (FOLDER / 'sudoers').read_text()
+    words = [line.split()[1].rstrip(',') for line in text.splitlines()
+             if line.startswith('    /usr/libexec')]
+    assert set(words) == set(vpn.VERBS) == set(vpn.FIELDS)
+    assert '*' not in text and '?' not in text and text.count(helped.HELPER) == len(words)
+    assert text.rstrip().endswith(f'%{helped.GROUP} ALL=(root:root) NOPASSWD: FOGROS2_VPN')
+    if process.which('visudo'):
+        subprocess.run([str(process.which('visudo')), '-q', '-c', '-f', str(FOLDER / 'sudoers')],
+                       check=True)
+
+
+def test_both_sides_mean_the_same() -> None:
+    assert str(vpn.PROTOCOL) == helped.PROTOCOL and str(vpn.RECORDS) == helped.KEYS
+
+
+# -- the caller's side ---------------------------------------------------------------------------
+
+def interface(key_file: str) -> VpnInterface:
+    return VpnInterface('fog0a1b2c', '198.18.7.1', NETWORK, 51820, key_file, guarded=True)
+
+
+PEERS = [Peer('first', KEY, '198.18.7.2', '203.0.113.9:51820'), Peer('b', OTHER, '198.18.7.3')]
+
+
+def test_what_is_asked_of_it_is_what_it_takes() -> None:
+    plugin = helped.HelpedWireGuard(domain=3, ports=((7000, 7119),))
+    made = interface(helped.key_file('fog0a1b2c'))
+    commands = [plugin.keys(made), *plugin.up(made, []), *plugin.peers(made, PEERS),
+                *plugin.repair(made, PEERS), plugin.status(made), *plugin.down(made)]
+    for command, verb in zip(commands, ['keys', 'up', 'peers', 'repair', 'status', 'down']):
+        assert command.argv == (helped.HELPER, verb) and command.sudo and command.what
+        request = vpn.parse(verb, command.input)
+        if verb == 'up':
+            record = vpn.Record('fog0a1b2c', 1000, 1, 1, vpn.network_of(
+                request['network'], vpn.pools()), request['port'], request['domain'],
+                vpn.ports_of(request['ports']))
+            assert record.interface() == made
+            assert record.vpn().ports == plugin.ports
+        if 'peers' in request:
+            assert [(p.public_key, p.address, p.endpoint) for p in vpn.peers_of(
+                request['peers'], NETWORK)] == [
+                    (p.public_key, p.address, p.endpoint) for p in PEERS[:len(request['peers'])]]
+    assert not plugin.alive(made).sudo
+
+
+def test_all_other_interfaces_are_root_s_commands() -> None:
+    plugin, plain = helped.HelpedWireGuard(), WireGuard()
+    for other in (interface('/home/eve/.ros/vpn.key'), interface('/run/fogros2/fogffffff/key')):
+        assert plugin.keys(other) == plain.keys(other)
+        assert plugin.status(other) == plain.status(other)
+        assert [*plugin.down(other)] == [*plain.down(other)]
+        for verb in ('up', 'peers', 'repair'):
+            assert [*getattr(plugin, verb)(other, PEERS)] == [*getattr(plain, verb)(other, PEERS)]
+
+
+@pytest.mark.parametrize(('answer', 'expected'), [
+    (Result(0, '1\n', ''), True), (Result(0, '2\n', ''), False),
+    (Result(1, '', 'sudo: a password is required'), False)])
+def test_it_is_used_where_it_is_permitted(
+    monkeypatch: pytest.MonkeyPatch, answer: Result, expected: bool,
+) -> None:
+    monkeypatch.setattr(helped, 'HELPER', sys.executable)
+    monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
+    monkeypatch.setattr(process, 'run', lambda command, **more: answer)
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    assert helped.permitted() is expected
+    monkeypatch.setattr(os, 'geteuid', lambda: 0)
+    assert not helped.permitted()
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    monkeypatch.setattr(helped, 'HELPER', '/nowhere/vpn')
+    assert not helped.permitted()
+
+
+def test_who_is_not_in_the_group_is_told_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
+    monkeypatch.setattr(process, 'sudo_trouble', lambda: process.PASSWORD)
+    with pytest.raises(PrerequisiteError) as caught:
+        robot.check_sudo()
+    assert caught.value.hint == process.PASSWORD[1]
+    monkeypatch.setattr(helped, 'HELPER', sys.executable)
+    with pytest.raises(PrerequisiteError) as caught:
+        robot.check_sudo()
+    assert 'group fogros2' in caught.value.hint
