@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import contextlib
 import queue
+import socket
 import threading
 from typing import Any, Optional, Protocol
 
@@ -114,6 +115,18 @@ class Watch:
         if response is None:
             return  # it has ended, or asks still, and whoever does closes it
         with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
-            response.shutdown()  # wakes the reader
+            _wake(response)
         self._thread.join(2.0)
         response.close()
+
+
+def _wake(response: Any) -> None:
+    """Have the thread that reads a response find its end; a close would wait for that thread."""
+    if hasattr(response, 'shutdown'):
+        response.shutdown()
+        return
+    # urllib3 before 2.3, as Debian 12 and Ubuntu 24.04 have it
+    held = getattr(response.connection, 'sock', None)
+    if held is None:
+        held = response._fp.fp.raw._sock
+    held.shutdown(socket.SHUT_RDWR)
