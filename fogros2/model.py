@@ -51,6 +51,7 @@ class MachineSpec:
     :param containers: ``docker run`` command lines started before the nodes.
     :param on_interrupt: when the provider takes the machine away while its nodes run: end the
         launch, or run the nodes on the robot.
+    :param monitor_allow: networks (CIDR) that reach its bridge to Foxglove besides the robot.
     """
 
     name: str
@@ -66,6 +67,7 @@ class MachineSpec:
     launch_foxglove: bool = False
     vpn: str = 'wireguard'
     on_interrupt: OnInterrupt = 'shutdown'
+    monitor_allow: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -104,6 +104,8 @@ class Record:
     :param agent: the agent's folder on the machine.
     :param python: interpreter on the machine that runs the agent.
     :param monitor: TCP port of its bridge to Foxglove, 0 for none.
+    :param monitor_open: where others than the robot reach that bridge (``host:port``), '' where
+        they don't.
     :param damage: why the record can't be read, '' when it can.
     """
 
@@ -129,6 +131,7 @@ class Record:
     agent_program: str = ''
     python: str = 'python3'
     monitor: int = 0
+    monitor_open: str = ''
     damage: str = ''
 
     @property
@@ -299,7 +302,8 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     values = {key: value for key, value in data.items() if key in known}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
-    spec['containers'] = tuple(spec.get('containers', ()))
+    for key in ('containers', 'monitor_allow'):
+        spec[key] = tuple(spec.get(key, ()))
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:

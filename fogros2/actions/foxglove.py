@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+import logging
 from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
@@ -11,13 +12,13 @@ from launch.actions import OpaqueFunction, RegisterEventHandler
 from launch.event_handlers import OnProcessStart
 import launch.logging
 
-from fogros2.actions import words
+from fogros2.actions import networks, words
 from fogros2.actions.carriers import Carrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.remote import send
 from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
-from fogros2.monitor import urls
+from fogros2.monitor import credentials, urls
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Seconds before a bridge that ended is started again.
 _RESPAWN = 2.0
+#: The agent's folder, as processes on a machine know it.
+_AGENT = '$FOGROS2_AGENT_DIRECTORY'
 
 
 class Foxglove(Action):
@@ -40,12 +43,19 @@ class Foxglove(Action):
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param topics: patterns (``*``, ``?``) of the topics to show.
     :param port: TCP port.
-    :raises ConfigurationError: no port, or no pattern.
+    :param monitor_allow: networks (CIDR) from which others than the robot get in, at the port
+        after that one, over TLS and with a token; through the provider's firewall, where it has
+        one. The machine itself turns all others away.
+    :param image: container image of the web application, served at the same port where the machine
+        can run it; '' for none.
+    :raises ConfigurationError: no port, no pattern, or no network.
     """
 
     def __init__(
         self, machine: SomeMachine, topics: Sequence[SomeSubstitutionsType] = ('*',),
-        port: Union[int, SomeSubstitutionsType] = urls.PORT, **kwargs: Any,
+        port: Union[int, SomeSubstitutionsType] = urls.PORT, *,
+        monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
+        image: SomeSubstitutionsType = urls.IMAGE, **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         if isinstance(topics, str) or not topics:
@@ -54,6 +64,8 @@ class Foxglove(Action):
         self.machine = machine
         self._topics = list(topics)
         self._port = port
+        self._allow = networks.items(monitor_allow)
+        self._image = image
         if isinstance(port, (int, str)):
             _port(port)
 
@@ -62,15 +74,22 @@ class Foxglove(Action):
         coordinator = Coordinator.of(context)
         port = _port(words.resolve(context, self._port))
         topics = [words.resolve(context, topic) for topic in self._topics]
-        session = None
-        if not coordinator.on_robot(self.machine):
-            session = coordinator.session(self.machine)
-        process = Carrier(_bridge(session, port, topics))
-        if session is not None:
-            send(process, session.spec.name)
-        return [process, RegisterEventHandler(OnProcessStart(
-            target_action=process,
-            on_start=OpaqueFunction(function=lambda _: _tell(session, port))))]
+        allow = networks.resolve(context, self._allow)
+        if coordinator.on_robot(self.machine):
+            process = Carrier(_bridge('robot', port, topics))
+            return [process, _once_started(process, lambda: _logger().info(
+                f"Foxglove: {urls.app(urls.bridge('localhost', port))}"))]
+        session = coordinator.session(self.machine)
+        options = ['--vpn', str(port)]
+        if coordinator.launch.provider(session.spec.provider).runs_containers:
+            options += ['--image', words.resolve(context, self._image)]
+        if allow:
+            folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)
+            options += ['--guarded', str(urls.guarded_port(port)), '--secrets', folder,
+                        *(word for network in allow for word in ('--allow', network))]
+        process = Carrier(_bridge(session.spec.name, port, topics, options))
+        send(process, session.spec.name)
+        return [process, _once_started(process, lambda: _tell(session, port, allow))]
 
 
 def _port(value: Union[int, str]) -> int:
@@ -84,23 +103,34 @@ def _port(value: Union[int, str]) -> int:
     return port
 
 
-def _bridge(session: Optional[Session], port: int, topics: Sequence[str]) -> NodeSpec:
-    where = 'robot' if session is None else session.spec.name
-    vpn = () if session is None else ('--vpn', str(port))
+def _bridge(
+    where: str, port: int, topics: Sequence[str], options: Sequence[str] = (),
+) -> NodeSpec:
     return NodeSpec(
         id=f'foxglove-{where}-{port}', name='foxglove_bridge', package='fogros2',
         executable='bridge', respawn=True, respawn_delay=_RESPAWN,
-        arguments=('--listen', f'127.0.0.1:{port}', *vpn,
+        arguments=('--name', where, '--listen', f'127.0.0.1:{port}', *options,
                    *(word for topic in topics for word in ('--topic', topic))))
 
 
-def _tell(session: Optional[Session], port: int) -> None:
-    logger = launch.logging.get_logger('fogros2')
-    if session is None or session.running is None:
-        logger.info(f"Foxglove: {urls.app(urls.bridge('localhost', port))}")
-        return
+def _once_started(process: Carrier, then: Callable[[], None]) -> RegisterEventHandler:
+    return RegisterEventHandler(OnProcessStart(
+        target_action=process, on_start=OpaqueFunction(function=lambda _: then())))
+
+
+def _tell(session: Session, port: int, allow: Sequence[str]) -> None:
+    assert session.running is not None
     session.running.serves(port)
     name = session.spec.name
-    logger.info(
+    _logger().info(
         f'{name}: Foxglove at {urls.bridge(session.running.vpn_address, port)}; '
         f'in a browser: ros2 fog monitor {name}')
+    if allow:
+        session.publish(urls.guarded_port(port), allow, lambda host, outside: _logger().info(
+            f"{name}: Foxglove for {', '.join(allow)} at wss://{urls.place(host, outside)}; "
+            f'with its token: ros2 fog monitor {name} --share'))
+
+
+def _logger() -> logging.Logger:
+    found: logging.Logger = launch.logging.get_logger('fogros2')
+    return found

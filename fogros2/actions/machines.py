@@ -12,7 +12,7 @@ import re
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2 import containers
-from fogros2.actions import names, words
+from fogros2.actions import names, networks, words
 from fogros2.errors import ConfigurationError
 from fogros2.model import (
     Bootstrap,
@@ -62,6 +62,8 @@ class CloudInstance:
         ends the launch, with an exit status other than zero; 'robot' starts them anew on the
         robot, which has to have their programs: with the same names and parameters, without
         what they had in memory, a lifecycle state, or components that were loaded.
+    :param monitor_allow: networks (CIDR) from which others than the robot may watch: the bridge
+        to Foxglove is there for them as well, over TLS and with a token.
     :param options: the provider's own settings, for subclasses to give.
     :raises ConfigurationError: an unknown keyword (with the nearest one), or a wrong value.
     """
@@ -80,6 +82,7 @@ class CloudInstance:
         bootstrap: SomeSubstitutionsType = 'auto',
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         on_interrupt: SomeSubstitutionsType = 'shutdown',
+        monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -100,6 +103,7 @@ class CloudInstance:
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
         self._foxglove = launch_foxglove
+        self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
@@ -240,6 +244,7 @@ class CloudInstance:
                 containers=tuple(words.resolve(context, line) for line in self._containers),
                 launch_foxglove=self._resolved(
                     context, 'launch_foxglove', words.Truth(self._foxglove)),
+                monitor_allow=networks.resolve(context, self._monitor_allow),
                 **values)
         return self._spec
 

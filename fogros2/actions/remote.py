@@ -100,9 +100,10 @@ class RemoteProcess(ExecuteLocal):
                 containers.parse(line), number, Coordinator.of(context).launch.id))
             send(follower, session.spec.name)
             found.append(follower)
-        if session.spec.launch_foxglove:
+        if session.spec.launch_foxglove or session.spec.monitor_allow:
             from fogros2.actions.foxglove import Foxglove
-            found.append(Foxglove(session.spec.name))
+            found.append(Foxglove(
+                session.spec.name, monitor_allow=session.spec.monitor_allow))
         return found
 
     def _carriers_here(self, context: LaunchContext) -> list[ExecuteLocal]:

@@ -208,6 +208,16 @@ class Session:
         self._runs.pop(run.node.id, None)
         self._changed()
 
+    def publish(
+        self, port: int, sources: Sequence[str], told: Callable[[str, int], None],
+    ) -> None:
+        """Let networks reach a TCP port of the machine that is up; ``told`` learns where."""
+        async def publish() -> None:
+            assert self.running is not None
+            told(*await self._in_thread(self.running.publish, port, sources))
+
+        self._request(publish)
+
     # -- the machine ----------------------------------------------------------------------------
 
     async def choose(self) -> None:

@@ -23,6 +23,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineState
+from fogros2.monitor import urls
 from fogros2.provider import (
     Provider,
     TAG_DEPENDENCIES,
@@ -120,8 +121,12 @@ class Creation:
         job = self._job
         job.reused = True
         job.undoing('end', self._end)
+        before = job.record
         self._claim(job.record.token)
         job.provider.adopt(machine.id, job.spec, self._tags())
+        if before.monitor_open:
+            # of a launch that was killed
+            job.provider.publish(machine, urls.guarded_port(before.monitor), ())
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             job.provider.start(machine.id)
 
@@ -185,7 +190,7 @@ class Creation:
             token=token, created=job.record.created or time.time(), armed=time.time(),
             launch=job.launch.id, last=job.launch.id,
             pid=pid, pid_start=process_start(pid) or 0, boot=boot_id(),
-            robot_vpn=job.launch.robot_vpn().interface)
+            robot_vpn=job.launch.robot_vpn().interface, monitor=0, monitor_open='')
 
     def _login_key(self) -> str:
         job = self._job

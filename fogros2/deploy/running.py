@@ -15,6 +15,7 @@ from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
 from fogros2.errors import AgentError
 from fogros2.model import Machine, NodeSpec, VpnInterface
+from fogros2.monitor import urls
 from fogros2.shell import Shell
 
 if TYPE_CHECKING:
@@ -95,6 +96,24 @@ class RunningMachine:
     def serves(self, port: int) -> None:
         """Remember the TCP port of the bridge to Foxglove that runs there."""
         self._job.save(monitor=port)
+
+    def publish(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
+        """
+        Let networks (CIDR) reach a TCP port of the machine until its end; return where they do.
+
+        :raises FogError: the provider doesn't open it.
+        """
+        job = self._job
+
+        def close() -> None:
+            # what ends takes it along
+            if job.survives or job.spec.on_exit == 'stop':
+                job.provider.publish(self.machine, port, ())
+
+        self.undo.callback(job.undone, 'port of the monitor', close)
+        host, outside = job.provider.publish(self.machine, port, sources)
+        job.save(monitor_open=urls.place(host, outside))
+        return host, outside
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """

@@ -3,10 +3,13 @@
 What stands before the bridge: it listens where the bridge doesn't, and lets in who may.
 
 The bridge itself listens on loopback. The gate takes connections on the VPN's address and hands
-them on as they are; where others than the robot were allowed in, it takes theirs on a port of its
-own, over TLS, and hands on those alone whose request carries the token:
-``wss://ADDRESS:PORT/?token=TOKEN``. All else is turned away, and logged once per address and
-cause, so that nobody fills the disk by knocking.
+them on; where others than the robot were allowed in, it takes theirs on a port of its own, from
+the networks that were named alone, over TLS, and hands on those alone whose request carries the
+token: ``wss://ADDRESS:PORT/?token=TOKEN``. All else is turned away, and logged once per address
+and cause, so that nobody fills the disk by knocking.
+
+A request for a page goes to the web application where the machine has one, else the gate's own
+page leads to those that others host.
 
 Standard library only: it also stands before ROS 2's own ``foxglove_bridge``, on machines that have
 nothing else of this package.
@@ -18,14 +21,17 @@ import argparse
 import asyncio
 from collections.abc import Sequence
 import contextlib
-import hmac
+import dataclasses
+import ipaddress
 import os
 import signal
 import socket
 import ssl
 import sys
-from typing import Optional
-import urllib.parse
+from typing import Optional, Union
+
+from fogros2.monitor import page
+from fogros2.monitor.request import check, parse, Refused, Request
 
 #: Variable of all nodes on a machine: its address in the VPN.
 VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'
@@ -33,42 +39,33 @@ VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'
 HEAD, HEAD_TIME = 16384, 10.0
 #: Seconds for the handshake of TLS.
 HANDSHAKE = 10.0
-#: Connections at once; a browser that watches takes one.
-CONNECTIONS = 200
+#: Connections at once by one door, so that nobody outside takes those of the robot; a browser that
+#: watches has one.
+CONNECTIONS = 100
 #: Addresses and causes remembered as logged.
 LOGGED = 1000
 _BLOCK = 65536
 
-
-class Refused(Exception):
-    """A request that isn't let in: the status to answer, and why, for the log."""
-
-    def __init__(self, status: str, why: str) -> None:
-        super().__init__(why)
-        self.status = status
+Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
 
 
-def admitted(head: bytes, token: str) -> bytes:
+@dataclasses.dataclass(frozen=True)
+class Guard:
     """
-    Return a request's head without the token, to be handed on.
+    Who may come in by a door that is open to others than the robot.
 
-    :param head: the request, up to and with the empty line.
-    :raises Refused: it isn't a GET, or lacks the token, or has a wrong one.
+    :param allowed: the networks that may knock; all if there are none.
+    :param token: what requests have to carry.
     """
-    line, separator, rest = head.partition(b'\r\n')
-    words = line.split(b' ')
-    if len(words) != 3 or words[0] != b'GET' or not separator:
-        raise Refused('400 Bad Request', 'what came is no request for a WebSocket')
-    url = urllib.parse.urlsplit(words[1].decode('latin-1'))
-    query = urllib.parse.parse_qsl(url.query, keep_blank_values=True)
-    given = [value for name, value in query if name == 'token']
-    if not given:
-        raise Refused('401 Unauthorized', 'no token')
-    if len(given) > 1 or not hmac.compare_digest(given[0].encode(), token.encode()):
-        raise Refused('401 Unauthorized', 'a wrong token')
-    left = urllib.parse.urlencode([item for item in query if item[0] != 'token'])
-    target = urllib.parse.urlunsplit(('', '', url.path or '/', left, ''))
-    return b'GET ' + target.encode('latin-1') + b' ' + words[2] + separator + rest
+
+    tls: ssl.SSLContext
+    token: str
+    allowed: tuple[Network, ...] = ()
+
+    def lets_knock(self, peer: str) -> bool:
+        """Return whether an address is among the networks."""
+        address = ipaddress.ip_address(peer)
+        return not self.allowed or any(address in network for network in self.allowed)
 
 
 class Gate:
@@ -76,87 +73,130 @@ class Gate:
     Hands connections on.
 
     :param to: address and port of the bridge.
-    :param token: what requests have to carry where one is asked for.
+    :param application: those of the web application, None where there is to be none.
+    :param name: of the machine.
     """
 
-    def __init__(self, to: tuple[str, int], token: str = '') -> None:
+    def __init__(
+        self, to: tuple[str, int], application: Optional[tuple[str, int]] = None, name: str = '',
+    ) -> None:
         self._to = to
-        self._token = token
+        self._application = application
+        self._name = name
         self._logged: set[tuple[str, str]] = set()
-        self._connections: set[asyncio.Task[None]] = set()
 
-    async def serve(self, listener: socket.socket, tls: Optional[ssl.SSLContext] = None) -> None:
+    async def serve(self, listener: socket.socket, guard: Optional[Guard] = None) -> None:
         """
         Take connections until cancelled.
 
         :param listener: a socket that listens, and doesn't block.
-        :param tls: asks for TLS and the token; without it, whoever gets here may come in.
+        :param guard: without one, whoever gets here may come in.
         """
         loop = asyncio.get_running_loop()
+        connections: set[asyncio.Task[None]] = set()
         try:
             while True:
                 connection, peer = await loop.sock_accept(listener)
-                if len(self._connections) >= CONNECTIONS:
-                    self._turn_away(peer[0], f'{CONNECTIONS} connections are open')
+                who = plain_address(peer[0])
+                why = '' if len(connections) < CONNECTIONS else \
+                    f'{CONNECTIONS} connections are open'
+                if guard is not None and not guard.lets_knock(who):
+                    why = 'not among the networks that are allowed'
+                if why:
+                    self._turn_away(who, why)
                     connection.close()
                     continue
-                task = loop.create_task(self._greet(connection, peer[0], tls))
-                self._connections.add(task)
-                task.add_done_callback(self._connections.discard)
+                task = loop.create_task(self._greet(connection, who, guard))
+                connections.add(task)
+                task.add_done_callback(connections.discard)
         finally:
             listener.close()
 
     async def _greet(
-        self, connection: socket.socket, peer: str, tls: Optional[ssl.SSLContext],
+        self, connection: socket.socket, peer: str, guard: Optional[Guard],
     ) -> None:
         loop = asyncio.get_running_loop()
         reader = asyncio.StreamReader(limit=HEAD, loop=loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
         try:
             transport, _ = await loop.connect_accepted_socket(
-                lambda: protocol, connection, ssl=tls,
-                ssl_handshake_timeout=HANDSHAKE if tls else None)
+                lambda: protocol, connection, ssl=guard.tls if guard else None,
+                ssl_handshake_timeout=HANDSHAKE if guard else None)
         except OSError as error:  # of TLS, too
             self._turn_away(peer, f'no TLS: {getattr(error, "reason", "") or error}')
             connection.close()
             return
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         try:
-            head = admitted(await _head(reader), self._token) if tls else b''
-            await self._pass(reader, writer, head)
+            request = parse(await _head(reader))
+            if guard is not None:
+                check(request, guard.token)
+            await self._lead(request, reader, writer, guard.token if guard else '')
         except Refused as refused:
             self._turn_away(peer, str(refused))
-            if tls:
-                writer.write(f'HTTP/1.1 {refused.status}\r\nContent-Length: 0\r\n'
-                             'Connection: close\r\n\r\n'.encode())
+            writer.write(page.answer(refused.status))
         except (OSError, asyncio.IncompleteReadError):
             pass  # gone before it said what it wants
         finally:
             await _closed(writer)
 
-    async def _pass(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, head: bytes,
+    async def _lead(
+        self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
+        token: str,
     ) -> None:
-        """Carry bytes both ways until either side ends."""
+        """Hand a request on to whom it is for, or answer it."""
+        if request.websocket:
+            try:
+                inner = await asyncio.open_connection(*self._to)
+            except OSError as error:
+                raise Refused(
+                    '502 Bad Gateway', f'the bridge does not answer: {error}') from error
+            await _pass(request.handed_on(), reader, writer, *inner)
+            return
         try:
-            inner_reader, inner_writer = await asyncio.open_connection(*self._to)
-        except OSError as error:
-            raise Refused('502 Bad Gateway', f'the bridge does not answer: {error}') from error
-        inner_writer.write(head)
-        ways = {asyncio.ensure_future(_carry(reader, inner_writer)),
-                asyncio.ensure_future(_carry(inner_reader, writer))}
-        try:
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for way in ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
-            await _closed(inner_writer)
+            if self._application is None:
+                raise ConnectionRefusedError
+            inner = await asyncio.open_connection(*self._application)
+        except OSError:
+            # the one name that browsers ask for by themselves isn't a page
+            writer.write(page.answer('404 Not Found') if request.target == '/favicon.ico'
+                         else page.links(request, self._name, token))
+            return
+        if request.given and token:
+            writer.write(page.redirect(request, token))
+            await _closed(inner[1])
+            return
+        # one request each: the next may be for the bridge
+        await _pass(request.handed_on(closing=True), reader, writer, *inner)
 
     def _turn_away(self, who: str, why: str) -> None:
         if (who, why) not in self._logged and len(self._logged) < LOGGED:
             self._logged.add((who, why))
             print(f'turned away {who}: {why}', file=sys.stderr, flush=True)
+
+
+def plain_address(address: str) -> str:
+    """Return a peer's address; one of IPv4 that came by a socket for both as itself."""
+    found = ipaddress.ip_address(address.partition('%')[0])
+    mapped = getattr(found, 'ipv4_mapped', None)
+    return str(mapped or found)
+
+
+async def _pass(
+    head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
+    inner_reader: asyncio.StreamReader, inner_writer: asyncio.StreamWriter,
+) -> None:
+    """Carry bytes both ways until either side ends."""
+    inner_writer.write(head)
+    ways = {asyncio.ensure_future(_carry(reader, inner_writer)),
+            asyncio.ensure_future(_carry(inner_reader, writer))}
+    try:
+        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for way in ways:
+            way.cancel()
+        await asyncio.gather(*ways, return_exceptions=True)
+        await _closed(inner_writer)
 
 
 async def _head(reader: asyncio.StreamReader) -> bytes:
@@ -194,9 +234,27 @@ def endpoint(text: str) -> tuple[str, int]:
     return host.strip('[]'), int(port)
 
 
+def network(text: str) -> Network:
+    """
+    Return a network of the form ``198.51.100.0/28``.
+
+    :raises argparse.ArgumentTypeError: it isn't of this form.
+    """
+    try:
+        return ipaddress.ip_network(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _listen(address: tuple[str, int]) -> socket.socket:
-    listener = socket.create_server(
-        address, family=socket.AF_INET6 if ':' in address[0] else socket.AF_INET)
+    host, port = address
+    if host == '':  # every address of the machine
+        both = socket.has_dualstack_ipv6()
+        listener = socket.create_server(
+            ('', port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both)
+    else:
+        listener = socket.create_server(
+            address, family=socket.AF_INET6 if ':' in host else socket.AF_INET)
     listener.setblocking(False)
     print('listening on {}:{}'.format(*listener.getsockname()), flush=True)
     return listener
@@ -209,23 +267,26 @@ async def _run(options: argparse.Namespace) -> None:
         loop.add_signal_handler(number, ended.cancel)
     if options.until_eof:
         loop.add_reader(0, ended.cancel)  # nothing is ever written there
-    token, tls = '', None
-    if options.guarded:
-        with open(options.token_file, encoding='ascii') as file:
-            token = file.read().strip()
-        if not token:
-            raise SystemExit(f'gate: {options.token_file} holds no token')
-        tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        tls.minimum_version = ssl.TLSVersion.TLSv1_2
-        tls.load_cert_chain(options.certificate, options.key)
-    gate = Gate(options.to, token)
+    gate = Gate(options.to, options.application, options.name)
     serving = [asyncio.ensure_future(gate.serve(_listen(address))) for address in options.listen]
     if options.guarded:
-        serving.append(asyncio.ensure_future(gate.serve(_listen(options.guarded), tls)))
+        serving.append(asyncio.ensure_future(
+            gate.serve(_listen(options.guarded), _guard(options))))
     await asyncio.wait({ended, *serving}, return_when=asyncio.FIRST_COMPLETED)
     for task in serving:
         if task.done():
             task.result()  # listening ends with an error alone
+
+
+def _guard(options: argparse.Namespace) -> Guard:
+    with open(options.token_file, encoding='ascii') as file:
+        token = file.read().strip()
+    if not token:
+        raise SystemExit(f'gate: {options.token_file} holds no token')
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.minimum_version = ssl.TLSVersion.TLSv1_2
+    tls.load_cert_chain(options.certificate, options.key)
+    return Guard(tls, token, tuple(options.allow))
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
@@ -237,10 +298,15 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument('--vpn', type=int, metavar='PORT', help=f'the same, at ${VPN_ADDRESS}')
     parser.add_argument('--until-eof', action='store_true',
                         help='end with the process that has the other end of the input')
-    parser.add_argument('--guarded', type=endpoint, help='where to listen with TLS and a token')
+    parser.add_argument('--guarded', type=endpoint,
+                        help='where to listen with TLS and a token; :PORT for every address')
+    parser.add_argument('--allow', type=network, action='append', default=[],
+                        help='network (CIDR) that may knock there; all unless given')
     parser.add_argument('--certificate', help='PEM file')
     parser.add_argument('--key', help='PEM file')
     parser.add_argument('--token-file', help='file with the token, so that no process list has it')
+    parser.add_argument('--application', type=endpoint, help='where the web application listens')
+    parser.add_argument('--name', default=socket.gethostname(), help="the machine's, for people")
     options = parser.parse_args(arguments)
     if options.vpn is not None:
         if VPN_ADDRESS not in os.environ:

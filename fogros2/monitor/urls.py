@@ -7,15 +7,45 @@ import urllib.parse
 
 #: Port on which viewers expect a bridge.
 PORT = 8765
-_APP = 'https://app.foxglove.dev/~/view'
+#: Foxglove's application, and Lichtblick's, as their makers host them.
+FOXGLOVE = 'https://app.foxglove.dev/~/view'
+LICHTBLICK = 'https://lichtblick-suite.github.io/lichtblick/'
+#: Lichtblick as a container, which serves HTTP on port 8080. By digest: it is what it was when it
+#: was chosen, or it isn't taken.
+IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
+         'ebaff0942173dc42c221ec0cc14d2bd7e6591e27c16cd11c8b2e557ce8da28d9')
+
+
+def guarded_port(port: int) -> int:
+    """Return the port at which others than the robot are let in, beside a bridge's own."""
+    return port + 1
+
+
+def application_port(port: int) -> int:
+    """Return the port of the loopback that the web application has, beside a bridge's own."""
+    return port + 2
+
+
+def place(host: str, port: int) -> str:
+    """Return ``host:port``, an IPv6 address in brackets."""
+    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
 
 
 def bridge(host: str, port: int) -> str:
     """Return a bridge's own address, for the desktop application."""
-    return f'ws://[{host}]:{port}' if ':' in host else f'ws://{host}:{port}'
+    return f'ws://{place(host, port)}'
 
 
-def app(address: str, at: str = _APP) -> str:
+def guarded(where: str, token: str) -> str:
+    """
+    Return a bridge's address for others than the robot.
+
+    :param where: ``host:port``.
+    """
+    return f'wss://{where}/?{urllib.parse.urlencode({"token": token})}'
+
+
+def app(address: str, at: str = FOXGLOVE) -> str:
     """
     Return a web application's address that opens a bridge.
 
@@ -26,3 +56,12 @@ def app(address: str, at: str = _APP) -> str:
     """
     query = urllib.parse.urlencode({'ds': 'foxglove-websocket', 'ds.url': address})
     return f'{at}?{query}'
+
+
+def served(host: str, port: int) -> str:
+    """
+    Return the address at which the gate before a bridge serves the application itself.
+
+    Where the machine has none, a page is there that leads to those above.
+    """
+    return app(bridge(host, port), f'http://{place(host, port)}/')

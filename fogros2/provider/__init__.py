@@ -224,6 +224,19 @@ class Provider(abc.ABC):
         """
         raise Unsupported(f"provider '{self.name}' has no firewall")
 
+    def publish(
+        self, machine: Machine, port: int, sources: Sequence[str],
+    ) -> tuple[str, int]:
+        """
+        Let ``sources`` (CIDR) reach a TCP port of a machine, they alone, and return where they do.
+
+        None of them closes it, and ends what was made for it. Whatever listens there has to look
+        itself who comes: a provider without a firewall of its own, as here, opens nothing.
+        """
+        if self.firewall:
+            self.allow(machine.id, port, sources)
+        return machine.vpn_host, port
+
     def pin(self, machine_id: str, host_key: str) -> None:
         """
         Remember the host key (OpenSSH form) that the machine has made for itself.

@@ -20,6 +20,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Machine, MachineState
+from fogros2.monitor import urls
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import Record, robot_name, Store
 from ros2fog_cli.api.interrupts import interruptible
@@ -118,6 +119,14 @@ class Entry:
         return self.record.shell.host if self.record is not None and self.record.shell else ''
 
     @property
+    def monitor(self) -> str:
+        """Where a browser of this robot's sees its topics, '' while it serves none."""
+        record = self.record
+        if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
+            return ''
+        return urls.served(record.vpn.address, record.monitor)
+
+    @property
     def launch(self) -> str:
         """The launch that has it, or had it last."""
         if self.record is not None and self.record.launch:
@@ -167,7 +176,9 @@ class Entry:
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address, 'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
-            'place': self.place, 'kind': self.kind,
+            'place': self.place, 'kind': self.kind, 'monitor': self.monitor or None,
+            'monitor_open': self.record.monitor_open or None
+            if self.record is not None and self.monitor else None,
             'cost_per_hour': None if self.cost is None else str(self.cost),
             'cost': None if (spent := self.spent(now)) is None
             else str(spent.quantize(Decimal('0.000001'))),

@@ -39,6 +39,9 @@ class ListVerb(VerbExtension):
               table.cost(entry.cost), table.cost(entry.spent(now), 2)) for entry in entries],
             width=table.terminal_width(),
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
+        for entry in entries:
+            if entry.monitor:
+                print(f'{entry.name}: topics at {entry.monitor}')
         total = machines.total(entries, now)
         if total is not None:
             print(f'{table.cost(total[0])} an hour, {table.cost(total[1], 2)} so far, '

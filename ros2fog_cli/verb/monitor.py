@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
+
+if TYPE_CHECKING:
+    from ros2fog_cli.api.machines import Entry
 
 
 class MonitorVerb(VerbExtension):
@@ -19,32 +23,57 @@ class MonitorVerb(VerbExtension):
                             help='of this computer; one that is free unless given')
         parser.add_argument('--no-browser', action='store_true',
                             help='only say where to look, for another computer or application')
+        parser.add_argument('--share', action='store_true',
+                            help='say where those whom monitor_allow= lets in find it, with the '
+                                 'token, and end')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve until interrupted."""
-        from fogros2.errors import ConfigurationError
-        from fogros2.monitor import urls
-        from fogros2.monitor.tunnel import Tunnel
         from ros2fog_cli.api import reach
         entry = reach.find(args.name, warn, regions=args.region)
-        there = (entry.record.monitor if entry.record is not None else 0) or urls.PORT
-        with reach.session(entry) as shell:
-            try:
-                tunnel = Tunnel(shell, ('127.0.0.1', there), port=args.port, say=warn)
-            except OSError as error:
-                raise ConfigurationError(
-                    f'port {args.port} of this computer: {error.strerror}',
-                    'another --port, or none for one that is free') from error
+        return share(entry) if args.share else serve(entry, args.port, not args.no_browser)
+
+
+def serve(entry: Entry, port: int, browser: bool) -> int:
+    """Carry a port of this computer to the machine's bridge until interrupted."""
+    from fogros2.errors import ConfigurationError
+    from fogros2.monitor import urls
+    from fogros2.monitor.tunnel import Tunnel
+    from ros2fog_cli.api import monitor, reach
+    there = (entry.record.monitor if entry.record is not None else 0) or urls.PORT
+    with reach.session(entry) as shell:
+        try:
+            tunnel = Tunnel(shell, ('127.0.0.1', there), port=port, say=warn)
+        except OSError as error:
+            raise ConfigurationError(
+                f'port {port} of this computer: {error.strerror}',
+                'another --port, or none for one that is free') from error
+        with monitor.carrying(tunnel) as ended:
             address = urls.bridge('localhost', tunnel.port)
-            print(f'{args.name} is at {address} until Ctrl-C; in a browser:\n'
-                  f'{urls.app(address)}', flush=True)
-            if not args.no_browser:
+            page = urls.served('localhost', tunnel.port) \
+                if monitor.has_application(tunnel.port) else urls.app(address)
+            print(f'{entry.name} is at {address} until Ctrl-C; in a browser:\n{page}', flush=True)
+            if browser:
                 import webbrowser
-                webbrowser.open(urls.app(address))
+                webbrowser.open(page)
             try:
-                tunnel.serve()
+                ended.wait()
             except KeyboardInterrupt:
                 print()
-            finally:
-                tunnel.close()
-        return 0
+    return 0
+
+
+def share(entry: Entry) -> int:
+    """Print the addresses that others take, with the token, which is the machine's to tell."""
+    from fogros2.monitor import urls
+    from ros2fog_cli.api import monitor, reach
+    with reach.session(entry) as shell:
+        where, token, fingerprint = monitor.credentials_of(entry, shell)
+    address = urls.guarded(where, token)
+    print(f'{address}\n\n'
+          'A browser has to be shown the certificate once, here:\n'
+          f'https://{address[len("wss://"):]}\n'
+          f'its SHA-256 is {fingerprint}\n')
+    for at in (urls.LICHTBLICK, urls.FOXGLOVE):
+        print(urls.app(address, at))
+    return 0

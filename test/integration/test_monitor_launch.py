@@ -3,20 +3,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
+import ipaddress
+import json
 from pathlib import Path
 import re
 import secrets
 import signal
 import socket
+import ssl
 import subprocess
 
 import pytest
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 
+from fogros2.model import Command
+from fogros2.process import run
 from fogros2.store import Store
 from fogros2.testing import viewer as viewers
-from fogros2.testing.launched import launching
+from fogros2.testing.launched import launching, ros2
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -26,7 +33,7 @@ from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    machine = ContainerInstance(name={name!r}, launch_foxglove=True)
+    machine = ContainerInstance(name={name!r}, launch_foxglove=True{more})
     return FogROSLaunchDescription([CloudNode(
         machine=machine, package='fogros2_examples', executable='talker', name='talker')])
 """
@@ -48,34 +55,97 @@ def sees_the_talker(url: str) -> None:
         viewer.close()
 
 
-def test_a_viewer_comes_in_by_the_vpn_and_by_a_tunnel(nothing_left, engine, tmp_path):
+def sees_by_a_tunnel(name: str) -> None:
+    tunnel = subprocess.Popen(
+        ['ros2', 'fog', 'monitor', name, '--no-browser'], stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, stdin=subprocess.DEVNULL)
+    try:
+        near = re.search(r'is at (ws://localhost:\d+) ', tunnel.stdout.readline())[1]
+        # the machine runs no containers, and so has no application
+        assert tunnel.stdout.readline().startswith(
+            'https://app.foxglove.dev/~/view?ds=foxglove-websocket&ds.url=ws%3A%2F%2F')
+        sees_the_talker(near)
+    finally:
+        tunnel.send_signal(signal.SIGINT)
+        assert tunnel.communicate(timeout=30)[0] == '\n'
+    assert tunnel.returncode == 0
+
+
+@contextlib.contextmanager
+def second_address(network: str, address: str) -> Iterator[None]:
+    """Give this computer another address in the machine's network, whose bridge is up."""
+    told = json.loads(run(Command(('podman', 'network', 'inspect', network), sudo=True),
+                          timeout=60).stdout)[0]
+    length = ipaddress.ip_network(told['subnets'][0]['subnet']).prefixlen
+    words = (f'{address}/{length}', 'dev', told['network_interface'])
+    run(Command(('ip', 'address', 'add', *words), sudo=True), timeout=60)
+    try:
+        yield
+    finally:
+        run(Command(('ip', 'address', 'del', *words), sudo=True), timeout=60)
+
+
+def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = True) -> bytes:
+    """Return what answers a request, nothing where the connection just ends."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError), \
+            socket.create_connection(at, timeout=20, source_address=(source, 0)) as plain, \
+            context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
+        connection.sendall(f'GET {target} HTTP/1.1\r\nHost: x\r\n\r\n'.encode())
+        return connection.recv(4096)
+    return b''
+
+
+def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
+        nothing_left, engine, cloud_network, nobody, tmp_path):
     name = f'mon-{secrets.token_hex(2)}'
+    gateway = json.loads(run(Command(
+        ('podman', 'network', 'inspect', cloud_network), sudo=True), timeout=60).stdout)[0][
+            'subnets'][0]['gateway']
     file = tmp_path / 'monitor.launch.py'
-    file.write_text(LAUNCH_FILE.format(name=name))
+    file.write_text(LAUNCH_FILE.format(
+        name=name, more=f', network={cloud_network!r}, monitor_allow=[{gateway!r}]'))
     with launching() as launch:
         launched = launch(str(file))
         launched.wait_for('serving ws://')
-        url = re.search(r'Foxglove at (ws://\S+?);', launched.text)[1]
-        assert f'in a browser: ros2 fog monitor {name}' in launched.text
+        launched.wait_for('the certificate has the SHA-256')
+        told = re.search(
+            r'Foxglove for (\S+) at wss://(\S+):(\d+); with its token: (.*)', launched.text)
+        assert (told[1], told[4]) == (f'{gateway}/32', f'ros2 fog monitor {name} --share')
+        at = told[2], int(told[3])
+        assert at == (Store().machine(name).load().shell.host, 8766)
+
+        shared = ros2('fog', 'monitor', name, '--share').stdout.splitlines()
+        url = shared[0]
+        assert url.startswith(f'wss://{at[0]}:{at[1]}/?token=')
+        fingerprint = re.search('SHA-256 is (.*)', '\n'.join(shared))[1]
+        assert f'the certificate has the SHA-256 {fingerprint}' in launched.text
+        target = url.partition(str(at[1]))[2]
+        token = target.partition('=')[2]
+        assert token not in launched.text
+
         sees_the_talker(url)
-
-        # where the robot reaches the machine without the VPN, nobody listens
-        outside = Store().machine(name).load().shell.host
+        assert b'certificate is accepted' in knock(at, target)
+        inside = re.search(r'Foxglove at (ws://\S+?); in a browser', launched.text)
+        sees_the_talker(inside[1])
+        assert (f'{name}: topics at http{inside[1][len("ws"):]}/?ds=foxglove-websocket&'
+                in ros2('fog', 'list').stdout)
+        sees_by_a_tunnel(name)
+        with second_address(cloud_network, nobody):
+            for _ in range(3):
+                assert knock(at, '/').startswith(b'HTTP/1.1 401 ')
+                assert knock(at, '/?token=wrong').startswith(b'HTTP/1.1 401 ')
+                assert b'200' not in knock(at, target, tls=False)
+                assert knock(at, target, source=nobody) == b''
+        for who, why in ((gateway, 'no token'), (gateway, 'a wrong token'),
+                         (gateway, 'no TLS: HTTP_REQUEST'),
+                         (nobody, 'not among the networks that are allowed')):
+            launched.wait_for(f'turned away {who}: {why}')
+        assert launched.text.count('turned away') == 4
+        # where the machine is reached without the VPN, nobody listens without asking
         with pytest.raises(ConnectionRefusedError):
-            socket.create_connection((outside, 8765), timeout=20)
-
-        tunnel = subprocess.Popen(
-            ['ros2', 'fog', 'monitor', name, '--no-browser'], stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, stdin=subprocess.DEVNULL)
-        try:
-            near = re.search(r'is at (ws://localhost:\d+) ', tunnel.stdout.readline())[1]
-            assert tunnel.stdout.readline().startswith(
-                'https://app.foxglove.dev/~/view?ds=foxglove-websocket&ds.url=ws%3A%2F%2F')
-            sees_the_talker(near)
-        finally:
-            tunnel.send_signal(signal.SIGINT)
-            assert tunnel.communicate(timeout=30)[0] == '\n'
-        assert tunnel.returncode == 0
+            socket.create_connection((at[0], 8765), timeout=20)
         launched.interrupt()
         assert launched.ended() == 0
         assert launched.errors == []

@@ -153,6 +153,7 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'truth': ('true'
             'scalar': ('true', True), 'list': ('a,b', ['a', 'b'])}
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'name': 'planner'}
+LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1'])}
 
 
 @pytest.mark.parametrize('provider', sorted(CLASSES))
@@ -162,7 +163,7 @@ def test_every_keyword_of_every_provider_is_an_attribute_plain_and_as_a_substitu
     for keyword in keywords.keywords(CLASSES[provider]).values():
         if keyword.kind in ('mapping', 'table'):
             continue
-        text, value = EXAMPLES[keyword.kind]
+        text, value = LISTS.get(keyword.name, EXAMPLES[keyword.kind])
         text = CHOICES.get(keyword.name, text)
         value = CHOICES.get(keyword.name, value)
         expected = CLASSES[provider](**{**needed, keyword.name: value}).spec(LaunchContext())

@@ -19,18 +19,44 @@ import threading
 
 import pytest
 
-from fogros2.monitor.gate import admitted, endpoint, Refused
+from fogros2.monitor import credentials, page
+from fogros2.monitor.gate import endpoint, network, plain_address
+from fogros2.monitor.request import check, parse, Refused
 
 TOKEN = 'sesame-0123456789'
 
 
-def request(target: str, method: str = 'GET') -> bytes:
-    return f'{method} {target} HTTP/1.1\r\nHost: x\r\n\r\n'.encode()
+def request(target: str, method: str = 'GET', more: str = '') -> bytes:
+    return f'{method} {target} HTTP/1.1\r\nHost: x\r\n{more}\r\n'.encode()
 
 
 def test_the_token_is_taken_out_of_what_is_handed_on():
-    assert admitted(request(f'/a?x=1&token={TOKEN}&y=%20'), TOKEN) == request('/a?x=1&y=+')
-    assert admitted(request(f'/?token={TOKEN}'), TOKEN) == request('/')
+    for target, left in ((f'/a?x=1&token={TOKEN}&y=%20', '/a?x=1&y=+'),
+                         (f'/?token={TOKEN}', '/'), ('/a?x=%20', '/a?x=%20')):
+        assert parse(request(target)).handed_on() == request(left)
+    cookie = f'Cookie: a=b; fogros2={TOKEN}\r\nConnection: keep-alive\r\n'
+    assert parse(request('/', more=cookie)).handed_on(closing=True) == request(
+        '/', more='Connection: close\r\n')
+
+
+def test_a_page_may_have_the_token_in_a_cookie_and_a_websocket_may_not():
+    cookie = f'Cookie: a=b; fogros2={TOKEN}\r\n'
+    check(parse(request('/', more=cookie)), TOKEN)
+    with pytest.raises(Refused, match='no token'):
+        check(parse(request('/', more=f'{cookie}Upgrade: WebSocket\r\n')), TOKEN)
+    with pytest.raises(Refused, match='a wrong token'):
+        check(parse(request('/', more='Cookie: fogros2=x\r\n')), TOKEN)
+    with pytest.raises(Refused, match='no token'):
+        check(parse(request('/', more='Cookie: ;;=\r\n')), TOKEN)
+
+
+@pytest.mark.parametrize('target', ['//evil.example/x', '/\\evil.example/x', 'http://x//evil'])
+def test_nobody_is_led_elsewhere(target):
+    answer = page.redirect(parse(request(f'{target}?token={TOKEN}')), TOKEN)
+    place, = (line for line in answer.split(b'\r\n') if line.startswith(b'Location: '))
+    assert place[len('Location: '):][:2] not in (b'//', b'/\\')
+    assert TOKEN.encode() not in place
+    assert f'fogros2={TOKEN}; Path=/; Secure; HttpOnly; SameSite=Lax'.encode() in answer
 
 
 @pytest.mark.parametrize(('head', 'status'), [
@@ -43,10 +69,12 @@ def test_the_token_is_taken_out_of_what_is_handed_on():
     (request(f'/?token={TOKEN}', 'POST'), '400'),
     (b'\x16\x03\x01 nonsense\r\n\r\n', '400'),
     (b'\r\n\r\n', '400'),
+    (b'GET / HTTP/2\r\n\r\n', '400'),
+    (b'GET //[x HTTP/1.1\r\n\r\n', '400'),
 ])
 def test_others_are_refused(head, status):
     with pytest.raises(Refused) as refused:
-        admitted(head, TOKEN)
+        check(parse(head), TOKEN)
     assert refused.value.status.startswith(status)
     assert TOKEN not in str(refused.value)
 
@@ -57,6 +85,34 @@ def test_an_endpoint_is_an_address_and_a_port():
     for text in ('8765', 'here:', 'here:x', 'here:70000'):
         with pytest.raises(Exception, match='ADDRESS:PORT'):
             endpoint(text)
+
+
+def test_addresses_are_what_they_are_whichever_socket_they_come_by():
+    assert plain_address('::ffff:198.51.100.1') == '198.51.100.1'
+    assert plain_address('fe80::1%eth0') == 'fe80::1'
+    with pytest.raises(Exception, match='host bits'):
+        network('198.51.100.1/28')
+
+
+@pytest.mark.parametrize(('host', 'links', 'shown'), [
+    ('localhost:8765', True, 'ws://localhost:8765'),
+    ('127.0.0.1:1', True, 'ws://127.0.0.1:1'),
+    ('[::1]:1', True, 'ws://[::1]:1'),
+    ('198.18.0.1:8765', False, 'ws://198.18.0.1:8765'),
+    ('"><script>', False, 'ws://&quot;&gt;&lt;script&gt;'),
+])
+def test_a_page_leads_to_applications_that_may_open_the_bridge(host, links, shown):
+    asked = parse(f'GET / HTTP/1.1\r\nHost: {host}\r\n\r\n'.encode())
+    text = page.links(asked, 'planner').decode()
+    assert (shown in text, 'https://' in text) == (True, links)
+    assert '<script>' not in text
+
+
+def test_who_came_with_the_token_is_led_on_with_it():
+    asked = parse(b'GET /?token=x HTTP/1.1\r\nHost: 198.51.100.2:8766\r\n\r\n')
+    text = page.links(asked, 'planner', TOKEN).decode()
+    assert ('https://lichtblick-suite.github.io/lichtblick/?ds=foxglove-websocket&amp;'
+            f'ds.url=wss%3A%2F%2F198.51.100.2%3A8766%2F%3Ftoken%3D{TOKEN}"') in text
 
 
 class Bridge(http.server.BaseHTTPRequestHandler):
@@ -85,7 +141,10 @@ def bridge() -> Iterator[int]:
 class Running:
     """A gate in a process of its own."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
+        made = credentials.Credentials(folder)
+        self.token = made.token.read_text().strip()
+        self.certificate = made.certificate
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, args=(process,))
         self._reader.start()
@@ -105,35 +164,33 @@ class Running:
 
 
 @contextmanager
-def running(folder: Path, to: int) -> Iterator[Running]:
+def running(folder: Path, to: int, *words: str) -> Iterator[Running]:
     if shutil.which('openssl') is None:
         pytest.skip('needs openssl')
-    subprocess.run(
-        ['openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1',
-         '-nodes', '-keyout', folder / 'key', '-out', folder / 'certificate', '-days', '1',
-         '-subj', '/CN=test', '-addext', 'subjectAltName=IP:127.0.0.1'],
-        check=True, capture_output=True)
-    (folder / 'token').write_text(TOKEN + '\n')
+    folder = Path(credentials.folder_of(str(folder), 8765, 'launch'))
+    made = credentials.make(folder, 'planner')
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2.monitor.gate', '--to', f'127.0.0.1:{to}',
-         '--listen', '127.0.0.1:0', '--guarded', '127.0.0.1:0',
-         '--certificate', folder / 'certificate', '--key', folder / 'key',
-         '--token-file', folder / 'token'],
+         '--listen', '127.0.0.1:0', '--guarded', ':0', '--certificate', made.certificate,
+         '--key', made.key, '--token-file', made.token, *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        yield Running(process)
+        yield Running(process, folder)
     finally:
         process.terminate()
         assert process.wait(20) == 0
         process.stdout.close()
 
 
-def ask(folder: Path, port: int, target: str) -> bytes:
+UPGRADE = 'Upgrade: websocket\r\nConnection: close\r\n'
+
+
+def ask(gate: Running, target: str, more: str = UPGRADE, at: str = '127.0.0.1') -> bytes:
     """Return the answer to a request over TLS, to one who knows the certificate."""
-    tls = ssl.create_default_context(cafile=folder / 'certificate')
-    with socket.create_connection(('127.0.0.1', port), timeout=20) as plain:
-        with tls.wrap_socket(plain, server_hostname='127.0.0.1') as connection:
-            connection.sendall(request(target)[:-2] + b'Connection: close\r\n\r\n')
+    tls = ssl.create_default_context(cafile=gate.certificate)
+    with socket.create_connection((at, gate.ports[1]), timeout=20) as plain:
+        with tls.wrap_socket(plain, server_hostname='planner') as connection:
+            connection.sendall(request(target, more=more))
             return b''.join(iter(lambda: connection.recv(4096), b''))
 
 
@@ -141,16 +198,16 @@ def test_who_may_comes_in_and_others_are_logged_once(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
         open_port, guarded = gate.ports
         with closing(socket.create_connection(('127.0.0.1', open_port), timeout=20)) as robot:
-            robot.sendall(request('/robot'))
+            robot.sendall(request('/robot', more=UPGRADE))
             assert b'200 OK' in robot.recv(4096)
-        answer = ask(tmp_path, guarded, f'/?token={TOKEN}&topic=a')
+        answer = ask(gate, f'/?token={gate.token}&topic=a')
         assert b' 200 OK' in answer
         assert answer.endswith(b'/?topic=a')
         for _ in range(3):
-            assert ask(tmp_path, guarded, '/').startswith(b'HTTP/1.1 401 ')
-            assert ask(tmp_path, guarded, '/?token=wrong').startswith(b'HTTP/1.1 401 ')
+            assert ask(gate, '/').startswith(b'HTTP/1.1 401 ')
+            assert ask(gate, '/?token=wrong').startswith(b'HTTP/1.1 401 ')
             with closing(socket.create_connection(('127.0.0.1', guarded), timeout=20)) as plain:
-                plain.sendall(request(f'/?token={TOKEN}'))
+                plain.sendall(request(f'/?token={gate.token}'))
                 assert b'HTTP/1.1 200' not in plain.recv(4096)
         assert [gate.line() for _ in range(3)] == [
             'turned away 127.0.0.1: no token', 'turned away 127.0.0.1: a wrong token',
@@ -158,23 +215,59 @@ def test_who_may_comes_in_and_others_are_logged_once(tmp_path, bridge):
     assert gate.ended() == []
 
 
+def test_other_networks_do_not_even_get_a_handshake(tmp_path, bridge):
+    with running(tmp_path, bridge, '--allow', '127.0.0.2/32', '--allow', '::1/128') as gate:
+        for _ in range(3):
+            with pytest.raises(OSError, match='reset|EOF|violation'):
+                ask(gate, f'/?token={gate.token}')
+        assert b' 200 OK' in ask(gate, f'/?token={gate.token}', at='::1')
+        assert gate.line() == 'turned away 127.0.0.1: not among the networks that are allowed'
+    assert gate.ended() == []
+
+
+def test_pages_go_to_the_application_where_there_is_one(tmp_path, bridge):
+    """The application is served to who has come with the token once, its links without it."""
+    with running(tmp_path, bridge, '--application', f'127.0.0.1:{bridge}') as gate:
+        answer = ask(gate, f'/?token={gate.token}&ds=x', more='')
+        assert answer.startswith(b'HTTP/1.1 303 ')
+        assert b'\r\nLocation: /?ds=x\r\n' in answer
+        cookie = f'Cookie: fogros2={gate.token}\r\nConnection: keep-alive\r\n'
+        answer = ask(gate, '/main.js', more=cookie)  # returns: the connection ends with it
+        assert b' 200 OK' in answer
+        assert answer.endswith(b'/main.js')
+        assert ask(gate, '/main.js', more='').startswith(b'HTTP/1.1 401 ')
+
+
+def test_without_an_application_a_page_says_where_there_are_some(tmp_path, bridge, free_udp_port):
+    with running(tmp_path, bridge, '--application', f'127.0.0.1:{free_udp_port}',
+                 '--name', 'planner') as gate:
+        with closing(socket.create_connection(('127.0.0.1', gate.ports[0]), timeout=20)) as robot:
+            robot.sendall(request('/?ds=x'))
+            page_there = b''.join(iter(lambda: robot.recv(4096), b''))
+        assert page_there.startswith(b'HTTP/1.1 200 OK')
+        assert b'ros2 fog monitor planner' in page_there
+        assert b'certificate is accepted' in ask(gate, f'/?token={gate.token}', more='')
+        assert ask(gate, f'/favicon.ico?token={gate.token}', more='').startswith(
+            b'HTTP/1.1 404 ')
+
+
 def test_the_process_list_does_not_have_the_token(tmp_path, bridge):
-    with running(tmp_path, bridge):
+    with running(tmp_path, bridge) as gate:
         children = Path(f'/proc/{os.getpid()}/task').glob('*/children')
         words = b' '.join(
             Path('/proc', child, 'cmdline').read_bytes()
             for path in children for child in path.read_text().split())
     assert b'monitor.gate' in words
-    assert TOKEN.encode() not in words
+    assert gate.token.encode() not in words
 
 
 def test_a_bridge_that_is_not_there_yet_is_told(tmp_path, free_udp_port):
     with running(tmp_path, free_udp_port) as gate:
-        assert ask(tmp_path, gate.ports[1], f'/?token={TOKEN}').startswith(b'HTTP/1.1 502 ')
+        assert ask(gate, f'/?token={gate.token}').startswith(b'HTTP/1.1 502 ')
         assert 'the bridge does not answer' in gate.line()
 
 
 def test_a_long_request_is_cut_off(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
-        answer = ask(tmp_path, gate.ports[1], f'/?token={TOKEN}&x=' + 'x' * 40000)
+        answer = ask(gate, f'/?token={gate.token}&x=' + 'x' * 40000)
         assert answer.startswith(b'HTTP/1.1 431 ')

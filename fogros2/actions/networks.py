@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Networks that a launch file names: who may watch."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Any, TYPE_CHECKING
+
+from fogros2.actions import words
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+
+_SUCH = "write networks such as '198.51.100.0/28', or addresses"
+
+
+def items(values: Any) -> Any:
+    """
+    Return networks that stay apart, None for none.
+
+    :raises ConfigurationError: it is one text, or a plain one is no network.
+    """
+    if isinstance(values, str):
+        raise ConfigurationError(f'monitor_allow={values!r} is no list of networks', _SUCH)
+    found = words.items(values)
+    if isinstance(found, words.Items):
+        for value in found:
+            if isinstance(value, str):
+                normal(value)
+    return found
+
+
+def resolve(context: LaunchContext, values: Any) -> tuple[str, ...]:
+    """
+    Return networks in CIDR form.
+
+    :param values: as :func:`items` has them.
+    :raises ConfigurationError: one is no network.
+    """
+    return tuple(normal(value) for value in words.resolve(context, values) or ())
+
+
+def normal(text: str) -> str:
+    """
+    Return a network, or an address, in CIDR form.
+
+    :raises ConfigurationError: it is neither, or has bits set beyond its mask.
+    """
+    try:
+        return str(ipaddress.ip_network(text.strip()))
+    except ValueError:
+        pass
+    try:
+        meant = str(ipaddress.ip_network(text.strip(), strict=False))
+    except ValueError as error:
+        raise ConfigurationError(f"monitor_allow: '{text}' is no network", _SUCH) from error
+    raise ConfigurationError(f"monitor_allow: '{text}' is an address within a network",
+                             f"write '{meant}', or the address alone")

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the gate answers by itself: a page that leads to the applications, and short refusals; pure.
+
+The page has a second use. A browser opens no ``wss://`` to a certificate that it doesn't know, and
+asks nobody; who opens this page is asked.
+"""
+
+from __future__ import annotations
+
+import html
+import ipaddress
+
+from fogros2.monitor import urls
+from fogros2.monitor.request import COOKIE, Request
+
+#: Says of an answer that it is the gate's own, not the application's.
+MARK = 'X-FogROS2-Gate'
+
+_PAGE = """\
+<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<meta name="color-scheme" content="light dark">
+<title>{name}</title>
+<style>
+body {{ font: 1rem/1.5 system-ui, sans-serif; max-width: 42rem; margin: 3rem auto;
+padding: 0 1rem }}
+code {{ overflow-wrap: anywhere }}
+</style>
+<h1>{name}</h1>
+{text}
+</html>
+"""
+
+
+def answer(status: str, body: str = '', *headers: str) -> bytes:
+    """Return an answer after which the connection ends; ``body`` is HTML."""
+    data = body.encode()
+    head = [
+        f'HTTP/1.1 {status}', f'{MARK}: 1', 'Connection: close', f'Content-Length: {len(data)}',
+        'Content-Type: text/html; charset=utf-8', 'Cache-Control: no-store',
+        'Referrer-Policy: no-referrer', 'X-Content-Type-Options: nosniff',
+        "Content-Security-Policy: default-src 'none'; style-src 'unsafe-inline'", *headers, '', '']
+    return '\r\n'.join(head).encode('latin-1') + data
+
+
+def redirect(request: Request, token: str) -> bytes:
+    """Return the way to the same page without the token, which becomes a cookie."""
+    return answer(
+        '303 See Other', '', f'Location: {request.target}',
+        f'Set-Cookie: {COOKIE}={token}; Path=/; Secure; HttpOnly; SameSite=Lax')
+
+
+def links(request: Request, name: str, token: str = '') -> bytes:
+    """
+    Return the page that leads to the web applications.
+
+    :param name: of the machine.
+    :param token: what was asked for with it, over TLS; '' where none is needed.
+    """
+    # what was asked for is the one address that is known to get here from there
+    where = request.host
+    address = urls.guarded(where, token) if token else f'ws://{where}'
+    parts = [f'<p>The topics of this machine are at<br><code>{html.escape(address)}</code></p>']
+    if token:
+        parts.append('<p>The certificate is accepted: your browser will open this address in the '
+                     'applications below, too.</p>')
+    if token or is_loopback(where):
+        parts.append('<ul>' + ''.join(
+            f'<li><a href="{html.escape(urls.app(address, at))}">{title}</a></li>'
+            for title, at in (('Lichtblick', urls.LICHTBLICK), ('Foxglove', urls.FOXGLOVE)))
+            + '</ul>')
+    else:
+        parts.append(
+            '<p>Pages of other hosts may not open it from here, as the connection to this one is '
+            'not encrypted by the browser. Take the desktop application, or</p>'
+            f'<p><code>ros2 fog monitor {html.escape(name)}</code></p>')
+    return answer('200 OK', _PAGE.format(name=html.escape(name), text='\n'.join(parts)))
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a Host header's value names the loopback."""
+    alone = host.rpartition(':')[0] if not host.endswith(']') and ':' in host else host
+    alone = alone.strip('[]')
+    try:
+        return ipaddress.ip_address(alone).is_loopback
+    except ValueError:
+        return alone == 'localhost'
