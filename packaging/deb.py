@@ -51,18 +51,38 @@ UBUNTU = {
 #: What bloom adds to all packages: the folder's setup.bash.
 WORKSPACE = 'ros-jazzy-ros-workspace'
 #: What not every robot needs, and rosdep has no key for.
-RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'wireguard-go')
+RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'sudo', 'wireguard-go')
+#: The helper by which a group of users makes VPN interfaces, what it imports, and its rights.
+HELPER = ROOT / 'packaging/vpn_helper'
+HELPER_FILES = {
+    HELPER / 'vpn.py': ('usr/libexec/fogros2/vpn', 0o755),
+    **{ROOT / f'fogros2/{name}.py': (f'usr/libexec/fogros2/fogros2/{name}.py', 0o644)
+       for name in ('__init__', 'errors', 'model', 'vpn/__init__', 'vpn/addresses',
+                    'vpn/wireguard')},
+    HELPER / 'sudoers': ('etc/sudoers.d/fogros2-vpn', 0o440),
+    **{HELPER / f'fogros2-vpn-tidy.{kind}': (f'usr/lib/systemd/system/fogros2-vpn-tidy.{kind}',
+                                            0o644) for kind in ('service', 'timer')}}
+TIMER = 'fogros2-vpn-tidy.timer'
 
 #: What apt shows below the first line, one line each.
 DESCRIPTION = (
     'Machines (EC2 instances, pods of a Kubernetes cluster, SSH hosts, containers) are',
     'created as the launch begins, get the workspace, ROS 2 and a VPN, and are deleted as',
     'it ends. The examples and the image transport H.264 are in this package, too.')
-#: Run before removal and upgrade: a Python of root's has compiled modules, which dpkg knows
-#: nothing of, so that their folders would stay.
-PRERM = """\
+#: Run before removal and upgrade. VPN interfaces lose what would take them away, and a Python of
+#: root's has compiled modules, which dpkg knows nothing of, so that their folders would stay.
+PRERM = f"""\
 #!/bin/sh
 set -e
+[ ! -d /run/systemd/system ] || systemctl stop --quiet {TIMER} || :
+""" + """\
+if [ "$1" = remove ]; then
+    for each in /run/fogros2/fog*; do
+        [ -d "$each" ] || continue
+        printf '{"name": "%s"}' "${each##*/}" | /usr/libexec/fogros2/vpn down
+    done
+    rm -rf /run/fogros2
+fi
 dpkg -L ros-jazzy-fogros2 | sed -n 's/\\.py$//p' | while read -r module; do
     folder=${module%/*}/__pycache__
     [ -d "$folder" ] || continue
@@ -70,6 +90,23 @@ dpkg -L ros-jazzy-fogros2 | sed -n 's/\\.py$//p' | while read -r module; do
     rmdir --ignore-fail-on-non-empty -- "$folder"
 done
 """
+#: A group without members: an administrator says who may.
+POSTINST = f"""\
+#!/bin/sh
+set -e
+getent group fogros2 >/dev/null || groupadd --system fogros2
+if [ -d /run/systemd/system ]; then
+    systemctl daemon-reload
+    systemctl start --quiet {TIMER}
+fi
+"""
+POSTRM = """\
+#!/bin/sh
+set -e
+[ "$1" = purge ] || exit 0
+! getent group fogros2 >/dev/null || groupdel fogros2
+"""
+SCRIPTS = {'postinst': POSTINST, 'prerm': PRERM, 'postrm': POSTRM}
 
 
 def dependencies(manifests: list[Path]) -> list[str]:
@@ -182,6 +219,18 @@ def documents(stage: Path) -> None:
         path.chmod(0o644)
 
 
+def helper(stage: Path) -> None:
+    """Write the helper of the VPN beside the rest, and what starts it."""
+    for source, (name, mode) in HELPER_FILES.items():
+        target = stage / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)
+        target.chmod(mode)
+    wants = stage / 'usr/lib/systemd/system/timers.target.wants'
+    wants.mkdir()
+    (wants / TIMER).symlink_to(f'../{TIMER}')
+
+
 def control(stage: Path, version: str) -> Iterator[str]:
     """Yield the lines of the control file."""
     manifests = [ROOT / 'package.xml', *(
@@ -212,7 +261,9 @@ def build(output: Path) -> Path:
         stage = folder / 'stage'
         version = unpack(wheel(folder), stage)
         documents(stage)
-        files = sorted(path for path in stage.rglob('*') if path.is_file())
+        helper(stage)
+        files = sorted(
+            path for path in stage.rglob('*') if path.is_file() and not path.is_symlink())
         debian = stage / 'DEBIAN'
         lines = list(control(stage, version))
         debian.mkdir()
@@ -220,8 +271,10 @@ def build(output: Path) -> Path:
         (debian / 'md5sums').write_text(''.join(
             f'{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  '
             f'{path.relative_to(stage)}\n' for path in files))
-        (debian / 'prerm').write_text(PRERM)
-        (debian / 'prerm').chmod(0o755)
+        (debian / 'conffiles').write_text('/etc/sudoers.d/fogros2-vpn\n')
+        for name, text in SCRIPTS.items():
+            (debian / name).write_text(text)
+            (debian / name).chmod(0o755)
         for path in (stage, *stage.rglob('*')):
             if path.is_dir():
                 path.chmod(0o755)

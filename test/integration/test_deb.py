@@ -317,6 +317,14 @@ def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
             f'{data}/share/fogros2_examples/launch/talker.container.launch.py'} <= set(names)
 
 
+def test_who_is_in_a_group_may_make_vpn_interfaces(installed: System) -> None:
+    helper = '/usr/libexec/fogros2/vpn'
+    assert 'fogros2:' in installed.run('getent', 'group', 'fogros2').stdout
+    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '1\n'
+    assert 'by sudo' in installed.run(helper, 'check', user='nobody', check=False).stderr
+    assert installed.run('stat', '-c', '%a %u', '/etc/sudoers.d/fogros2-vpn').stdout == '440 0\n'
+
+
 def test_nothing_stays_after_it_is_purged(
     installed: System, files_before: frozenset[str],
 ) -> None:
@@ -325,6 +333,7 @@ def test_nothing_stays_after_it_is_purged(
     installed.run('sh', '-c', f'ls {SITE}/fogros2/shell/__pycache__/ssh.*.pyc')
     installed.apt('stubs', 'purge', NAME)
     assert not installed.has_package()
+    assert installed.run('getent', 'group', 'fogros2', check=False).returncode != 0
     after = frozenset(installed.run('sh', '-c', ALL_FILES).stdout.splitlines())
     assert after <= files_before
     # which no package owns, so that whoever leaves it empty takes it along

@@ -11,8 +11,10 @@ import hashlib
 import importlib.util
 import io
 from pathlib import Path
+import re
 import shutil
 import subprocess
+import sys
 import tarfile
 from types import ModuleType
 
@@ -20,6 +22,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
+VPN = 'usr/libexec/fogros2/vpn'
 NODES = {'fogros2': {'bridge'},
          'fogros2_examples': {'camera', 'image_processor', 'listener', 'talker'},
          'image_transport_h264': {'decoder', 'encoder'}}
@@ -106,8 +109,10 @@ def test_files_are_where_bloom_puts_them(
 ) -> None:
     paths = {name for name, (info, _) in files.items() if info.isfile()}
     places = (f'{SITE}/', 'opt/ros/jazzy/lib/', 'opt/ros/jazzy/share/',
-              'usr/share/doc/ros-jazzy-fogros2/')
-    assert not [name for name in paths if not name.startswith(places)]
+              'usr/share/doc/ros-jazzy-fogros2/', 'usr/libexec/fogros2/')
+    assert {name for name in paths if not name.startswith(places)} == {
+        'etc/sudoers.d/fogros2-vpn', 'usr/lib/systemd/system/fogros2-vpn-tidy.service',
+        'usr/lib/systemd/system/fogros2-vpn-tidy.timer'}
     for package, nodes in NODES.items():
         assert f'opt/ros/jazzy/share/ament_index/resource_index/packages/{package}' in paths
         assert f'opt/ros/jazzy/share/{package}/package.xml' in paths
@@ -136,7 +141,11 @@ def test_owners_and_modes(files: dict[str, tuple[tarfile.TarInfo, bytes]]) -> No
              for name in names}
     for name, (info, _) in files.items():
         assert (info.uid, info.gid) == (0, 0), name
-        wanted = 0o755 if info.isdir() or name in nodes else 0o644
+        if info.issym():
+            assert name.endswith('timers.target.wants/fogros2-vpn-tidy.timer')
+            continue
+        wanted = 0o755 if info.isdir() or name in nodes or name == VPN else \
+            0o440 if 'sudoers' in name else 0o644
         assert info.mode == wanted, f'{name}: {info.mode:o}'
     assert all(files[name][1].startswith(b'#!/usr/bin/env python3\n') for name in nodes)
 
@@ -178,6 +187,28 @@ def test_plugins_are_announced(files: dict[str, tuple[tarfile.TarInfo, bytes]]) 
         assert f'[{group}]' in text
 
 
-def test_script_before_removal_is_a_shell_script(deb: ModuleType) -> None:
-    assert deb.PRERM.startswith('#!/bin/sh\nset -e\n')
-    subprocess.run(['sh', '-n'], input=deb.PRERM, text=True, check=True)
+@pytest.mark.parametrize('name', ['postinst', 'prerm', 'postrm'])
+def test_scripts_are_shell_scripts(deb: ModuleType, name: str) -> None:
+    assert deb.SCRIPTS[name].startswith('#!/bin/sh\nset -e\n')
+    subprocess.run(['sh', '-n'], input=deb.SCRIPTS[name], text=True, check=True)
+
+
+def test_the_helper_has_all_that_it_imports(
+    files: dict[str, tuple[tarfile.TarInfo, bytes]], tmp_path: Path,
+) -> None:
+    top = 'usr/libexec/'
+    for name, (info, data) in files.items():
+        if name.startswith(top) and info.isfile():
+            target = tmp_path / name.removeprefix(top)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(data)
+    # the interpreter of the tests, without their packages
+    said = subprocess.run([sys.executable, '-IS', str(tmp_path / 'fogros2/vpn'), 'nothing'],
+                          capture_output=True, text=True)
+    assert said.returncode == 2 and said.stderr.startswith('fogros2 vpn: ')
+    # the other way to install it brings the same
+    listed = (ROOT / 'packaging/vpn_helper/install').read_text()
+    (names,) = re.findall('for name in (.*); do', listed)
+    assert {f'{top}fogros2/vpn', *(f'{top}fogros2/fogros2/{name}.py' for name in names.split())} \
+        == {name for name, (info, _) in files.items()
+            if name.startswith(top) and info.isfile()}
