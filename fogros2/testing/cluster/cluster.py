@@ -48,6 +48,11 @@ class Cluster:
         """Return the administrator's kubeconfig file."""
         return self.folder / 'admin.conf'
 
+    @property
+    def why_not_ready(self) -> str:
+        """Return why ``READY`` has nothing that a launch of this robot needs, '' if it has."""
+        return images.why_not_ready(self.images)
+
     def kubeconfig_of(self, user: str, namespace: str = 'default') -> Path:
         """Return a kubeconfig file of a user (see ``USERS``) for a namespace."""
         path = self.folder / f'{user}-{namespace}.conf'

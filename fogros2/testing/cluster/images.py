@@ -3,8 +3,9 @@
 Machine images for a test's cluster, made on this computer: nothing is downloaded but packages.
 
 ``BARE`` is Debian with the few programs that every machine needs, by debootstrap; ``READY`` has
-the embedded default besides, put there by the same bootstrap that a launch uses; ``SANDBOX`` holds
-a pod's namespaces. They are kept, unpacked as containerd does it, in the user's cache folder.
+the robot's ROS besides (the embedded default, or this computer's ROS 2), put there by the same
+bootstrap that a launch uses; ``SANDBOX`` holds a pod's namespaces. They are kept, unpacked as
+containerd does it, in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from fogros2 import bootstrap, plan, process, wheels
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command, MachineSpec, Result, SyncReport
 from fogros2.provider.kubernetes.options import IMAGE
-from fogros2.testing.cluster import services
+from fogros2.testing.cluster import ros, services
 from fogros2.testing.cluster.node_process import run_node
 
 BARE = 'fogros2.test/machine:bare'
@@ -45,6 +46,8 @@ USER, UID = 'fog', 1000
 _ARCHITECTURES = {'x86_64': 'amd64', 'aarch64': 'arm64'}
 _CONFIG = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'],
            'Cmd': ['/bin/sh']}
+#: In an image folder: why ``READY`` is no more than ``BARE``, if it isn't.
+_WHY_NOT = 'why-not-ready'
 #: Takes documentation and apt's lists out: they are half of a small system.
 _SHRINK = ('rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/apt/* "$1"/usr/share/doc/* '
            '"$1"/usr/share/locale/* "$1"/usr/share/man/* "$1"/var/log/* "$1"/dev/*')
@@ -167,10 +170,12 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     :param binaries: the cluster's programs.
     """
     packed = wheels.collect()
+    its = None if packed.embedded else ros.prefix()
     with _alone(cache):
         root = base(cache, say)
         system = cache / f'system-{_checksum(f"1 {root.name}")}'
-        target = cache / f'images-{_checksum(f"3 {system.name} {packed.key}")}'
+        has = f'{packed.key} {its} {ros.key(its)}' if its else packed.key
+        target = cache / f'images-{_checksum(f"4 {system.name} {has}")}'
         for path in (system, target):
             # root's; one who isn't can't say that it was used
             with contextlib.suppress(FileNotFoundError, PermissionError):
@@ -178,7 +183,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
         if not target.is_dir():
             say('packing the machine images')
             with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside:
-                _make(Path(aside), root, system, target, packed, binaries)
+                _make(Path(aside), root, system, target, its, binaries)
             _forget_old(cache, 'images-', keep=target)
             _forget_old(cache, 'system-', keep=system)
     return target
@@ -196,7 +201,7 @@ def _alone(cache: Path) -> Iterator[None]:
 
 
 def _make(
-    aside: Path, root: Path, system: Path, target: Path, packed: wheels.Wheels, binaries: Path,
+    aside: Path, root: Path, system: Path, target: Path, its: Optional[Path], binaries: Path,
 ) -> None:
     layers = [aside / name for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
     upper, archive = aside / 'upper', aside / 'images.tar'
@@ -214,14 +219,19 @@ def _make(
         shell = RootShell(root, upper)
         shell.run(Command(('useradd', '-m', '-s', '/bin/bash', '-u', str(UID), USER), sudo=True,
                           what='add the login user'), timeout=30.0)
-        if packed.embedded:
-            _add_embedded(shell)
+        why_not = _add_ros(shell, its, root, upper / 'files')
         _tar(layers[1], upper / 'files')
         # the lower layer is there already
         write_archive(archive, [
             Image(name, tuple(layers[:2]), _CONFIG) for name in (READY, DEFAULT)],
             leave_out=layers[:1])
         _unpack(archive, target, binaries, system)
+        (target / _WHY_NOT).write_text(why_not)
+
+
+def why_not_ready(store: Path) -> str:
+    """Return why ``READY`` has no ROS in it, '' if it has."""
+    return (store / _WHY_NOT).read_text()
 
 
 def _unpack(
@@ -235,20 +245,33 @@ def _unpack(
     }, {'containerd.toml': services.containerd(SANDBOX)}).wait()
 
 
-def _add_embedded(shell: RootShell) -> None:
-    """Install the embedded default as a launch would."""
+def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> str:
+    """
+    Install what a launch of this robot would, and return why that can't be done.
+
+    :param its: the folder of the robot's ROS 2, None where it has the embedded default.
+    """
     # tests may be run by an interpreter whose folder isn't on PATH
     beside = str(Path(sys.executable).with_name('ros2'))
     ros2 = process.which('ros2') or process.which(beside)
     if ros2 is None:
         raise PrerequisiteError('ros2 is not on PATH', 'run this by tools/run.sh')
+    if its is not None:
+        ros.add(its, root, files)
+        runs = shell.run(Command(('sh', '-c', '. "$1/setup.sh" && ros2 --help', 'sh', str(its))),
+                         timeout=60.0, check=False)
+        if runs.returncode != 0:
+            last = runs.stderr.strip().rpartition('\n')[2]
+            return f"this computer's ROS 2 can't run in the machine image: {last}"
     under = plan.underlay(dict(os.environ), None, ros2)
     bootstrap.ensure(
         shell, under,  # type: ignore[arg-type]  # nothing there asks for put, open, interactive
-        MachineSpec(name='image', provider='', bootstrap='embedded'), timeout=300.0)
+        MachineSpec(name='image', provider='', bootstrap='none' if its else 'embedded'),
+        timeout=300.0)
     # or each pod would compile what it imports, once for each of its processes that begin together
     shell.run(Command(('python3', '-m', 'compileall', '-q', bootstrap.INSTALL_FOLDER),
-                      what='compile the embedded default'), timeout=300.0)
+                      what='compile what was installed'), timeout=300.0)
+    return ''
 
 
 def sandbox_layer(target: Path) -> None:

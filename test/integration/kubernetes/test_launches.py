@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 from pathlib import Path
 import shutil
@@ -16,16 +15,7 @@ from fogros2.testing.cluster import DEFAULT, READY
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
-
-def no_embedded() -> bool:
-    return not list(importlib.metadata.distributions(name='ros2-embedded'))
-
-
-pytestmark = [
-    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
-    pytest.mark.skipif(no_embedded(), reason='this robot runs ROS 2, and its pods would need an '
-                       'image with ROS 2: none can be made from what this computer has'),
-]
+pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
 #: Seconds for what takes a few on a computer that has nothing else to do.
 PATIENCE = 150.0
@@ -73,6 +63,13 @@ def generate_launch_description():
     ld.add_action(listener_node)
     return ld
 """
+
+
+@pytest.fixture(autouse=True, scope='module')
+def ready(kubernetes):
+    """Skip where the pods' image can't have what this robot's launches need."""
+    if reason := kubernetes.why_not_ready:
+        pytest.skip(reason)
 
 
 @pytest.fixture(autouse=True)
