@@ -187,6 +187,15 @@ class ProviderContract:
             for sources in ([robot], [robot], [], [], [robot]):
                 provider.allow(machine_id, 22, sources)
 
+    def test_a_port_is_published_and_closed_again(self) -> None:
+        with self.machine() as (provider, _, _, machine_id):
+            machine = self.reached(provider, machine_id)
+            for sources in (['198.51.100.0/28'], ['198.51.100.0/28', '198.51.100.77/32']):
+                host, port = provider.publish(machine, 8766, sources)
+                assert host and 0 < port < 65536
+            for _ in range(2):
+                provider.publish(machine, 8766, [])
+
     def test_a_host_key_of_the_machine_s_own_is_told_from_then_on(self) -> None:
         with self.machine() as (provider, _, _, machine_id):
             key = ' '.join(PUBLIC_KEY.split()[:2])

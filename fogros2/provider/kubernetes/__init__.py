@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import threading
 import time
@@ -238,6 +238,21 @@ class KubernetesProvider(Provider):
             known.pop(machine_id, None)
         with _translated(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
+
+    def publish(
+        self, machine: Machine, port: int, sources: Sequence[str],
+    ) -> tuple[str, int]:
+        """Make a Service for a TCP port, or remove it; loads what it takes when asked alone."""
+        from fogros2.provider.kubernetes import publishing
+        where = MachineId.parse(machine.id)
+        api = kubernetes_api.connect(where.context)
+        if not sources:
+            publishing.close(api, where, port)
+            return machine.vpn_host, port
+        pod = pods.pod_of(self._job(api, where), self._pods_of(api, where))
+        if pod is None:
+            raise MachineNotFound(f"the pod of '{where.job}' is gone")
+        return publishing.publish(api, where, machine, pod, port, sources, self.cancel)
 
     # -- what all of them need ------------------------------------------------------------------
 
