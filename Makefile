@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video test test-kubernetes lint bench soak deb docs clean
+.PHONY: help setup demo demo-video test test-kubernetes test-minimum lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -24,6 +24,13 @@ test-kubernetes:
 	@tools/setup.sh test
 	@tools/kubernetes.sh >/dev/null
 	@tools/test.sh test/integration/kubernetes $(ARGS)
+
+## test-minimum   the tests without machines, with the oldest versions that are supported
+test-minimum: export FOGROS2_VENV = $(CURDIR)/.venv-minimum
+test-minimum:
+	@PIP_CONSTRAINT=$(CURDIR)/packaging/noble.txt tools/setup.sh lint
+	@tools/run.sh embedded -- pytest --ignore=test/unit/test_linters.py \
+		test/unit test/contract test/launch ros2_embedded/test $(ARGS)
 
 ## lint   ruff and mypy
 lint:
@@ -57,7 +64,7 @@ setup:
 
 ## clean  take away what the targets above made in this folder
 clean:
-	rm -rf .venv .venv-ros .cache build install log *.egg-info ros2_embedded/*.egg-info
+	rm -rf .venv .venv-ros .venv-minimum .cache build install log *.egg-info ros2_embedded/*.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:

@@ -24,6 +24,7 @@ fi
 # The container of the demo sees the system's folders, not a home: a system Python comes first.
 # cyclonedds has wheels for 3.10 to 3.13, so a newer one comes last.
 find_python() {
+    if [ -n "${FOGROS2_PYTHON:-}" ]; then command -v "$FOGROS2_PYTHON"; return; fi
     for want in '(3, 10) <= v <= (3, 13)' 'v >= (3, 10)'; do
         for python in /usr/bin/python3 /usr/bin/python3.13 /usr/bin/python3.12 \
                 /usr/bin/python3.11 /usr/bin/python3.10 /usr/local/bin/python3 python3 \
