@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any, Optional
 
 from fogros2.store import Store
+from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.live import Live
 
 
@@ -21,7 +22,9 @@ class Board:
         self, store: Optional[Store] = None, *, regions: Optional[list[str]] = None,
         topics: bool = True,
     ) -> None:
-        self._live = Live(store, regions=regions)
+        store = store or Store()
+        self._graphs = Graphs(store) if topics else None
+        self._live = Live(store, regions=regions, more=self._look_at_graphs)
 
     def start(self) -> None:
         """Begin to look."""
@@ -30,6 +33,8 @@ class Board:
     def close(self) -> None:
         """End all that was begun."""
         self._live.close()
+        if self._graphs is not None:
+            self._graphs.close()
 
     def state(self, after: int, timeout: float) -> dict[str, Any]:
         """Return the state once it is a later one."""
@@ -39,10 +44,15 @@ class Board:
         """Return a machine's newer log lines."""
         return [dataclasses.asdict(line) for line in self._live.lines(machine, after)]
 
-    def picture(self, topic: str) -> Optional[bytes]:
-        """Return the last picture of a topic."""
-        return None
+    def picture(self, stream: str) -> Optional[bytes]:
+        """Return the last picture of a stream."""
+        return self._graphs.picture(stream) if self._graphs is not None else None
 
     def delete(self, machine: str, force: bool) -> None:
         """Begin to end a machine."""
         self._live.delete(machine, force=force)
+
+    def _look_at_graphs(self, live: Live) -> dict[str, Any]:
+        if self._graphs is None:
+            return {}
+        return self._graphs.update(live.running() if live.watched else [], live.names())

@@ -66,19 +66,25 @@ class Follower:
         self.problems: dict[str, str] = {}
         #: Names that the machine's nodes go by in the graph.
         self.names: tuple[str, ...] = ()
-        self._stopped = threading.Event()
+        self._stopped, self._watched = threading.Event(), threading.Event()
+        self._watched.set()
         self._thread = threading.Thread(
             target=self._run, name=f'fog-follow-{entry.name}', daemon=True)
         self._thread.start()
 
-    def know(self, entry: Entry) -> None:
-        """Take what is known of the machine now."""
+    def know(self, entry: Entry, *, watched: bool = True) -> None:
+        """Take what is known of the machine now, and whether anybody looks."""
         if entry.record is not None:
             self._entry, self._record = entry, entry.record
+        if watched:
+            self._watched.set()
+        else:
+            self._watched.clear()
 
     def stop(self) -> None:
         """End it; the connection closes soon after."""
         self._stopped.set()
+        self._watched.set()
 
     def join(self, timeout: float) -> None:
         """Wait for the connection to close, so many seconds."""
@@ -98,11 +104,11 @@ class Follower:
 
     def _run(self) -> None:
         pause = RETRY
-        while not self._stopped.is_set():
+        while self._watched.wait() and not self._stopped.is_set():
             try:
                 with contextlib.ExitStack() as undo:
                     client, shell = self._connect(undo)
-                    while not self._stopped.is_set():
+                    while self._watched.is_set() and not self._stopped.is_set():
                         self._ask(client, shell)
                         pause = RETRY
                         self._stopped.wait(self._interval)

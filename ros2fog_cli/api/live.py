@@ -62,7 +62,7 @@ class Live:
 
     :param name: of the one machine to look at, None for all.
     :param regions: places to ask where a provider has some.
-    :param more: what else belongs to the state, asked for each look.
+    :param more: what else belongs to the state, asked at each look.
     """
 
     def __init__(
@@ -105,6 +105,7 @@ class Live:
             follower.stop()
         for follower in followers:
             follower.join(2.0)
+        self._threads[0].join(5.0)
 
     # -- what others ask ------------------------------------------------------------------------
 
@@ -185,11 +186,13 @@ class Live:
 
     def _keep(self) -> None:
         while not self._stopped.is_set():
-            if not self.watched:
-                self._wake.wait(1.0)
             self._wake.clear()
             self._look()
-            self._wake.wait(LOOK if self.watched else 0.0)
+            if self.watched:
+                self._wake.wait(LOOK)
+                continue
+            # the look before has told those who measure for us; present() wakes us
+            self._wake.wait()
 
     def _keep_asking(self) -> None:
         while not self._stopped.wait(LOOK):
@@ -275,7 +278,7 @@ class Live:
         if up and shown.follower is None:
             shown.follower = Follower(shown.entry, self._wake.set, self._interval)
         elif up and shown.follower is not None:
-            shown.follower.know(shown.entry)
+            shown.follower.know(shown.entry, watched=self.watched)
         elif shown.follower is not None and (
                 record is None or not record.launch_alive or not there):
             shown.follower.stop()

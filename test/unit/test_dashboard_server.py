@@ -31,8 +31,8 @@ class Canned:
         self.asked.append(('log', machine, after))
         return [{'number': after + 1, 'text': '</script><b>'}]
 
-    def picture(self, topic: str) -> Optional[bytes]:
-        return b'\xff\xd8picture' if topic == '/camera' else None
+    def picture(self, stream: str) -> Optional[bytes]:
+        return b'\xff\xd8picture' if stream == '/camera' else None
 
     def delete(self, machine: str, force: bool) -> None:
         self.asked.append(('delete', machine, force))
@@ -77,9 +77,9 @@ def test_what_is_there(dashboard: Dashboard) -> None:
     assert json.loads(ask(dashboard, '/api/state?after=7')[1]) == {'version': 1, 'machines': []}
     assert json.loads(ask(dashboard, '/api/log?machine=a%20b&after=3')[1])[0]['number'] == 4
     assert asked(dashboard) == [('state', 7), ('log', 'a b', 3)]
-    status, data, headers = ask(dashboard, '/api/picture?topic=/camera')
+    status, data, headers = ask(dashboard, '/api/picture?of=/camera')
     assert (status, data, headers['Content-Type']) == (200, b'\xff\xd8picture', 'image/jpeg')
-    assert ask(dashboard, '/api/picture?topic=/other')[0] == 404
+    assert ask(dashboard, '/api/picture?of=/other')[0] == 404
     status, data, headers = ask(dashboard, '/', **{TOKEN: None})
     assert status == 200 and data == PAGE.read_bytes()
     assert dashboard.token.encode() not in data

@@ -41,8 +41,8 @@ class Source(Protocol):
     def log(self, machine: str, after: int) -> list[dict[str, Any]]:
         """Return a machine's log lines with numbers above ``after``."""
 
-    def picture(self, topic: str) -> Optional[bytes]:
-        """Return the last picture of a topic as JPEG."""
+    def picture(self, stream: str) -> Optional[bytes]:
+        """Return the last picture of a stream, by its id in the state, as JPEG."""
 
     def delete(self, machine: str, force: bool) -> None:
         """
@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == '/api/log':
             self._json(source.log(query.get('machine', ''), _number(query, 'after', 0)))
         elif path == '/api/picture':
-            picture = source.picture(query.get('topic', ''))
+            picture = source.picture(query.get('of', ''))
             if picture is None:
                 raise _Refused(HTTPStatus.NOT_FOUND, 'there is no picture of it')
             self._send(picture, 'image/jpeg')

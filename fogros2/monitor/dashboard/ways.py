@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics cross the VPN, by the names of the nodes at their ends; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+import re
+from typing import Optional
+
+from fogros2.image_transport.topics import identifier
+
+#: Names as :func:`fogros2.image_transport.topics.names_of` makes them.
+_ENCODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_encoder(?:_on_(?P<host>\w+))?')
+_DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
+                      r'(?:_from_(?P<source>\w+?))?(?:_on_(?P<host>\w+))?')
+#: What every node has, and what belongs to a stream.
+_HIDDEN = re.compile(r'/rosout|/parameter_events|.*/_.*|_.*')
+_OF_STREAM = ('keyframe', 'feedback', 'pieces', 'camera_info')
+#: Name of the node that looks, which is none of the launch's.
+OWN = '_fogros2_dashboard'
+
+
+@dataclasses.dataclass(frozen=True)
+class Topic:
+    """A topic of the graph: its type, and the names of the nodes at its ends."""
+
+    name: str
+    kind: str
+    publishers: frozenset[str]
+    subscribers: frozenset[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stream:
+    """
+    A streamed topic.
+
+    :param topic: as launch files have it.
+    :param between: the topic that crosses.
+    :param source: the machine it comes from, '' for the robot; ``target`` the one it goes to.
+    :param heard: whether anybody subscribes to what crosses.
+    """
+
+    topic: str
+    transport: str
+    between: str
+    kind: str
+    source: str
+    target: str
+    heard: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Crossing:
+    """A topic with ends on several hosts, '' for the robot."""
+
+    topic: str
+    kind: str
+    sources: tuple[str, ...]
+    targets: tuple[str, ...]
+
+
+class Hosts:
+    """
+    Which host a node is on.
+
+    :param machines: by name, the names of the nodes that run there.
+    """
+
+    def __init__(self, machines: Mapping[str, Iterable[str]]) -> None:
+        self._of_node = {node: name for name, nodes in machines.items() for node in nodes}
+        self._named = {identifier(name): name for name in machines}
+
+    def machine(self, identified: Optional[str]) -> str:
+        """Return the machine of which a node's name has so much."""
+        return self._named.get(identified, identified) if identified else ''
+
+    def of(self, node: str) -> str:
+        """Return a node's host; one of which nobody knows is the robot's."""
+        for pattern in (_ENCODER, _DECODER):
+            if match := pattern.fullmatch(node):
+                return self.machine(match['host'])
+        return self._of_node.get(node, '')
+
+
+def streams(topics: Iterable[Topic], nodes: Iterable[str], hosts: Hosts) -> list[Stream]:
+    """Return the streams whose encoder is in the graph, one for each decoder."""
+    by_name = {topic.name: topic for topic in topics}
+    nodes = sorted(set(nodes))
+    decoders = [match for node in nodes if (match := _DECODER.fullmatch(node))]
+    found = []
+    for node in nodes:
+        encoder = _ENCODER.fullmatch(node)
+        if encoder is None:
+            continue
+        for topic in by_name.values():
+            name, _, last = topic.name.rpartition('/')
+            if encoder['host']:
+                name = name.removeprefix(f"/fogros2/{encoder['host']}")
+            if node not in topic.publishers or last != encoder['transport'] \
+                    or identifier(name) != encoder['topic']:
+                continue
+            targets = [decoder['host'] for decoder in decoders if (
+                decoder['topic'], decoder['transport'], decoder['source']) == (
+                encoder['topic'], encoder['transport'], encoder['host'])]
+            found += [Stream(
+                name, last, topic.name, topic.kind, hosts.machine(encoder['host']),
+                hosts.machine(target), bool(topic.subscribers - {OWN}))
+                for target in targets]
+    return sorted(found, key=lambda one: (one.source, one.topic, one.target))
+
+
+def crossing(
+    topics: Iterable[Topic], hosts: Hosts, streamed: Iterable[Stream],
+) -> list[Crossing]:
+    """Return the other topics that have a publisher on one host and a subscriber on another."""
+    between = {one.between for one in streamed}
+    found = []
+    for topic in topics:
+        if _HIDDEN.fullmatch(topic.name) or topic.name in between \
+                or topic.name.rpartition('/')[0] in between \
+                and topic.name.rpartition('/')[2] in _OF_STREAM:
+            continue
+        sources = {hosts.of(node) for node in topic.publishers - {OWN}}
+        targets = {hosts.of(node) for node in topic.subscribers - {OWN}}
+        if any(source != target for source in sources for target in targets):
+            found.append(Crossing(
+                topic.name, topic.kind, tuple(sorted(sources)), tuple(sorted(targets))))
+    return sorted(found, key=lambda one: one.topic)
+
+
+def decoded(topic: Topic) -> bool:
+    """Return whether a topic is what a stream's decoder makes of it, and nobody else's."""
+    return bool(topic.publishers) and all(map(_DECODER.fullmatch, topic.publishers))

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A program beside each launch that somebody looks at: rates of topics, and pictures."""
+
+from __future__ import annotations
+
+import base64
+from collections import deque
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2.errors import FogError
+from fogros2.store import Record, Store
+from ros2fog_cli.api import reach
+
+#: The program; a process of its own, as a launch has a DDS configuration of its own.
+_PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
+#: Seconds after which one that ended is started anew.
+AGAIN = 10.0
+
+
+class Graph:
+    """
+    A program that looks at one launch's graph.
+
+    :param environment: its variables.
+    """
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self.streams: list[dict[str, Any]] = []
+        self.topics: list[dict[str, Any]] = []
+        self.pictures: dict[str, tuple[int, bytes]] = {}
+        self._notes: dict[str, str] = {}
+        self._said: deque[str] = deque(maxlen=5)
+        self._told = ''
+        self._process = subprocess.Popen(
+            _PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, errors='replace', env=environment,
+            # a Ctrl-C is for us, who close its standard input then
+            start_new_session=True)
+        self._readers = [threading.Thread(target=read, daemon=True, name='fog-graph')
+                         for read in (self._read, self._read_errors)]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self._process.poll() is None
+
+    @property
+    def trouble(self) -> str:
+        """The last thing that it said before it ended."""
+        return self._said[-1] if self._said else f'exit status {self._process.returncode}'
+
+    def know(self, machines: dict[str, tuple[str, ...]]) -> None:
+        """Tell it what runs where."""
+        line = json.dumps({'machines': machines})
+        if line != self._told and self._process.stdin is not None:
+            self._told = line
+            with contextlib.suppress(OSError, ValueError):
+                self._process.stdin.write(line + '\n')
+                self._process.stdin.flush()
+
+    def close(self) -> None:
+        """End it."""
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for reader in self._readers:
+            reader.join(2.0)
+        for pipe in (self._process.stdout, self._process.stderr):
+            if pipe is not None:
+                pipe.close()
+
+    def state(self) -> list[dict[str, Any]]:
+        """Return the streams with the numbers of their last pictures."""
+        return [{**one, 'picture': self.pictures.get(one['topic'], (0, b''))[0],
+                 'note': one['note'] or self._notes.get(one['topic'], '')}
+                for one in self.streams]
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                told = json.loads(line)
+                if 'streams' in told:
+                    self.streams, self.topics = told['streams'], told['topics']
+                elif 'data' in told:
+                    self.pictures[told['picture']] = (
+                        int(told['number']), base64.b64decode(told['data']))
+                else:
+                    self._notes[told['picture']] = str(told['note'])
+
+    def _read_errors(self) -> None:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            if line.strip():
+                self._said.append(line.strip()[:300])
+
+
+class Graphs:
+    """The programs of all launches that run."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._graphs: dict[str, Graph] = {}
+        self._refused: dict[str, tuple[float, str]] = {}
+
+    def update(
+        self, records: list[Record], machines: dict[str, tuple[str, ...]],
+    ) -> dict[str, Any]:
+        """
+        Have a program for each launch of these machines, and return what they tell.
+
+        :param records: of machines that are up.
+        :param machines: by name, the names of the nodes there.
+        """
+        launches: dict[str, list[Record]] = {}
+        for record in records:
+            launches.setdefault(record.launch, []).append(record)
+        for launch in [launch for launch in self._graphs if launch not in launches]:
+            self._graphs.pop(launch).close()
+        for launch, several in launches.items():
+            graph = self._graph(launch, several[0])
+            if graph is not None:
+                graph.know({record.name: machines.get(record.name, ()) for record in several})
+        trouble = [why for launch, (_, why) in self._refused.items()
+                   if launch in launches and launch not in self._graphs]
+        return {
+            'streams': [{**one, 'id': f"{launch} {one['topic']}"}
+                        for launch, graph in sorted(self._graphs.items())
+                        for one in graph.state()],
+            'topics': [one for _, graph in sorted(self._graphs.items()) for one in graph.topics],
+            'graph_trouble': trouble}
+
+    def picture(self, name: str) -> Optional[bytes]:
+        """Return the last picture of a stream, by its id."""
+        launch, _, topic = name.partition(' ')
+        graph = self._graphs.get(launch)
+        return graph.pictures.get(topic, (0, None))[1] if graph is not None else None
+
+    def close(self) -> None:
+        """End all of them."""
+        while self._graphs:
+            self._graphs.popitem()[1].close()
+
+    def _graph(self, launch: str, record: Record) -> Optional[Graph]:
+        graph = self._graphs.get(launch)
+        if graph is not None and graph.alive:
+            return graph
+        now = time.monotonic()
+        if graph is not None:
+            del self._graphs[launch]
+            graph.close()
+            self._refused[launch] = now, f'topics are not looked at: {graph.trouble}'
+        if now - self._refused.get(launch, (-1e9, ''))[0] < AGAIN:
+            return None
+        try:
+            environment = reach.robot_environment(record, self._store)
+        except FogError as error:
+            self._refused[launch] = now, f'topics are not looked at: {error}'
+            return None
+        if environment is None:
+            return None  # just over
+        domain = self._store.root / 'launches' / launch / 'domain'
+        with contextlib.suppress(OSError):
+            environment['ROS_DOMAIN_ID'] = domain.read_text()
+        self._graphs[launch] = Graph({**os.environ, **environment})
+        return self._graphs[launch]
