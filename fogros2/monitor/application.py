@@ -20,6 +20,7 @@ from typing import Optional
 from fogros2 import process
 from fogros2.errors import Cancelled, CommandError, FogError, PrerequisiteError
 from fogros2.model import Command
+from fogros2.provider import container_engine
 from fogros2.waiting import wait_until
 
 #: Port on which the image serves.
@@ -61,8 +62,10 @@ class Application:
             say(f'getting {self._image}')
             self._call('pull', '-q', self._image, timeout=PULL)
         self.stop()
-        self._call('run', '-d', '--name', self._name, '--cap-drop', 'all',
-                   '--security-opt', 'no-new-privileges',
+        # Lichtblick's server is a file with this one capability: without, it doesn't start
+        self._call('run', '-d', '--name', self._name, '--stop-timeout', '0',
+                   '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
+                   '--security-opt', 'no-new-privileges', *container_engine.limits(),
                    '-p', f'127.0.0.1:{self._port}:{INSIDE}', self._image)
         wait_until(self._listens, timeout=READY, cancel=self._ended,
                    what=f'{self._image} to listen on its port {INSIDE}')

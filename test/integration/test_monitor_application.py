@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The web application beside the bridge, by an image that stands for Lichtblick: it serves HTTP.
+
+What an image lacks or an engine refuses is said, and nothing else of the bridge suffers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import http.client
+import io
+import os
+from pathlib import Path
+import queue
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tarfile
+import threading
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.monitor import page, urls
+from fogros2.process import run
+from fogros2.waiting import wait_until
+from ros2fog_cli.api.monitor import has_application
+
+
+@pytest.fixture(scope='module')
+def image(engine: str) -> Iterator[str]:
+    """Import an image whose busybox serves a page at port 8080, as Lichtblick's."""
+    busybox = shutil.which('busybox')
+    if busybox is None:
+        pytest.skip('needs busybox')
+    name = f'localhost/fogt-{secrets.token_hex(4)}:1'
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode='w') as archive:
+        archive.add(busybox, 'bin/busybox')
+        text = tarfile.TarInfo('www/index.html')
+        text.size = len(b'the application')
+        archive.addfile(text, io.BytesIO(b'the application'))
+    run(Command((
+        engine, 'import', '-c',
+        'CMD ["/bin/busybox", "httpd", "-f", "-p", "8080", "-h", "/www"]', '-', name),
+        sudo=True, input=packed.getvalue()), timeout=60)
+    yield name
+    run(Command((engine, 'rmi', '-f', name), sudo=True), timeout=60)
+
+
+def there(port: int) -> str:
+    return run(Command(('podman', 'ps', '-aq', '--filter', f'name=fogros2-application-{port}$'),
+                       sudo=True), timeout=60).stdout
+
+
+def free_port() -> int:
+    with socket.create_server(('127.0.0.1', 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def program(module: str, *words: str) -> Iterator[queue.Queue[str]]:
+    """Run one of the monitor's programs until the block's end; yield what it says."""
+    said: queue.Queue[str] = queue.Queue()
+    process = subprocess.Popen(
+        [sys.executable, '-m', f'fogros2.monitor.{module}', *words], stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        cwd=Path(__file__).parents[2], env=dict(os.environ))
+    reader = threading.Thread(target=lambda: [said.put(line.strip()) for line in process.stdout])
+    reader.start()
+    try:
+        yield said
+    finally:
+        process.stdin.close()  # as when the bridge ends
+        assert process.wait(60) == 0
+        reader.join(10)
+        process.stdout.close()
+
+
+def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image):
+    inside, outside = free_port(), free_port()
+    with program('gate', '--to', '127.0.0.1:1', '--listen', f'127.0.0.1:{outside}',
+                 '--application', f'127.0.0.1:{inside}', '--until-eof') as gate:
+        assert gate.get(timeout=20) == f'listening on 127.0.0.1:{outside}'
+        assert not has_application(outside)
+        with program('application', '--image', image, '--port', str(inside),
+                     '--at', urls.served('localhost', outside)) as said:
+            assert said.get(timeout=60) == (
+                f'the web application is at http://localhost:{outside}/?ds=foxglove-websocket&'
+                f'ds.url=ws%3A%2F%2Flocalhost%3A{outside}')
+            assert has_application(outside)
+            link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
+            with contextlib.closing(link):
+                link.request('GET', '/index.html?ds=x')
+                assert link.getresponse().read() == b'the application'
+            assert there(inside)
+        assert not there(inside)
+        assert not has_application(outside)
+        link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
+        with contextlib.closing(link):
+            link.request('GET', '/')
+            answer = link.getresponse()
+            assert answer.getheader(page.MARK) and urls.LICHTBLICK.encode() in answer.read()
+
+
+def test_what_can_not_be_had_is_said(engine):
+    port = free_port()
+    with program('application', '--image', 'localhost/fogt-no-such-image:1', '--port', str(port),
+                 '--at', 'x') as said:
+        assert said.get(timeout=60) == 'getting localhost/fogt-no-such-image:1'
+        assert said.get(timeout=60).startswith('no web application here: ')
+    assert not there(port)
+
+
+def test_an_image_that_comes_slowly_does_not_keep_the_bridge_from_its_end(tmp_path, monkeypatch):
+    slow = tmp_path / 'podman'
+    slow.write_text('#!/bin/sh\n[ "$1" = pull ] && exec sleep 600\nexit 1\n')
+    slow.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
+    with program('application', '--image', 'x', '--port', str(free_port()), '--at', 'x') as said:
+        assert said.get(timeout=60) == 'getting x'
+    wait_until(lambda: said.empty() or None, timeout=5, what='silence')
