@@ -13,7 +13,6 @@ import subprocess
 
 import pytest
 
-
 #: What ``colcon test`` runs unless it is told otherwise: what makes no machine.
 QUICK = ['test/unit', 'test/contract', 'test/launch']
 
