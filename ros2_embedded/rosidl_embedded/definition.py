@@ -97,8 +97,9 @@ def parse_members(name: str, members: list[str]) -> Definition:
     for member in members:
         head = re.match(r'(\S+)\s+([A-Z][A-Z0-9_]*)\s*=(.*)$', member)
         if head and '<=' not in head[1].rpartition(']')[2]:
-            constants[head[2]] = _value(head[1].partition('<=')[0].replace('char', 'uint8'),
-                                        head[3])
+            value = _value(head[1].partition('<=')[0].replace('char', 'uint8'), head[3])
+            # fields of this type are bytes in Python
+            constants[head[2]] = bytes([value]) if head[1] == 'byte' else value
         else:
             fields.append(parse_field(member, package))
     return Definition(name, tuple(fields), constants)

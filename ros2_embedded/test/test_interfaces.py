@@ -7,6 +7,7 @@ import pickle
 import random
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from example_interfaces.msg import WString
 from example_interfaces.srv import AddTwoInts
 from geometry_msgs.msg import Polygon, PoseStamped, Quaternion
@@ -86,6 +87,12 @@ def test_defaults():
     pose = PoseStamped()
     assert pose.header.stamp == Time() and pose.pose.orientation.w == 1.0
     assert PoseStamped().header is not pose.header
+
+
+def test_constants_are_what_their_fields_take():
+    assert DiagnosticStatus.STALE == b'\x03'
+    assert DiagnosticStatus(level=DiagnosticStatus.WARN).level == b'\x01'
+    assert NavSatStatus.STATUS_NO_FIX == -1
 
 
 def test_keyword_constructor():
