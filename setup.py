@@ -13,7 +13,9 @@ from setuptools import find_packages, setup
 VERSION = '0.1.0'
 #: Packages whose nodes ``ros2 run`` and launch files find: package -> its executables.
 EXECUTABLES = {
-    'fogros2_examples': ['talker', 'listener', 'camera', 'image_processor'],
+    'fogros2_examples': [
+        'talker', 'listener', 'camera', 'image_processor', 'motion_planner', 'planning_client',
+        'slam', 'slam_camera'],
     'image_transport_h264': ['encoder', 'decoder'],
 }
 

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion planning: the planner where ``machine:=`` says, who asks it here."""
+
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    """Describe the two; ``environment:=`` and ``picture:=`` say what is planned and shown."""
+    return FogROSLaunchDescription([
+        DeclareLaunchArgument('machine', default_value='container',
+                              choices=['robot', 'container', 'aws', 'kubernetes'],
+                              description='where the planner runs'),
+        DeclareLaunchArgument('foxglove', default_value='false',
+                              description='show the topics in a browser: ros2 fog monitor'),
+        DeclareLaunchArgument('environment', default_value='apartment',
+                              description='apartment, cubicles, or a .cfg file of OMPL.app'),
+        DeclareLaunchArgument('time', default_value='60.0',
+                              description='seconds after which a plan is given up'),
+        DeclareLaunchArgument('count', default_value='1', description='how many plans'),
+        DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
+        FogMachine(LaunchConfiguration('machine'), {
+            'name': 'planner', 'launch_foxglove': LaunchConfiguration('foxglove')}),
+        CloudNode(machine='planner', package='fogros2_examples', executable='motion_planner',
+                  output='screen', parameters=[{'time': LaunchConfiguration('time')}]),
+        Node(package='fogros2_examples', executable='planning_client', output='screen',
+             parameters=[{'environment': LaunchConfiguration('environment'),
+                          'count': LaunchConfiguration('count'),
+                          'picture': LaunchConfiguration('picture')}], on_exit=Shutdown()),
+    ])

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Plans motions of rigid bodies: service ``plan``, in the scene that comes on ``environment``.
+
+What came of a plan is on ``planning_status``: the service's path can only be empty.
+"""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from nav_msgs.srv import GetPlan
+import numpy
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from visualization_msgs.msg import MarkerArray
+
+from fogros2_examples.planning.messages import BadScene, path_message, pose_of, scene_of
+from fogros2_examples.planning.racing import Racer
+
+#: The last one is kept for those who come later.
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+WHY = {'start': 'the start touches something, or is out of bounds',
+       'goal': 'the goal touches something, or is out of bounds'}
+
+
+class MotionPlanner(Node):
+    """
+    The planner.
+
+    Parameters: ``time`` in s, after which a plan is given up; ``workers``, how many searches run
+    at once, 0 for one on each core; ``planners``, OMPL's, which the searches take in turn;
+    ``seed`` of the first search.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('motion_planner')
+        self.seconds = float(self.declare_parameter('time', 30.0).value)
+        self.seed = int(self.declare_parameter('seed', 1).value)
+        self.scene = ''
+        self.racer = Racer(int(self.declare_parameter('workers', 0).value),
+                           list(self.declare_parameter('planners', ['RRTConnect']).value))
+        self.status = self.create_publisher(DiagnosticStatus, 'planning_status', LATCHED)
+        self.create_subscription(MarkerArray, 'environment', self.enter, LATCHED)
+        self.create_service(GetPlan, 'plan', self.plan)
+
+    def enter(self, markers: MarkerArray) -> None:
+        """Take a scene; one that is none leaves the last in its place."""
+        try:
+            scene = scene_of(markers)
+        except BadScene as error:
+            self.tell(DiagnosticStatus.ERROR, 'environment', f'no environment: {error}')
+            return
+        try:
+            self.racer.enter(scene)
+        except RuntimeError as error:
+            self.tell(DiagnosticStatus.ERROR, 'environment', f'no environment: {error}')
+            return
+        self.scene = scene.name
+        self.tell(DiagnosticStatus.OK, 'environment', (
+            f"environment '{scene.name}': {len(scene.walls.triangles)} triangles of walls, "
+            f'{len(scene.body.triangles)} of the body; {self.racer.workers} searches at once'))
+
+    def plan(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
+        """Answer with a path, an empty one where there is none."""
+        wanted = request.start.header.frame_id
+        if not self.scene or wanted != self.scene:
+            self.tell(DiagnosticStatus.ERROR, 'plan', (
+                f"no plan: the start is in the frame '{wanted}', the environment is "
+                + (f"'{self.scene}'" if self.scene else 'not there yet')))
+            return response
+        try:
+            start, goal = pose_of(request.start.pose), pose_of(request.goal.pose)
+        except ValueError as error:
+            self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
+            return response
+        try:
+            outcome = self.racer.plan(start, goal, seconds=self.seconds, seed=self.seed)
+        except RuntimeError as error:
+            self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
+            return response
+        figures = {name: outcome[name] for name in ('end', 'seconds', 'checks', 'length')}
+        took = f"{outcome['seconds']:.2f} s, {outcome['checks']} checks"
+        if outcome['end'] == 'found':
+            response.plan = path_message(numpy.array(outcome['path']), self.scene)
+            response.plan.header.stamp = self.get_clock().now().to_msg()
+            self.tell(DiagnosticStatus.OK, 'plan',
+                      f"path of {outcome['length']:.1f} m in {took}", figures)
+        else:
+            why = WHY.get(outcome['end'], f'no way was found in {self.seconds:g} s')
+            self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {why} ({took})', figures)
+        return response
+
+    def tell(self, level: bytes, name: str, message: str,
+             figures: dict[str, object] | None = None) -> None:
+        """Say what happened, here and to others."""
+        log = self.get_logger()
+        (log.info if level == DiagnosticStatus.OK else log.error)(message)
+        self.status.publish(DiagnosticStatus(
+            level=level, name=name, message=message, hardware_id=self.scene,
+            values=[KeyValue(key=key, value=str(value))
+                    for key, value in (figures or {}).items()]))
+
+
+def main() -> None:
+    """Run until interrupted."""
+    rclpy.init()
+    node = MotionPlanner()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+    finally:
+        node.racer.close()

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Has motions planned and takes the time: puts a scene on ``environment``, calls ``plan``.
+
+Shows what it got: the path on ``path``, the body along it on ``motion``, a picture of it on
+``picture`` and in a file.
+"""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Callable
+import json
+from pathlib import Path as File
+import time
+from typing import Any, Optional
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from nav_msgs.srv import GetPlan
+import numpy
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image
+from visualization_msgs.msg import MarkerArray
+
+from fogros2_examples.meshes import Floats
+from fogros2_examples.planning.app_files import BadFile, loaded
+from fogros2_examples.planning.messages import (
+    COLOURS,
+    mesh_marker,
+    pose_message,
+    pose_of,
+    scene_message,
+)
+from fogros2_examples.planning.picture import picture, spaced
+from fogros2_examples.planning.scene import MADE, Scene
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class PlanningClient(Node):
+    """
+    The client.
+
+    Parameters: ``environment``, 'apartment', 'cubicles', or a file of OMPL.app's (``.cfg``);
+    ``count`` of plans; ``picture``, a PNG file to write, '' for none; ``wait`` in s, how long an
+    answer may take; ``figures``, a file to which each plan's times go, as a line of JSON.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('planning_client')
+        self.environment = str(self.declare_parameter('environment', 'apartment').value)
+        self.count = int(self.declare_parameter('count', 1).value)
+        self.picture = str(self.declare_parameter('picture', '').value)
+        self.figures = str(self.declare_parameter('figures', '').value)
+        self.wait = float(self.declare_parameter('wait', 120.0).value)
+        self.told: Optional[DiagnosticStatus] = None
+        self.scenes = self.create_publisher(MarkerArray, 'environment', LATCHED)
+        self.paths = self.create_publisher(Path, 'path', LATCHED)
+        self.motions = self.create_publisher(MarkerArray, 'motion', LATCHED)
+        self.pictures = self.create_publisher(Image, 'picture', LATCHED)
+        self.create_subscription(DiagnosticStatus, 'planning_status', self.hear, LATCHED)
+        self.planner = self.create_client(GetPlan, 'plan')
+
+    def hear(self, status: DiagnosticStatus) -> None:
+        """Keep what the planner says of itself."""
+        self.told = status
+
+    def run(self) -> int:
+        """Return the exit status: 0 where all plans were found."""
+        try:
+            scene = loaded(File(self.environment)) if self.environment.endswith('.cfg') else (
+                MADE[self.environment]())
+        except KeyError:
+            self.get_logger().fatal(
+                f"no environment is called '{self.environment}': there are {', '.join(MADE)}, "
+                'and files of OMPL.app (.cfg)')
+            return 2
+        except BadFile as error:
+            self.get_logger().fatal(str(error))
+            return 2
+        self.scenes.publish(scene_message(scene))
+        if not self._until(lambda: self.told is not None and self.told.hardware_id == scene.name):
+            self.get_logger().fatal(f'no planner took the environment in {self.wait:g} s')
+            return 2
+        found = [path for number in range(self.count) if len(path := self._plan(scene, number))]
+        if found:
+            self._show(scene, found[-1])
+        return 0 if len(found) == self.count else 1
+
+    def _plan(self, scene: Scene, number: int) -> Floats:
+        request = GetPlan.Request()
+        for name, pose in (('start', scene.start), ('goal', scene.goal)):
+            stamped = PoseStamped(pose=pose_message(pose))
+            stamped.header.frame_id = scene.name
+            setattr(request, name, stamped)
+        self.told = None
+        begin = time.monotonic()
+        future = self.planner.call_async(request)
+        self._until(future.done)
+        total = time.monotonic() - begin
+        self._until(lambda: self.told is not None, 5.0)
+        response = future.result() if future.done() else None
+        path = numpy.array([pose_of(stamped.pose) for stamped in response.plan.poses]
+                           if response else []).reshape(-1, 7)
+        figures: dict[str, Any] = {'plan': number, 'total': total, 'found': bool(len(path))}
+        if self.told is not None:
+            figures |= {value.key: float(value.value) for value in self.told.values
+                        if value.key != 'end'}
+            self.get_logger().info(
+                f'{self.told.message}; {total:.3f} s with the way there and back')
+        else:
+            self.get_logger().error(f'no answer in {self.wait:g} s')
+        if self.figures:
+            with open(self.figures, 'a') as file:
+                file.write(json.dumps(figures) + '\n')
+        if response:
+            self.paths.publish(response.plan)
+        return path
+
+    def _show(self, scene: Scene, path: Floats) -> None:
+        self.motions.publish(MarkerArray(markers=[
+            mesh_marker(scene.body, 'motion', number, scene.name, pose_message(pose),
+                        COLOURS['body']) for number, pose in enumerate(spaced(path, 0.9))]))
+        if not self.picture:
+            return
+        length = float(numpy.linalg.norm(numpy.diff(path[:, :3], axis=0), axis=1).sum())
+        drawn = picture(scene, path, f'{scene.name}: a path of {length:.1f} m')
+        height, width = drawn.shape[:2]
+        self.pictures.publish(Image(height=height, width=width, encoding='bgr8', step=3 * width,
+                                    data=array.array('B', drawn.tobytes())))
+        if not cv2.imwrite(self.picture, drawn):
+            self.get_logger().error(f'{self.picture} can not be written')
+            return
+        self.get_logger().info(f'wrote {self.picture}')
+
+    def _until(self, true: Callable[[], bool], wait: float = 0.0) -> bool:
+        """Handle messages until something is true; return whether it came to be in time."""
+        deadline = time.monotonic() + (wait or self.wait)
+        while not true():
+            if time.monotonic() > deadline:
+                return False
+            rclpy.spin_once(self, timeout_sec=0.1)
+        return True
+
+
+def main() -> None:
+    """Run until all plans are there."""
+    rclpy.init()
+    try:
+        raise SystemExit(PlanningClient().run())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+    finally:
+        rclpy.try_shutdown()

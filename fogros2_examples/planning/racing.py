@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asks the worker, a process of its own, for motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from typing import Any, Optional
+
+from fogros2_examples.meshes import Floats
+from fogros2_examples.planning import worker
+from fogros2_examples.planning.scene import Scene
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+class Racer:
+    """
+    Plans in one scene at a time.
+
+    :param workers: searches at once; 0 for one on each core.
+    :param planners: names of OMPL's; the searches take them in turn.
+    """
+
+    def __init__(self, workers: int = 0, planners: Sequence[str] = ('RRTConnect',)) -> None:
+        self.workers = workers or cores()
+        self.planners = list(planners)
+        self._scene: Optional[Scene] = None
+        self._process = self._start()
+
+    @staticmethod
+    def _start() -> subprocess.Popen[str]:
+        return subprocess.Popen([sys.executable, '-m', worker.__name__], stdin=subprocess.PIPE,
+                                stdout=subprocess.PIPE, text=True)
+
+    def enter(self, scene: Scene) -> None:
+        """
+        Plan in this scene from now on.
+
+        :raises RuntimeError: the worker has ended; the next call has a new one.
+        """
+        self._scene = None
+        self._ask({'scene': worker.encoded(scene)})
+        self._scene = scene
+
+    def plan(self, start: Floats, goal: Floats, *, seconds: float,
+             seed: int = 1) -> dict[str, Any]:
+        """
+        Return what ``search.Outcome`` has, the path as lists; the first motion found wins.
+
+        :param seed: of the first search; the others count on.
+        :raises RuntimeError: the worker has ended; the next call has a new one.
+        """
+        return self._ask({
+            'start': start.tolist(), 'goal': goal.tolist(), 'seconds': seconds,
+            'seeds': [seed + number for number in range(self.workers)],
+            'planners': self.planners})
+
+    def close(self) -> None:
+        """End the worker."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(OSError):  # it may be gone, with words to it not read
+            self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        if self._process.poll() is not None:
+            self.close()
+            self._process = self._start()
+            if self._scene is not None:
+                self.enter(self._scene)
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps(question) + '\n')
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except OSError as error:
+            raise RuntimeError(f'the search has ended: {error}') from error
+        if not line:
+            raise RuntimeError(f'the search has ended with status {self._process.wait()}')
+        answer: dict[str, Any] = json.loads(line)
+        return answer

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One search for a motion: OMPL asks, FCL answers whether the body touches anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any, Literal, Optional
+
+import fcl
+import numpy
+import ompl.base
+import ompl.geometric
+import ompl.util
+
+from fogros2_examples.meshes import Floats, joined, Mesh, rotation
+from fogros2_examples.planning.scene import Scene
+
+#: Planners of OMPL's that plan between two poses.
+PLANNERS = ('RRTConnect', 'LBKPIECE1', 'KPIECE1', 'RRT', 'BKPIECE1')
+#: How far the body goes between two checks, as a share of the largest distance there is.
+RESOLUTION = 0.002
+End = Literal['found', 'start', 'goal', 'time']
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """
+    What came of a search.
+
+    :param end: 'found'; 'start' or 'goal': the body touches something there, or is out of bounds;
+        'time': no way was found in it.
+    :param path: poses (n, 7) as in Scene, from start to goal; empty where none was found. From
+        one to the next the body moves straight and turns the shorter way, both evenly.
+    :param length: of the path, m.
+    :param checks: how often it was looked whether the body touches anything.
+    :param seconds: what the search took.
+    """
+
+    end: End
+    path: Floats
+    length: float
+    checks: int
+    seconds: float
+
+
+class Space:
+    """The poses of a scene's body; holds what a search needs, made once."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.checks = 0
+        self._body = fcl.CollisionObject(_model(scene.body), fcl.Transform())
+        self._walls = fcl.CollisionObject(_model(joined([scene.walls, scene.shell])),
+                                          fcl.Transform())
+        self._request = fcl.CollisionRequest()
+        ompl.util.setLogLevel(ompl.util.LOG_ERROR)
+        self.states = ompl.base.SE3StateSpace()
+        bounds = ompl.base.RealVectorBounds(3)
+        for axis in range(3):
+            bounds.setLow(axis, float(scene.low[axis]))
+            bounds.setHigh(axis, float(scene.high[axis]))
+        self.states.setBounds(bounds)
+
+    def touches(self, position: Floats, turn: Floats) -> bool:
+        """Return whether the body touches anything; ``turn`` is a matrix or w, x, y, z."""
+        self.checks += 1
+        self._body.setTransform(fcl.Transform(turn, position))
+        return bool(fcl.collide(self._body, self._walls, self._request, fcl.CollisionResult()))
+
+    def free(self, pose: Floats) -> bool:
+        """Return whether a pose is within bounds and touches nothing."""
+        inside = (pose[:3] >= self.scene.low).all() and (pose[:3] <= self.scene.high).all()
+        return bool(inside) and not self.touches(pose[:3], rotation(pose[3:]))
+
+    def search(self, start: Floats, goal: Floats, *, seconds: float, seed: int = 1,
+               planner: str = PLANNERS[0]) -> Outcome:
+        """
+        Look for a motion.
+
+        :param seconds: after which it is given up.
+        :param seed: the same one finds the same motion. OMPL takes it once in a process: a second
+            search there goes on with the first one's random numbers.
+        """
+        begin, self.checks = time.monotonic(), 0
+
+        def ended(end: End, path: Optional[Floats] = None) -> Outcome:
+            poses = numpy.empty((0, 7)) if path is None else path
+            steps = numpy.linalg.norm(numpy.diff(poses[:, :3], axis=0), axis=1)
+            return Outcome(end, poses, float(steps.sum()), self.checks, time.monotonic() - begin)
+
+        if not self.free(start):
+            return ended('start')
+        if not self.free(goal):
+            return ended('goal')
+        ompl.util.RNG.setSeed(seed)
+        setup = ompl.geometric.SimpleSetup(self.states)
+        setup.setStateValidityChecker(self._valid)
+        setup.setStartAndGoalStates(self._state(start), self._state(goal))
+        space = setup.getSpaceInformation()
+        space.setStateValidityCheckingResolution(RESOLUTION)
+        setup.setPlanner(getattr(ompl.geometric, planner)(space))
+        asked = 0
+
+        def give_up() -> bool:
+            nonlocal asked
+            asked += 1
+            return asked % 32 == 0 and time.monotonic() - begin > seconds
+
+        setup.solve(ompl.base.PlannerTerminationCondition(give_up))
+        if not setup.haveExactSolutionPath():
+            return ended('time')
+        found = setup.getSolutionPath()
+        simplifier = ompl.geometric.PathSimplifier(space)
+        # in steps, not in time, so that a seed always finds the same
+        simplifier.reduceVertices(found)
+        simplifier.collapseCloseVertices(found)
+        simplifier.partialShortcutPath(found)
+        simplifier.reduceVertices(found)
+        return ended('found', numpy.array([_pose(state) for state in found.getStates()]))
+
+    def _valid(self, state: Any) -> bool:
+        turn = state.rotation()
+        position = numpy.array([state.getX(), state.getY(), state.getZ()])
+        scene = self.scene
+        if (position < scene.low).any() or (position > scene.high).any():
+            return False
+        return not self.touches(position, numpy.array([turn.w, turn.x, turn.y, turn.z]))
+
+    def _state(self, pose: Floats) -> Any:
+        state = self.states.allocState()
+        state.setXYZ(*map(float, pose[:3]))
+        turn = state.rotation()
+        turn.x, turn.y, turn.z, turn.w = map(float, pose[3:] / numpy.linalg.norm(pose[3:]))
+        return state
+
+
+def _pose(state: Any) -> list[float]:
+    turn = state.rotation()
+    return [state.getX(), state.getY(), state.getZ(), turn.x, turn.y, turn.z, turn.w]
+
+
+def _model(mesh: Mesh) -> Any:
+    model = fcl.BVHModel()
+    model.beginModel(len(mesh.triangles), len(mesh.vertices))
+    model.addSubModel(mesh.vertices, mesh.triangles)
+    model.endModel()
+    return model

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Races searches against each other, each in a process and so on a core of its own; a program.
+
+It reads JSON lines: ``{"scene": ...}`` as ``encoded`` makes it, answered when the scene is ready,
+and ``{"start", "goal", "seconds", "seeds", "planners"}``, answered with the best outcome. Threads
+wouldn't do: OMPL asks Python at each step whether the body touches anything, and one thread at a
+time runs Python. A process is forked for each search, as OMPL takes a seed once in its life, and
+finds the scene ready. Nothing else runs here that a fork would break.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import contextlib
+import dataclasses
+import json
+import os
+import select
+import signal
+import sys
+from typing import Any, Optional, TYPE_CHECKING
+
+import numpy
+
+from fogros2_examples.meshes import Mesh
+from fogros2_examples.planning.scene import Scene
+
+if TYPE_CHECKING:
+    from fogros2_examples.planning.search import Outcome, Space
+
+
+def encoded(scene: Scene) -> dict[str, Any]:
+    """Return a scene as JSON has it."""
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mesh):
+            return {'vertices': value.vertices.tolist(), 'triangles': value.triangles.tolist()}
+        return value if isinstance(value, str) else value.tolist()
+
+    return {field.name: plain(getattr(scene, field.name)) for field in dataclasses.fields(scene)}
+
+
+def decoded(given: Mapping[str, Any]) -> Scene:
+    """Return the scene of ``encoded``."""
+    def mesh(value: Mapping[str, Any]) -> Mesh:
+        return Mesh(numpy.array(value['vertices'], float).reshape(-1, 3),
+                    numpy.array(value['triangles'], numpy.int32).reshape(-1, 3))
+
+    low, high, start, goal = (
+        numpy.array(given[name], float) for name in ('low', 'high', 'start', 'goal'))
+    return Scene(given['name'], mesh(given['body']), mesh(given['walls']), mesh(given['shell']),
+                 low, high, start, goal)
+
+
+def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
+    """
+    Return the first motion that a search finds, or why none did.
+
+    :param asked: ``start``, ``goal``, ``seconds``; of ``seeds`` each is a search, by the planner
+        of ``planners`` whose turn it is.
+    """
+    from fogros2_examples.planning.search import Outcome
+
+    start, goal = numpy.array(asked['start'], float), numpy.array(asked['goal'], float)
+    pipes: dict[int, int] = {}
+    for number, seed in enumerate(asked['seeds']):
+        planner = asked['planners'][number % len(asked['planners'])]
+        read, write = os.pipe()
+        child = os.fork()
+        if not child:
+            _search(space, write, start, goal, asked['seconds'], seed, planner)
+        os.close(write)
+        pipes[read] = child
+    texts = dict.fromkeys(pipes, b'')
+    best: Optional[Outcome] = None
+    try:
+        while pipes and (best is None or best.end == 'time'):
+            for read in select.select(list(pipes), [], [])[0]:
+                data = os.read(read, 1 << 16)
+                texts[read] += data
+                if data:
+                    continue
+                os.close(read)
+                _, status = os.waitpid(pipes.pop(read), 0)
+                if not texts[read]:
+                    raise RuntimeError(f'a search ended with status {status} and no answer')
+                said = json.loads(texts[read])
+                found = Outcome(**{**said, 'path': numpy.array(said['path']).reshape(-1, 7)})
+                if best is None or found.end != 'time':
+                    best = found
+    finally:
+        for read, child in pipes.items():
+            os.close(read)
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+    if best is None:
+        raise RuntimeError('no seed, no search')
+    return best
+
+
+def _search(space: Space, write: int, start: Any, goal: Any, seconds: float, seed: int,
+            planner: str) -> None:
+    """Search in a process of its own, and end it."""
+    outcome = space.search(start, goal, seconds=seconds, seed=seed, planner=planner)
+    with os.fdopen(write, 'w') as out:
+        json.dump({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}, out)
+    # the bindings would print a page about what they had not freed
+    os._exit(0)
+
+
+def main() -> None:
+    """Answer line by line until there are no more."""
+    from fogros2_examples.planning.search import Space
+
+    # a Ctrl-C in a terminal goes to all; who started this one closes its input
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    space: Optional[Space] = None
+    with contextlib.suppress(BrokenPipeError):
+        for line in sys.stdin:
+            asked = json.loads(line)
+            if 'scene' in asked:
+                space = Space(decoded(asked['scene']))
+                print(json.dumps({'ready': True}), flush=True)
+                continue
+            if space is None:
+                raise RuntimeError('asked for a motion before there was a scene')
+            outcome = race(space, asked)
+            print(json.dumps({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}),
+                  flush=True)
+    os._exit(0)
+
+
+if __name__ == '__main__':
+    main()

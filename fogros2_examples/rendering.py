@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures and depth images of triangle meshes, by a z-buffer; no graphics card is needed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy
+from numpy.typing import ArrayLike, NDArray
+
+from fogros2_examples.meshes import Floats
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """
+    A pinhole camera; it looks along its z, its x goes right, its y down.
+
+    :param rotation: matrix (3, 3) whose columns are its axes in the world.
+    :param centre: where it is, m.
+    :param focal: in pixels.
+    """
+
+    width: int
+    height: int
+    focal: float
+    rotation: Floats
+    centre: Floats
+
+    def seen(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return points (..., 3) as pixels (..., 2) with centres at whole numbers, and depths."""
+        there = (points - self.centre) @ self.rotation
+        depth = there[..., 2]
+        middle = numpy.array([(self.width - 1) / 2, (self.height - 1) / 2])
+        with numpy.errstate(divide='ignore', invalid='ignore'):
+            return there[..., :2] / depth[..., None] * self.focal + middle, depth
+
+
+def looking(at: ArrayLike, centre: ArrayLike, *, width: int, height: int, focal: float,
+            up: ArrayLike = (0.0, 0.0, 1.0)) -> Camera:
+    """Return a camera at ``centre`` that looks at a point, ``up`` being up in its picture."""
+    forward = numpy.asarray(at, float) - numpy.asarray(centre, float)
+    forward /= numpy.linalg.norm(forward)
+    right = numpy.cross(forward, numpy.asarray(up, float))
+    right /= numpy.linalg.norm(right)
+    return Camera(width, height, focal,
+                  numpy.column_stack([right, numpy.cross(forward, right), forward]),
+                  numpy.asarray(centre, float))
+
+
+def drawn(camera: Camera, corners: Floats, nearest: float = 0.01,
+          ) -> tuple[NDArray[numpy.float32], NDArray[numpy.int32]]:
+    """
+    Return what a camera sees of triangles.
+
+    :param corners: array (n, 3, 3), m; a triangle with a corner nearer than ``nearest`` isn't
+        drawn.
+    :return: depth along its axis in m, 0 where there is nothing, and the index of the triangle
+        there, -1 for none: two arrays (height, width).
+    """
+    buffer = numpy.zeros((camera.height, camera.width), numpy.float64)  # 1 / depth
+    index = numpy.full(buffer.shape, -1, numpy.int32)
+    pixels, depths = camera.seen(corners)
+    there = numpy.asarray((depths > nearest).all(axis=1), bool)
+    low = numpy.ceil(numpy.where(there[:, None], pixels.min(axis=1), 0)).astype(int)
+    high = numpy.floor(numpy.where(there[:, None], pixels.max(axis=1), -1)).astype(int)
+    low = numpy.maximum(low, 0)
+    high = numpy.minimum(high, [camera.width - 1, camera.height - 1])
+    for number in numpy.flatnonzero((high >= low).all(axis=1)):
+        (ax, ay), (bx, by), (cx, cy) = pixels[number]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if abs(area) < 1e-9:
+            continue
+        x = numpy.arange(low[number, 0], high[number, 0] + 1)
+        y = numpy.arange(low[number, 1], high[number, 1] + 1)[:, None]
+        u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
+        v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
+        # 1 / depth is linear in the picture
+        a, b, c = 1 / depths[number]
+        inverse = a + u * (b - a) + v * (c - a)
+        rows, columns = slice(y[0, 0], y[-1, 0] + 1), slice(x[0], x[-1] + 1)
+        front: NDArray[numpy.bool_] = numpy.asarray(
+            (u >= 0) & (v >= 0) & (u + v <= 1) & (inverse > buffer[rows, columns]), bool)
+        buffer[rows, columns][front] = inverse[front]
+        index[rows, columns][front] = number
+    with numpy.errstate(divide='ignore'):
+        return numpy.where(buffer > 0, 1 / buffer, 0).astype(numpy.float32), index
+
+
+def shaded(camera: Camera, corners: Floats, colours: Floats,
+           background: ArrayLike = (255, 255, 255),
+           ) -> tuple[NDArray[numpy.uint8], NDArray[numpy.float32]]:
+    """
+    Return a picture of triangles, lit from above the camera, with a thin line round each thing.
+
+    :param colours: of the triangles, array (n, 3) of 0 to 255.
+    :return: array (height, width, 3), in the order of ``colours``; the depths as of ``drawn``.
+    """
+    # four samples a pixel
+    fine = Camera(2 * camera.width, 2 * camera.height, 2 * camera.focal, camera.rotation,
+                  camera.centre)
+    depth, index = drawn(fine, corners)
+    normals = numpy.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= numpy.maximum(numpy.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    light = camera.rotation @ numpy.array([-0.35, -0.55, -0.75])
+    # the side that is seen is the one that is lit
+    facing = numpy.sign(((camera.centre - corners[:, 0]) * normals).sum(axis=1))
+    bright = 0.72 + 0.28 * numpy.clip(facing * (normals @ light), -0.7, 1)
+    shades = numpy.concatenate([colours * bright[:, None], [background]])
+    picture = shades[index]
+    far = numpy.where(index >= 0, depth, depth.max() * 1.2)
+    for axis in (0, 1):
+        # a step in depth that no slope explains is an edge of a thing
+        bend = numpy.abs(numpy.diff(1 / far, 2, axis=axis)) * numpy.take(
+            far, range(1, far.shape[axis] - 1), axis=axis)
+        rows = [slice(None), slice(None)]
+        rows[axis] = slice(1, -1)
+        picture[tuple(rows)][bend > 0.01] *= 0.55
+    mean = picture.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
+    return numpy.clip(mean, 0, 255).astype(numpy.uint8), depth[::2, ::2]

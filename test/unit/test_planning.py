@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion planning: scenes, motions held against another way to look for contact, bad input."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import threading
+
+import numpy
+import pytest
+
+fcl = pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
+pytest.importorskip('ompl', reason='ompl is in the extra applications')
+
+from fogros2_examples.meshes import (  # noqa: E402 - only where its libraries are
+    box,
+    cylinder,
+    joined,
+    quaternion,
+    rotation,
+    sphere,
+    turned,
+)
+from fogros2_examples.planning.app_files import BadFile, loaded  # noqa: E402
+from fogros2_examples.planning.picture import between, picture, spaced  # noqa: E402
+from fogros2_examples.planning.racing import Racer  # noqa: E402
+from fogros2_examples.planning.scene import apartment, MADE, pose, Scene  # noqa: E402
+
+
+def volume(mesh):
+    a, b, c = mesh.corners.transpose(1, 0, 2)
+    return float((a * numpy.cross(b, c)).sum() / 6)
+
+
+def test_solids_are_closed_and_face_outwards():
+    assert volume(box((0, 0, 0), (1, 2, 3))) == pytest.approx(6)
+    assert volume(cylinder(1, 2, 200)) == pytest.approx(2 * math.pi, rel=1e-3)
+    assert volume(sphere(1, 100)) == pytest.approx(4 / 3 * math.pi, rel=5e-3)
+    for mesh in (box((0, 0, 0), (1, 1, 1)), cylinder(1, 1), sphere(1)):
+        edges = [(t[i], t[(i + 1) % 3]) for t in mesh.triangles.tolist() for i in range(3)]
+        assert len(set(edges)) == len(edges) and {(b, a) for a, b in edges} == set(edges)
+
+
+@pytest.mark.parametrize('axis, angle', [
+    ((0, 0, 1), 0.3), ((1, 0, 0), math.pi), ((1, 2, 3), 2.9), ((0, 1, 0), -math.pi / 2)])
+def test_quaternions_and_matrices_agree(axis, angle):
+    matrix = turned(axis, angle)
+    assert rotation(quaternion(matrix)) == pytest.approx(matrix, abs=1e-12)
+    assert numpy.trace(matrix) == pytest.approx(1 + 2 * math.cos(angle))
+
+
+def depth(first, second):
+    """Return by how much two boxes overlap at least, m; 0 where they don't."""
+    def axes(corners):
+        return [(corners[i] - corners[0]) / numpy.linalg.norm(corners[i] - corners[0])
+                for i in (1, 2, 4)]
+
+    least = math.inf
+    a, b = axes(first), axes(second)
+    for axis in [*a, *b, *(numpy.cross(x, y) for x in a for y in b)]:
+        length = numpy.linalg.norm(axis)
+        if length < 1e-6:
+            continue
+        p, q = first @ axis / length, second @ axis / length
+        least = min(least, p.max() - q.min(), q.max() - p.min())
+    return max(0.0, least)
+
+
+def boxes(mesh):
+    return [mesh.vertices[i:i + 8] for i in range(0, len(mesh.vertices), 8)]
+
+
+@pytest.mark.parametrize('name', sorted(MADE))
+def test_a_motion_touches_nothing(name):
+    # the boxes that the meshes are made of are held against each other without FCL
+    scene = MADE[name]()
+    racer = Racer(workers=2)
+    try:
+        racer.enter(scene)
+        outcome = racer.plan(scene.start, scene.goal, seconds=60, seed=3)
+    finally:
+        racer.close()
+    assert outcome['end'] == 'found'
+    path = numpy.array(outcome['path'])
+    assert path[0] == pytest.approx(scene.start, abs=1e-6)
+    assert path[-1][:3] == pytest.approx(scene.goal[:3], abs=1e-6)
+    assert abs(path[-1][3:] @ scene.goal[3:]) == pytest.approx(1)
+    assert outcome['length'] >= numpy.linalg.norm(scene.goal[:3] - scene.start[:3])
+    around = [(part, part.min(axis=0), part.max(axis=0))
+              for part in boxes(scene.walls) + boxes(scene.shell)]
+    for at in between(path, 0.05):
+        body = scene.at(at)
+        low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+        for part, under, over in around:
+            if (low < over).all() and (high > under).all():
+                # OMPL looks at poses some centimetres apart
+                assert all(depth(piece, part) < 0.02 for piece in boxes(body)), at
+
+
+def box_room(wall):
+    """Return a room 4 m long; ``wall`` says whether a wall closes its middle."""
+    walls = joined([box((1.9, -1, -1), (2.1, 3, 3))] if wall else [box((1.9, 1, 0), (2.1, 2, 2))])
+    return Scene('room', box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), walls, joined([]),
+                 numpy.zeros(3), numpy.array([4.0, 2.0, 2.0]), pose(0.5, 0.5, 0.5),
+                 pose(3.5, 0.5, 0.5))
+
+
+@pytest.fixture(scope='module')
+def racer():
+    racer = Racer(workers=2, planners=['RRTConnect', 'KPIECE1'])
+    yield racer
+    racer.close()
+
+
+def test_what_can_not_be_planned_is_told_apart(racer):
+    racer.enter(box_room(wall=True))
+    start, goal = pose(0.5, 0.5, 0.5), pose(3.5, 0.5, 0.5)
+    outcome = racer.plan(start, goal, seconds=0.5)
+    assert outcome['end'] == 'time' and outcome['path'] == []
+    assert 0.5 <= outcome['seconds'] < 3
+    assert racer.plan(pose(2, 0.5, 0.5), goal, seconds=5)['end'] == 'start'
+    assert racer.plan(start, pose(3.5, 0.5, 9), seconds=5)['end'] == 'goal'
+    # and it goes on
+    racer.enter(box_room(wall=False))
+    assert racer.plan(start, goal, seconds=20)['end'] == 'found'
+
+
+def test_a_seed_finds_the_same(racer):
+    racer.enter(apartment())
+    one = Racer(workers=1)
+    try:
+        scene = box_room(wall=False)
+        one.enter(scene)
+        found = [one.plan(scene.start, scene.goal, seconds=20, seed=5) for _ in range(2)]
+    finally:
+        one.close()
+    assert found[0]['path'] == found[1]['path'] and found[0]['checks'] == found[1]['checks']
+
+
+def test_a_search_that_dies_is_told_and_replaced():
+    racer, scene = Racer(workers=1), box_room(wall=False)
+    try:
+        racer.enter(scene)
+        os.kill(racer._process.pid, signal.SIGSTOP)
+        threading.Timer(0.3, racer._process.kill).start()
+        with pytest.raises(RuntimeError, match='has ended'):
+            racer.plan(scene.start, scene.goal, seconds=20)
+        assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
+    finally:
+        racer.close()
+
+
+def test_a_path_between_its_poses_turns_the_shorter_way():
+    path = numpy.array([pose(0, 0, 0), pose(1, 0, 0, yaw=1.0)])
+    path[1, 3:] *= -1  # the same turn
+    fine = between(path, 0.1, 0.1)
+    assert len(fine) == 11
+    for share, at in zip(numpy.linspace(0, 1, 11), fine):
+        assert at[0] == pytest.approx(share)
+        assert rotation(at[3:]) == pytest.approx(turned((0, 0, 1), share), abs=1e-9)
+    assert spaced(path, 0.5)[:, 0] == pytest.approx([0, 0.5, 1], abs=0.03)
+
+
+def test_the_picture_shows_start_and_goal():
+    scene = box_room(wall=False)
+    image = picture(scene, numpy.array([scene.start, scene.goal]), 'a room', width=200, height=150)
+    assert image.shape == (150, 200, 3)
+    assert (image < 200).any(axis=2).mean() > 0.05
+
+
+CFG = """[problem]
+robot = {robot}
+world = walls.obj
+start.x = 0.5
+start.y = 0.5  # m
+start.z = 0.5
+start.theta = {theta}
+start.axis.x = 0
+start.axis.y = 0
+start.axis.z = {axis}
+goal.x = 3.5
+goal.y = 0.5
+goal.z = 0.5
+goal.theta = 0
+goal.axis.x = 0
+goal.axis.y = 0
+goal.axis.z = 0
+volume.min.x = 0
+volume.min.y = 0
+volume.min.z = 0
+volume.max.x = 4
+volume.max.y = 2
+volume.max.z = 2
+[planner]
+planner=geometric.RRTConnect
+"""
+
+
+def write(path, mesh):
+    path.write_text(''.join(
+        [f"v {' '.join(map(str, v))}\n" for v in mesh.vertices.tolist()]
+        + [f"f {' '.join(str(i + 1) for i in t)}\n" for t in mesh.triangles.tolist()]))
+
+
+def test_a_problem_of_ompl_app(tmp_path, racer):
+    pytest.importorskip('trimesh', reason='trimesh is in the extra applications')
+    room = box_room(wall=False)
+    write(tmp_path / 'body.obj', room.body)
+    write(tmp_path / 'walls.obj', room.walls)
+    path = tmp_path / 'room.cfg'
+    path.write_text(CFG.format(robot='body.obj', theta=1.5, axis=2))
+    scene = loaded(path)
+    assert scene.name == 'room' and len(scene.walls.triangles) == len(room.walls.triangles)
+    assert scene.high.tolist() == [4, 2, 2]
+    assert rotation(scene.start[3:]) == pytest.approx(turned((0, 0, 1), 1.5))
+    racer.enter(scene)
+    assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
+    for words, text in [
+            ({'robot': 'none.obj'}, 'there is no .*none.obj'), ({'theta': 'x'}, 'could not'),
+            ({'robot': 'room.cfg'}, "can't be read as a mesh")]:
+        path.write_text(CFG.format(**{'robot': 'body.obj', 'theta': 0, 'axis': 1, **words}))
+        with pytest.raises(BadFile, match=text):
+            loaded(path)
+    for text, said in [('[problem]\nworld=a\n', "has no 'robot'"), ('nothing', "can't be read")]:
+        path.write_text(text)
+        with pytest.raises(BadFile, match=said):
+            loaded(path)
+    with pytest.raises(BadFile, match="can't be read"):
+        loaded(tmp_path / 'missing.cfg')
