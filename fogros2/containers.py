@@ -1,24 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Step 9: containers that run on a machine beside its nodes.
+Step 9: containers that run on a machine beside its nodes, and nodes that run in one.
 
 Pure: what ``docker run`` lines mean, and the commands by which podman or docker on the machine
 runs them. Each container is started before the nodes; a process of the agent follows it, so that
 it is seen in ``ros2 fog status``, what it says in ``ros2 fog logs``, and it ends with the nodes.
+A node in an image is a process of the agent's, too, which has the node as its container.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 import posixpath
 import re
 import shlex
 from typing import Any, Union
 
+from fogros2 import container_scripts as scripts
 from fogros2.errors import ConfigurationError
-from fogros2.model import Command, NodeSpec
+from fogros2.model import Command, NodeSpec, Text
 
+#: The program in the agent's folder that follows a container, with the container's name and when
+#: it is started again.
+FOLLOWER = 'follow-container'
 #: Label of a launch's containers, with its id.
 LABEL = 'fogros2-launch'
 #: Options of ``docker run`` that take no value.
@@ -31,41 +36,17 @@ _SHORT_FLAGS = 'diPqt'
 #: What the way containers are run here decides.
 _OURS = {'-d', '--detach', '-i', '--interactive', '-t', '--tty', '--rm'}
 _ENGINES = ('podman', 'docker')
-
-# Finds the engine; as root, as the login user may not be in docker's group.
-_ENGINE = """\
-engine=; for each in podman docker; do
-    ! command -v $each >/dev/null || { engine=$each; break; }
-done
-as_root=; [ "$(id -u)" = 0 ] || as_root='sudo -n'
-"""
-_RUN = _ENGINE + """\
-name=$1 gpus=$2 image=$3; shift 3
-$as_root $engine image inspect "$image" >/dev/null 2>&1 ||
-    $as_root $engine pull -q "$image" >/dev/null
-$as_root $engine rm -f "$name" >/dev/null 2>&1 || :
-if [ -n "$gpus" ]; then
-    if [ $engine = docker ]; then set -- --gpus "$gpus" "$@"
-    else set -- --device "nvidia.com/gpu=$gpus" "$@"; fi
-fi
-$as_root $engine run -d --name "$name" "$@" >/dev/null
-"""
-# Passes its signal on as the engine's own stop, and the exit status of the container back.
-_FOLLOW = _ENGINE + """\
-trap '$as_root $engine stop -t 5 "$1" >/dev/null 2>&1' INT TERM
-$as_root $engine logs -f "$1" & logs=$!
-$as_root $engine wait "$1" >/dev/null & waiting=$!
-wait $waiting || wait $waiting
-wait $logs
-status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$1")
-$as_root $engine rm -f "$1" >/dev/null 2>&1
-exit "$status"
-"""
-_REMOVE = _ENGINE + """\
-[ -n "$engine" ] || exit 0
-ids=$($as_root $engine ps -aq --filter "label=$1=$2")
-[ -z "$ids" ] || $as_root $engine rm -f $ids >/dev/null
-"""
+#: What the scripts are called that travel with a process.
+_OUTER, _INNER = 'container', 'in-container'
+_VARIABLE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
+#: Variables that a node in an image gets as the machine's own nodes have them.
+_VARIABLES = (
+    'CYCLONEDDS_URI', 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE', 'LANG',
+    'RCUTILS_COLORIZED_OUTPUT', 'RCUTILS_CONSOLE_OUTPUT_FORMAT', 'RCUTILS_LOGGING_BUFFERED_STREAM',
+    'RCUTILS_LOGGING_USE_STDOUT', 'RMW_FASTRTPS_USE_QOS_FROM_XML', 'RMW_IMPLEMENTATION',
+    'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_DOMAIN_ID', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS',
+    'ZENOH_CONFIG_OVERRIDE', 'ZENOH_ROUTER_CHECK_ATTEMPTS', 'ZENOH_SESSION_CONFIG_URI',
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +57,7 @@ class Container:
     :param options: words before the image, without those that are ours to say.
     :param gpus: 'all' or a number, '' for none.
     :param name: as the launch file has it, '' for none.
+    :param restart: such as 'always', '' for never.
     """
 
     image: str
@@ -83,6 +65,7 @@ class Container:
     command: tuple[str, ...] = ()
     gpus: str = ''
     name: str = ''
+    restart: str = ''
 
 
 def described(
@@ -132,7 +115,7 @@ def parse(line: str) -> Container:
     if words[:1] != ['run']:
         raise wrong('runs nothing')
     options: list[str] = []
-    found = {'--gpus': '', '--name': ''}
+    found = {'--gpus': '', '--name': '', '--restart': ''}
     at = 1
     while at < len(words) and words[at].startswith('-') and words[at] != '-':
         word = words[at]
@@ -162,7 +145,7 @@ def parse(line: str) -> Container:
     if at >= len(words):
         raise wrong('names no image')
     return Container(words[at], tuple(options), tuple(words[at + 1:]), found['--gpus'],
-                     found['--name'])
+                     found['--name'], found['--restart'])
 
 
 def called(container: Container, number: int, launch: str) -> str:
@@ -171,25 +154,67 @@ def called(container: Container, number: int, launch: str) -> str:
     return f'fogros2-{launch}-{number}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', what)[:40]
 
 
+def node_container(image: str, options: Sequence[str]) -> Container:
+    """
+    Return the container that a node runs in.
+
+    :param options: of ``docker run``, such as '--gpus=all'.
+    :raises ConfigurationError: they are none.
+    """
+    container = parse(shlex.join(['docker', 'run', *options, image]))
+    if container.image != image or container.command:
+        raise ConfigurationError(
+            f"image_options={list(options)} are no options of 'docker run' alone",
+            "such as ['--gpus=all', '-v', '/data:/data:ro']")
+    return container
+
+
+def qualified(image: str) -> str:
+    """Return an image's name as docker understands it; podman takes short ones for nobody's."""
+    first, slash, _ = image.partition('/')
+    if ':/' in image or slash and ('.' in first or ':' in first or first == 'localhost'):
+        return image
+    return f'docker.io/{image}' if slash else f'docker.io/library/{image}'
+
+
+def reason(text: str) -> str:
+    """Return the line of an engine's messages that says what went wrong with an image."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
+    return (errors or lines or ['no reason given'])[-1]
+
+
 def find() -> Command:
-    """Return what prints the machine's engine, nothing where it has none."""
-    return Command.script(_ENGINE + 'echo $engine', what='look for podman or docker')
+    """Return what prints the machine's engine, nothing where it has none that works."""
+    return Command.script(scripts.FIND, what='look for podman or docker')
 
 
 def install() -> Command:
     """Return what installs an engine."""
-    return Command.script(
-        'export DEBIAN_FRONTEND=noninteractive\napt-get update -q\n'
-        'apt-get install -q -y --no-install-recommends podman', sudo=True, what='install podman')
+    return Command.script(scripts.INSTALL, sudo=True, what='install podman')
 
 
-def run(container: Container, number: int, launch: str) -> Command:
-    """Return what starts a container, its image downloaded first if it isn't there."""
+def fetch(image: str, rmw: str = '') -> Command:
+    """
+    Return what downloads an image unless it is there, and prints how the engine knows it.
+
+    :param rmw: middleware that it has to have if it has ROS 2, '' for any.
+    """
+    return Command(('sh', '-ec', scripts.IMAGE, 'sh', image, qualified(image), rmw),
+                   what=f"get the image '{image}'")
+
+
+def run(container: Container, number: int, launch: str, image: str) -> Command:
+    """
+    Return what starts a container.
+
+    :param image: what ``fetch`` printed.
+    """
     name = called(container, number, launch)
     return Command(
-        ('sh', '-ec', _RUN, 'sh', name, container.gpus, container.image,
-         '--label', f'{LABEL}={launch}', *container.options, container.image,
-         *container.command), what=f"start the container '{container.image}'")
+        ('sh', '-ec', scripts.RUN, 'sh', name, container.gpus,
+         '--label', f'{LABEL}={launch}', *container.options, image, *container.command),
+        what=f"start the container '{container.image}'")
 
 
 def follow(container: Container, number: int, launch: str) -> NodeSpec:
@@ -197,9 +222,41 @@ def follow(container: Container, number: int, launch: str) -> NodeSpec:
     name = called(container, number, launch)
     return NodeSpec(
         id=f'container-{name}', name=name.split('-', 3)[3],
-        arguments=('sh', '-c', _FOLLOW, 'sh', name), sigterm_timeout=15.0)
+        arguments=('sh', '-c', f'exec sh "$FOGROS2_AGENT_DIRECTORY/{FOLLOWER}" "$0" "$@"', name,
+                   container.restart), sigterm_timeout=15.0)
+
+
+def inside(
+    node: NodeSpec, image: str, launch: str, workspace: str, variables: Iterable[str] = (),
+) -> NodeSpec:
+    """
+    Return the process that runs a node in its image.
+
+    :param image: what ``fetch`` printed.
+    :param workspace: the one that travels, '' for none; it is at the same place in there.
+    :param variables: names of those that the machine's nodes have by the launch file.
+    """
+    container = node_container(node.image, node.image_options)
+    names = sorted(name for name in {*_VARIABLES, *variables, *node.environment}
+                   if _VARIABLE.fullmatch(name))
+    options: list[Text] = ['--label', f'{LABEL}={launch}', *container.options]
+    for key in node.files:
+        options += ['-v', ({'file': key}, ':', {'file': key}, ':ro')]
+    options += ['-w', node.cwd] if node.cwd else []
+    # a machine's agent kills what doesn't end, and the container wouldn't know of it
+    grace = max(0.1, node.sigkill_timeout - 1.0)
+    name = f'fogros2-{launch}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', node.name)[:60]
+    return dataclasses.replace(
+        node, package='', executable='', prefix=(), cwd=None, image='', image_options=(),
+        files={**node.files, _OUTER: scripts.NODE.replace('@VARIABLES@', ' '.join(names)),
+               _INNER: scripts.INSIDE},
+        arguments=(
+            'sh', ({'file': _OUTER},), name, container.gpus, workspace, f'{grace:g}',
+            ({'file': _INNER},), *options, image, 'sh', ({'file': _INNER},), workspace,
+            node.package, node.executable, shlex.join(node.prefix), *node.arguments))
 
 
 def remove(launch: str) -> Command:
     """Return what removes all containers of a launch."""
-    return Command(('sh', '-ec', _REMOVE, 'sh', LABEL, launch), what='remove its containers')
+    return Command(('sh', '-ec', scripts.REMOVE, 'sh', LABEL, launch),
+                   what='remove its containers')

@@ -314,6 +314,8 @@ class NodeSpec:
     :param files: contents of files that travel; ``{'file': key}`` in a Text names one's path.
     :param environment: variables on top of the machine's own.
     :param respawn_delay: seconds.
+    :param image: container image that the process runs in, '' for the machine itself.
+    :param image_options: of ``docker run``, for that.
     """
 
     id: str
@@ -332,6 +334,8 @@ class NodeSpec:
     respawn_max_retries: int = -1
     sigterm_timeout: float = 5.0
     sigkill_timeout: float = 5.0
+    image: str = ''
+    image_options: tuple[str, ...] = ()
 
 
 def to_json(data: Any) -> str:

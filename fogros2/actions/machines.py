@@ -210,6 +210,9 @@ class CloudInstance:
             containers.parse(cmd)
         self._containers.append(cmd)
 
+    def takes_containers(self) -> None:
+        """Take it that containers will run on the machine, besides those it knows of."""
+
     def is_up(self, running: RunningMachine) -> None:
         """Take it that the machine is up; for the launch to call."""
         self._running = running
@@ -277,6 +280,8 @@ class ContainerInstance(CloudInstance):
         ``path:path there``; it can't write to them.
     :param gpus: 'all' or a number.
     :param devices: such as '/dev/video0'.
+    :param containers: whether it may run containers of its own, which takes rights that make it
+        little of a wall; None where ``add_docker_container`` or a node's ``image`` asks for it.
     """
 
     provider = 'container'
@@ -293,6 +298,7 @@ class ContainerInstance(CloudInstance):
         user: Optional[SomeSubstitutionsType] = None,
         gpus: Optional[SomeSubstitutionsType] = None,
         devices: Optional[Sequence[SomeSubstitutionsType]] = None,
+        containers: Optional[Truth] = None,
         **common: Any,
     ) -> None:
         super().__init__(options={
@@ -300,7 +306,12 @@ class ContainerInstance(CloudInstance):
             'cpus': words.number(cpus), 'memory': memory, 'ports': words.items(ports),
             'mounts': words.items(mounts), 'user': user, 'gpus': gpus,
             'devices': words.items(devices),
+            'containers': words.truth(containers),
         }, **common)
+
+    def takes_containers(self) -> None:
+        """Have the machine made with the rights that an engine takes, unless it may not."""
+        self._options.setdefault('containers', words.Truth(True))
 
 
 class SSHInstance(CloudInstance):

@@ -87,16 +87,18 @@ def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
 
 def from_action(
     action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str], spec: MachineSpec,
-    launch_id: str,
+    launch_id: str, image: str = '', image_options: Sequence[str] = (),
 ) -> NodeSpec:
     """
     Return what a prepared action asks for.
+
+    What is in an image is known there alone: paths of the robot's ROS stay as they are then.
 
     :param base: the environment before the launch changed it; changes travel.
     :raises ConfigurationError: a package, an executable or a parameter file is missing.
     """
     description = action.process_description
-    texts = Texts(plan.ament_prefixes(base), spec.workspace)
+    texts = Texts(() if image else plan.ament_prefixes(base), spec.workspace)
     final = list(description.final_cmd or ())
     # launch puts the prefix's words before the command's
     count = len(final) - len(description.cmd)
@@ -106,7 +108,7 @@ def from_action(
     if len(first) == 1 and isinstance(first[0], ProgramName) and first[0].package:
         package = perform_substitutions(context, first[0].package)
         executable = final.pop(0)
-        if not spec.options.get('image'):
+        if not image and not spec.options.get('image'):
             plan.check_program(package, executable, texts.prefixes)
     files: dict[str, Text] = {}
     arguments = [texts.text(word) for word in final]
@@ -136,6 +138,8 @@ def from_action(
         respawn_max_retries=options.respawn_max_retries,
         sigterm_timeout=float(perform_substitutions(context, action.sigterm_timeout)),
         sigkill_timeout=float(perform_substitutions(context, action.sigkill_timeout)),
+        image=image,
+        image_options=tuple(image_options),
     )
 
 

@@ -33,6 +33,9 @@ class RemoteProcess(ExecuteLocal):
 
     _fogros2_machine: SomeMachine
     _fogros2_streams: Sequence[Entry] = ()
+    #: Container image that the process runs in there, and what ``docker run`` is told besides.
+    _fogros2_image = ''
+    _fogros2_image_options: Sequence[str] = ()
     _fogros2_session: Session
     _fogros2_node: NodeSpec
     #: The command on the robot, where it may have to go on.
@@ -59,8 +62,11 @@ class RemoteProcess(ExecuteLocal):
         super().prepare(context)
         private.prefix_output(self, session.spec.name)
         self._fogros2_node = node_spec.from_action(
-            self, context, coordinator.base_environment, session.spec, coordinator.launch.id)
-        if session.spec.on_interrupt == 'robot' and not isinstance(self, carriers.Carrier):
+            self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
+            self._fogros2_image, self._fogros2_image_options)
+        if self._fogros2_image:
+            coordinator.launch.provider(session.spec.provider).check_containers(session.spec)
+        elif session.spec.on_interrupt == 'robot' and not isinstance(self, carriers.Carrier):
             self._fogros2_command = node_spec.robot_command(self, context)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:

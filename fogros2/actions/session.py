@@ -130,7 +130,7 @@ class Session:
         """The (package, executable) pairs of what waits for the machine."""
         return sorted({
             (run.node.package, run.node.executable) for run in self._waiting
-            if run.node.package})
+            if run.node.package and not run.node.image})
 
     def add(self, instance: CloudInstance) -> None:
         """Have an instance stand for this machine."""

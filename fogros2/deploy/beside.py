@@ -1,40 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Step 9: containers beside a machine's nodes."""
+"""Step 9: containers beside a machine's nodes, and images that nodes run in."""
 
 from __future__ import annotations
 
-from fogros2 import containers
+from collections.abc import Sequence
+import threading
+
+from fogros2 import container_scripts, containers
 from fogros2.deploy.job import Job
 from fogros2.errors import CommandError, PrerequisiteError
+from fogros2.model import NodeSpec
 from fogros2.shell import Shell
 
 
-def start(job: Job, shell: Shell) -> None:
+class Containers:
     """
-    Start a machine's containers, before its nodes; an engine is installed where there is none.
+    What one machine has of containers; thread-safe.
 
-    :raises CommandError: an image can't be had, or a container doesn't start.
-    :raises PrerequisiteError: the machine can't have an engine.
+    :param directory: of the machine's agent.
     """
-    if not job.spec.containers:
-        return
-    launch = job.launch.id
-    with job.step('containers') as detail:
-        if not shell.run(containers.find(), timeout=job.timeouts.command,
-                         cancel=job.cancel).stdout.strip():
+
+    def __init__(self, job: Job, shell: Shell, directory: str) -> None:
+        self._job = job
+        self._shell = shell
+        self._directory = directory
+        self._lock = threading.Lock()
+        self._engine = False
+        #: What the engine knows images as, by what the launch file calls them.
+        self._images: dict[tuple[str, str], str] = {}
+
+    def start(self) -> None:
+        """
+        Start a machine's containers, before its nodes; an engine is installed where there is none.
+
+        :raises CommandError: a container doesn't start.
+        :raises PrerequisiteError: the machine can't have an engine, or an image.
+        """
+        job = self._job
+        # here, as nodes in images come later and are to be stopped before
+        job.undoing('containers', self._remove)
+        if not job.spec.containers:
+            return
+        launch = job.launch.id
+        with self._lock, job.step('containers') as detail:
+            self._shell.put(
+                container_scripts.FOLLOW.encode(), f'{self._directory}/{containers.FOLLOWER}',
+                mode=0o600, timeout=job.timeouts.command)
+            for number, line in enumerate(job.spec.containers):
+                container = containers.parse(line)
+                image = self._image(container.image)
+                self._shell.run(containers.run(container, number, launch, image),
+                                timeout=job.timeouts.install, cancel=job.cancel)
+            detail.append(f'{len(job.spec.containers)}')
+
+    def inside(self, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
+        """
+        Return nodes as they are to be started: those with an image run in it, there by then.
+
+        :raises PrerequisiteError: the machine can't have an engine, or an image.
+        """
+        rmw = self._job.launch.dds().rmw
+        with self._lock:
+            for image in dict.fromkeys(node.image for node in nodes if node.image):
+                if (image, rmw) not in self._images:
+                    with self._job.step(f'image {image}'):
+                        self._image(image, rmw)
+        return [node if not node.image else containers.inside(
+            node, self._images[node.image, rmw], self._job.launch.id,
+            self._job.spec.workspace or '', self._job.spec.environment) for node in nodes]
+
+    def _image(self, image: str, rmw: str = '') -> str:
+        """Return what the engine knows an image as, downloaded if it wasn't there."""
+        job = self._job
+        if (image, rmw) not in self._images:
+            self._ensure_engine()
             try:
-                shell.run(containers.install(), timeout=job.timeouts.install, cancel=job.cancel)
+                printed = self._shell.run(containers.fetch(image, rmw), cancel=job.cancel,
+                                          timeout=job.timeouts.install).stdout
             except CommandError as error:
                 raise PrerequisiteError(
-                    f"'{job.name}' has neither podman nor docker, and podman can't be installed: "
-                    f'{error}', 'take an image with one of them') from error
+                    f"'{job.name}' can't get the image '{image}': "
+                    f'{containers.reason(error.result.stderr)}',
+                    'is its name right, and may anybody download it?') from error
+            self._images[image, rmw] = printed.split()[-1]
+        return self._images[image, rmw]
 
-        def removed() -> None:
-            if job.survives:
-                job.tidy(shell, [containers.remove(launch)])
+    def _ensure_engine(self) -> None:
+        job = self._job
+        if self._engine or self._shell.run(
+                containers.find(), timeout=job.timeouts.command,
+                cancel=job.cancel).stdout.strip():
+            self._engine = True
+            return
+        try:
+            self._shell.run(containers.install(), timeout=job.timeouts.install, cancel=job.cancel)
+        except CommandError as error:
+            raise PrerequisiteError(
+                f"'{job.name}' has neither podman nor docker, and podman can't be installed: "
+                f'{error}', 'take an image with one of them') from error
+        self._engine = True
 
-        job.undoing('containers', removed)
-        for number, line in enumerate(job.spec.containers):
-            shell.run(containers.run(containers.parse(line), number, launch),
-                      timeout=job.timeouts.install, cancel=job.cancel)
-        detail.append(f'{len(job.spec.containers)}')
+    def _remove(self) -> None:
+        if self._engine and self._job.survives:
+            self._job.tidy(self._shell, [containers.remove(self._job.launch.id)])

@@ -17,7 +17,8 @@ from typing import Any, TYPE_CHECKING
 
 from fogros2 import bootstrap, workspace
 from fogros2.agent_client import AgentClient
-from fogros2.deploy import beside, routing
+from fogros2.deploy import routing
+from fogros2.deploy.beside import Containers
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.equipping import Equipment
@@ -70,9 +71,10 @@ class Deployment:
                 configuring = pool.submit(self.configure_dds, shell, interface)
                 equipment = Equipment(job, shell, ros)
                 equipping = pool.submit(_after, installing, self.equip, equipment)
-                containers = pool.submit(_after, installing, beside.start, job, shell)
+                containers = Containers(job, shell, self.guard.directory)
+                starting = pool.submit(_after, installing, containers.start)
                 self._all_of(
-                    installing, joining, syncing, configuring, equipping, containers)
+                    installing, joining, syncing, configuring, equipping, starting)
                 public_key = joining.result().place.peer.public_key
                 dds = configuring.result()
             with job.step('agent') as detail:
@@ -86,7 +88,7 @@ class Deployment:
             job.failed = False
             running = RunningMachine(
                 self.launch, job, machine, shell, agent, heartbeat, interface,
-                self.guard.first_event, self.joining.redial, equipment)
+                self.guard.first_event, self.joining.redial, equipment, containers)
             running.undo = job.undo.pop_all()
             return running
 

@@ -107,11 +107,7 @@ class Launch:
                     "use on_exit='delete' to leave nothing there, or 'keep'")
             for line in spec.containers:
                 containers.parse(line)
-                if not machines.runs_containers:
-                    raise ConfigurationError(
-                        f"'{spec.name}' can't run containers: a machine of the provider "
-                        f"'{spec.provider}' hasn't the rights that an engine takes",
-                        'run them on an EC2 instance or a computer that is reached by SSH')
+                machines.check_containers(spec)
             if spec.workspace is not None:
                 workspace.inspect(Path(spec.workspace))
             for package, executable in programs.get(spec.name, ()):

@@ -10,6 +10,7 @@ import threading
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.deploy.beside import Containers
 from fogros2.deploy.equipping import Equipment
 from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
@@ -33,12 +34,13 @@ class RunningMachine:
     :param first_event: number of the agent's first event that is this launch's.
     :param found: takes what the provider tells of the machine when its heartbeat stays away.
     :param equipment: brings what some nodes import.
+    :param containers: brings the images that some run in.
     """
 
     def __init__(
         self, launch: Launch, job: Job, machine: Machine, shell: Shell, agent: AgentClient,
         heartbeat: Heartbeat, interface: VpnInterface, first_event: int,
-        found: Callable[[Machine], None], equipment: Equipment,
+        found: Callable[[Machine], None], equipment: Equipment, containers: Containers,
     ) -> None:
         self.spec = job.spec
         self.machine = machine
@@ -52,6 +54,7 @@ class RunningMachine:
         self._launch = launch
         self._job = job
         self._equipment = equipment
+        self._containers = containers
         self._first_event = first_event
         self._warm = False
         self._lock = threading.Lock()
@@ -72,9 +75,9 @@ class RunningMachine:
         """
         Start nodes; what becomes of them arrives as events.
 
-        :raises PrerequisiteError: the machine can't have what they import.
+        :raises PrerequisiteError: the machine can't have what they import, or their image.
         """
-        nodes = self._equipment.fitted(nodes)
+        nodes = self._equipment.fitted(self._containers.inside(nodes))
         self.agent.request('start', nodes=[_json(node) for node in nodes])
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:

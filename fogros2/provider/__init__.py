@@ -39,7 +39,7 @@ class Provider(abc.ABC):
     agent_program: ClassVar[str] = ''
     #: Whether its computers are made for a launch, not somebody's that exist already.
     owned: ClassVar[bool] = True
-    #: Whether a container engine can run on its machines.
+    #: Whether a container engine can run on its machines, unasked.
     runs_containers: ClassVar[bool] = True
     #: Seconds between two looks at a machine that comes up slowly, at the most.
     look_interval: ClassVar[float] = 3.0
@@ -84,6 +84,18 @@ class Provider(abc.ABC):
         :raises ConfigurationError: an option is unknown or its value is wrong.
         :raises PrerequisiteError: this computer lacks something.
         """
+
+    def check_containers(self, spec: MachineSpec) -> None:
+        """
+        Look whether a container engine can run on a machine of this spec.
+
+        :raises Unsupported: it can't.
+        """
+        if not self.runs_containers:
+            raise Unsupported(
+                f"'{spec.name}' can't run containers: a machine of the provider '{self.name}' "
+                "hasn't the rights that an engine takes",
+                'run them on an EC2 instance or a computer that is reached by SSH')
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """

@@ -49,7 +49,7 @@ umask 022
 failed() {
     code=$?
     [ $code -eq 0 ] && return
-    [ -s "$top/cid" ] && "$engine" rm -f "$(cat "$top/cid")" >/dev/null 2>&1
+    [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
     rm -rf -- "$top"
     rmdir -- "${top%/*}" 2>/dev/null
     exit $code
@@ -83,7 +83,7 @@ _THERE = 17
 _DESTROY = """\
 identity=$1 top=$2
 shift 2
-"$@" rm -f -t 0 "$identity" >/dev/null || "$@" rm -f "$identity" >/dev/null
+"$@" rm -f -v -t 0 "$identity" >/dev/null || "$@" rm -f -v "$identity" >/dev/null
 code=$?
 rm -rf -- "$top"
 rmdir -- "${top%/*}" 2>/dev/null
@@ -95,7 +95,7 @@ class ContainerProvider(Provider):
     """Containers of podman or docker on this computer."""
 
     name: ClassVar[str] = 'container'
-    #: One of its own would take rights that would make a container little of a wall.
+    #: Not unasked: that takes rights which make a container little of a wall.
     runs_containers = False
     look_interval: ClassVar[float] = 0.1
     agent_directory: ClassVar[str] = f'/{container_entry.AGENT_DIRECTORY}'
@@ -120,6 +120,12 @@ class ContainerProvider(Provider):
         container_options.check_network(engine, options)
         if not options.image:
             check_root()
+
+    def check_containers(self, spec: MachineSpec) -> None:
+        """Look whether the machine is to be made with the rights for it."""
+        if not container_options.runs_containers(spec, Options.parse(spec.options)):
+            raise Unsupported(f"'{spec.name}' was made without the rights that containers take",
+                              'say containers=True where the machine is described')
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create the container and start it; returns when the engine has started it."""
@@ -175,7 +181,8 @@ class ContainerProvider(Provider):
         archive = container_root.Archive()
         container_entry.add(
             archive, user=options.user, authorized_key=request.authorized_key,
-            environment=options.env, agent_config=request.agent_config)
+            environment=options.env, agent_config=request.agent_config,
+            nested=container_options.runs_containers(spec, options))
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), '' if kept else removal_hook(top),
              ' '.join(system) if kept else '',
@@ -203,7 +210,8 @@ class ContainerProvider(Provider):
         archive = container_root.Archive()
         container_entry.add(
             archive, user=options.user, authorized_key=request.authorized_key,
-            environment=options.env, agent_config=request.agent_config)
+            environment=options.env, agent_config=request.agent_config,
+            nested=container_options.runs_containers(spec, options))
         what = f"creating container machine '{spec.name}' from {options.image}"
         identity = engine.call(
             'create', *words, '--user', '0:0', '--entrypoint', '/bin/sh', options.image,
@@ -213,7 +221,7 @@ class ContainerProvider(Provider):
             engine.call('cp', '-', f'{identity}:/', what=what, data=archive.data())
             engine.call('start', identity, what=what)
         except BaseException:
-            engine.call('rm', '-f', identity, what='removing it again', check=False)
+            engine.call('rm', '-f', '-v', identity, what='removing it again', check=False)
             raise
         return identity
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import json
 from typing import Any
 
+from fogros2.provider import container_engine
 from fogros2.provider.agent_file import agent_file
 from fogros2.provider.container_root import Archive
 
@@ -80,6 +81,32 @@ while :; do
 done
 """
 
+# What an engine inside sets for the networks of its containers is this machine's network alone;
+# the rest of the kernel's settings stays read-only.
+_NESTED = """\
+mount --bind /proc/sys/net /proc/sys/net && mount -o remount,bind,rw /proc/sys/net
+[ -e /etc/containers/policy.json ] || {
+    mkdir -p /etc/containers
+    echo '{"default": [{"type": "insecureAcceptAnything"}]}' > /etc/containers/policy.json
+}
+"""
+_NESTED_CONFIG = 'etc/containers/containers.conf.d/fogros2.conf'
+# Control groups are the outer engine's, and so are limits. The usual network may be the one that
+# the machine itself is in.
+_NESTED_SETTINGS = """\
+[containers]
+cgroups = "disabled"
+default_ulimits = [{limits}]
+
+[engine]
+cgroup_manager = "cgroupfs"
+events_logger = "file"
+runtime = "crun"
+
+[network]
+default_subnet = "10.187.88.0/24"
+"""
+
 #: ``wait`` takes in the children that others leave to the first process.
 _IDLE = """\
 sleep infinity &
@@ -115,9 +142,13 @@ SetEnv {environment}
 
 def add(
     archive: Archive, *, user: str, authorized_key: str, environment: Mapping[str, str],
-    agent_config: Mapping[str, Any],
+    agent_config: Mapping[str, Any], nested: bool = False,
 ) -> None:
-    """Add the first process's script and what it needs to a machine's root."""
+    """
+    Add the first process's script and what it needs to a machine's root.
+
+    :param nested: the machine runs containers of its own.
+    """
     agent = agent_file() if agent_config else None
     names = {
         'user': user, 'folder': FOLDER, 'host_key': HOST_KEY, 'error_mark': ERROR_MARK,
@@ -125,6 +156,10 @@ def add(
         'root': 'prohibit-password' if user == 'root' else 'no',
     }
     guard = _IDLE if agent is None else _GUARD.format(**names) + _IDLE
+    if nested:
+        guard = _NESTED + guard
+        archive.file(_NESTED_CONFIG, _NESTED_SETTINGS.format(
+            limits=', '.join(f'"{word}"' for word in container_engine.limits()[1::2])).encode())
     archive.folder(FOLDER)
     archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(guard=guard, **names).encode(), 0o755)
     variables = {

@@ -8,6 +8,7 @@ import dataclasses
 import ipaddress
 import json
 import os
+from pathlib import Path
 import re
 from typing import Any
 
@@ -24,6 +25,8 @@ from fogros2.provider.container_machine import (
     MACHINE,
 )
 from fogros2.provider.options import parsed
+
+APPARMOR = Path('/sys/kernel/security/apparmor')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +46,7 @@ class Options:
     :param ports: such as '8080:80' or '8080:80/udp'.
     :param mounts: folders visible there read-only: 'path' or 'path:path there'.
     :param env: variables of every login.
+    :param containers: whether it may run containers of its own.
     """
 
     image: str = ''
@@ -57,6 +61,7 @@ class Options:
     ports: tuple[str, ...] = ()
     mounts: tuple[str, ...] = ()
     env: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    containers: bool = False
 
     @classmethod
     def parse(cls, given: Mapping[str, Any]) -> Options:
@@ -209,3 +214,25 @@ def common_flags(
         yield from ('--device', device)
     for port in options.ports:
         yield from ('-p', port)
+    if runs_containers(spec, options):
+        yield from nested_flags(engine)
+
+
+def runs_containers(spec: MachineSpec, options: Options) -> bool:
+    """Return whether a machine is to run containers of its own."""
+    return options.containers or bool(spec.containers)
+
+
+def nested_flags(engine: Engine) -> Iterator[str]:
+    """
+    Yield what an engine inside takes: to mount, and a place for its layers that isn't one itself.
+
+    Masked paths and, with podman, the filter of system calls stay.
+    """
+    yield from ('--cap-add', 'SYS_ADMIN', '-v', '/var/lib/containers')
+    if APPARMOR.exists():
+        # its usual profile lets nobody mount
+        yield from ('--security-opt', 'apparmor=unconfined')
+    if engine.name == 'docker':
+        # its filter keeps containers from changing their root
+        yield from ('--security-opt', 'seccomp=unconfined')

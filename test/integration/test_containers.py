@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Containers beside nodes, with the engine of this computer, as on a machine reached by SSH."""
+"""
+Containers beside nodes and nodes in images: with the engine of this computer, as on a machine that
+is reached by SSH, and with one of its own on a container machine.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import io
 import os
+from pathlib import Path
 import secrets
 import shutil
 import signal
@@ -14,10 +18,10 @@ import tarfile
 
 import pytest
 
-from fogros2 import containers
+from fogros2 import container_scripts, containers
 from fogros2.containers import Container
 from fogros2.errors import CommandError
-from fogros2.model import Command, Endpoint
+from fogros2.model import Command, Endpoint, NodeSpec
 from fogros2.process import run
 from fogros2.provider import container_engine
 from fogros2.shell.local import LocalShell
@@ -58,32 +62,53 @@ def there(launch: str) -> list[str]:
                ).stdout.splitlines()
 
 
-def started(container: Container, launch: str) -> subprocess.Popen[str]:
+def begun(words: Sequence[str], folder: Path, **variables: str) -> subprocess.Popen[str]:
+    """Start what the agent would start."""
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, 'FOGROS2_AGENT_DIRECTORY': str(folder), **variables})
+
+
+def started(container: Container, launch: str, folder: Path) -> subprocess.Popen[str]:
     """Start a container as a deployment does, and follow it as the agent does."""
     shell = LocalShell(Endpoint('local'), name='here')
     assert shell.run(containers.find(), timeout=60).stdout.strip() == 'podman'
-    shell.run(containers.run(container, 0, launch), timeout=60)
+    image = shell.run(containers.fetch(container.image), timeout=60).stdout.strip()
+    shell.run(containers.run(container, 0, launch, image), timeout=60)
+    (folder / containers.FOLLOWER).write_text(container_scripts.FOLLOW)
     words = containers.follow(container, 0, launch).arguments
-    return subprocess.Popen(
-        [str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    return begun([str(word) for word in words], folder)
 
 
-def limited(image: str, *command: str) -> Container:
-    return Container(image, (*container_engine.limits(), '--net', 'none'), command)
+def limited(image: str, *command: str, restart: str = '') -> Container:
+    return Container(
+        image, (*container_engine.limits(), '--net', 'none'), command, restart=restart)
 
 
-def test_what_it_says_and_how_it_ends_is_told(image, launch):
-    follower = started(limited(image, 'sh', '-c', 'echo hello; exit 3'), launch)
+def node(image: str, launch: str, folder: Path, *command: str, **variables: str,
+         ) -> subprocess.Popen[str]:
+    """Start a node in an image as the agent does."""
+    made = containers.inside(
+        NodeSpec('1', 'n-1', arguments=command, image=image, sigkill_timeout=1.5,
+                 image_options=container_engine.limits()),
+        image, launch, str(folder), ('COLOUR',))
+    for key, text in made.files.items():
+        (folder / key).write_text(str(text))
+    return begun([word if isinstance(word, str) else str(folder / word[0]['file'])
+                  for word in made.arguments], folder, **variables)
+
+
+def test_what_it_says_and_how_it_ends_is_told(image, launch, tmp_path):
+    follower = started(limited(image, 'sh', '-c', 'echo hello; exit 3'), launch, tmp_path)
     said = follower.communicate(timeout=60)[0]
     assert (said.splitlines(), follower.returncode) == (['hello'], 3)
     assert there(launch) == []
 
 
-def test_it_stops_with_the_process_that_follows_it(image, launch):
+def test_it_stops_with_the_process_that_follows_it(image, launch, tmp_path):
     follower = started(limited(
         image, 'sh', '-c', "trap 'echo bye; exit 0' TERM; echo up; while :; do "
-        'busybox sleep 0.1; done'), launch)
+        'busybox sleep 0.1; done'), launch, tmp_path)
     assert follower.stdout.readline() == 'up\n'
     assert [line.split()[1].lower() for line in there(launch)] in (['up'], ['running'])
     follower.send_signal(signal.SIGINT)
@@ -92,8 +117,8 @@ def test_it_stops_with_the_process_that_follows_it(image, launch):
     assert there(launch) == []
 
 
-def test_what_nobody_follows_any_more_is_removed(image, launch):
-    follower = started(limited(image, 'busybox', 'sleep', '1000'), launch)
+def test_what_nobody_follows_any_more_is_removed(image, launch, tmp_path):
+    follower = started(limited(image, 'busybox', 'sleep', '1000'), launch, tmp_path)
     os.kill(follower.pid, signal.SIGKILL)
     follower.wait(60)
     assert there(launch) != []
@@ -106,5 +131,76 @@ def test_what_nobody_follows_any_more_is_removed(image, launch):
 def test_an_image_that_is_not_there_is_told(engine, launch):
     shell = LocalShell(Endpoint('local'), name='here')
     with pytest.raises(CommandError, match='no-such-image'):
-        shell.run(containers.run(
-            Container('localhost/no-such-image:1'), 0, launch), timeout=60)
+        shell.run(containers.fetch('localhost/no-such-image:1'), timeout=60)
+
+
+def test_one_that_fails_is_started_again_as_often_as_it_may(image, launch, tmp_path):
+    follower = started(
+        limited(image, 'sh', '-c', 'echo up; exit 3', restart='on-failure:2'), launch, tmp_path)
+    said = follower.communicate(timeout=60)[0].splitlines()
+    assert (said.count('up'), follower.returncode) == (3, 3)
+    assert sum('is started again' in line for line in said) == 2
+    assert there(launch) == []
+
+
+def test_one_that_was_told_to_end_is_not_started_again(image, launch, tmp_path):
+    follower = started(limited(
+        image, 'sh', '-c', "trap 'exit 7' TERM; echo up; while :; do busybox sleep 0.1; done",
+        restart='always'), launch, tmp_path)
+    assert follower.stdout.readline() == 'up\n'
+    follower.send_signal(signal.SIGINT)
+    follower.communicate(timeout=60)
+    assert follower.returncode == 7
+    assert there(launch) == []
+
+
+# --- nodes in images -----------------------------------------------------------------------------
+
+def test_a_node_in_an_image_has_the_machine_s_variables_files_and_user(image, launch, tmp_path):
+    settings = tmp_path / 'dds.xml'
+    settings.write_text('settings of DDS\n')
+    process = node(
+        image, launch, tmp_path, 'sh', '-c',
+        'echo $RMW_IMPLEMENTATION "$COLOUR" $HOME ${SECRET-none}; '
+        'busybox cat ${CYCLONEDDS_URI##*file://}; busybox id -u; busybox hostname; '
+        f'busybox touch {tmp_path}/dds.xml; exit 5',
+        CYCLONEDDS_URI=f'<a/>,file://{settings}', RMW_IMPLEMENTATION='rmw', COLOUR='dark red',
+        SECRET='s')
+    said = process.communicate(timeout=60)[0].splitlines()
+    assert said[:4] == [
+        'rmw dark red /tmp none', 'settings of DDS', str(os.geteuid()), os.uname().nodename]
+    assert 'Read-only' in said[4]
+    assert process.returncode == 5
+    assert there(launch) == []
+    assert not list(tmp_path.glob('variables-*'))
+
+
+@pytest.mark.parametrize(('asked', 'command', 'returncode'), [
+    (signal.SIGINT, "trap 'exit 4' INT; echo up; while :; do busybox sleep 0.1; done", 4),
+    (signal.SIGINT, 'echo up; exec busybox sleep 1000', -signal.SIGINT),
+    (signal.SIGTERM, "trap '' TERM; echo up; while :; do busybox sleep 0.1; done",
+     -signal.SIGKILL),
+])
+def test_a_node_in_an_image_takes_signals_as_any_node(
+        image, launch, tmp_path, asked, command, returncode):
+    process = node(image, launch, tmp_path, 'sh', '-c', command)
+    assert process.stdout.readline() == 'up\n'
+    process.send_signal(asked)
+    process.communicate(timeout=60)
+    assert process.returncode == returncode
+    assert there(launch) == []
+
+
+def test_a_node_in_an_image_that_is_killed_there_ended_so(image, launch, tmp_path):
+    process = node(image, launch, tmp_path, 'sh', '-c', 'kill -KILL $$')
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert there(launch) == []
+
+
+def test_one_that_is_told_to_end_before_it_began_ends(image, launch, tmp_path):
+    process = node(image, launch, tmp_path, 'sh', '-c', 'exec busybox sleep 1000')
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert there(launch) == []

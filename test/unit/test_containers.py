@@ -3,14 +3,28 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+import subprocess
+import threading
+from types import SimpleNamespace
+
+from launch import LaunchContext, LaunchDescription
+from launch.launch_description_sources import get_launch_description_from_any_launch_file
 import pytest
 
-from fogros2 import containers
+from fogros2 import container_scripts, containers
+from fogros2.actions.cloud_node import CloudNode
 from fogros2.actions.machines import ContainerInstance
 from fogros2.containers import Container, parse
 from fogros2.deploy import Launch
-from fogros2.errors import ConfigurationError
-from fogros2.model import MachineSpec
+from fogros2.deploy.beside import Containers
+from fogros2.errors import ConfigurationError, PrerequisiteError, Unsupported
+from fogros2.model import Command, MachineSpec, NodeSpec, Result
+from fogros2.provider.container import ContainerProvider
+from fogros2.report import step
+from fogros2.testing.fakes import FakeShell
+from fogros2.waiting import Timeouts
 
 
 @pytest.mark.parametrize(('line', 'meant'), [
@@ -25,7 +39,7 @@ from fogros2.model import MachineSpec
     ('docker run -p8080:80 -e=X=1 -dP -- image',
      Container('image', ('-p', '8080:80', '-e', 'X=1', '-P'))),
     ("docker run -e 'A=b c' --restart always image sh -c 'echo hi'",
-     Container('image', ('-e', 'A=b c', '--restart', 'always'), ('sh', '-c', 'echo hi'))),
+     Container('image', ('-e', 'A=b c'), ('sh', '-c', 'echo hi'), restart='always')),
 ])
 def test_a_line_is_understood(line, meant):
     assert parse(line) == meant
@@ -46,8 +60,8 @@ def test_parts_make_a_line():
         'image:1', command='run --fast', ports=['80:8080'], environment={'A': 'b c'},
         volumes=['/x:/y'], gpus=1, restart='always', name='eyes')
     assert parse(line) == Container(
-        'image:1', ('-p', '80:8080', '-e', 'A=b c', '-v', '/x:/y', '--restart', 'always'),
-        ('run', '--fast'), '1', 'eyes')
+        'image:1', ('-p', '80:8080', '-e', 'A=b c', '-v', '/x:/y'),
+        ('run', '--fast'), '1', 'eyes', 'always')
 
 
 def test_each_launch_has_names_of_its_own():
@@ -55,7 +69,7 @@ def test_each_launch_has_names_of_its_own():
     assert containers.called(named, 0, 'abcdef') == 'fogros2-abcdef-0-my-eyes'
     assert containers.called(unnamed, 1, 'abcdef') == 'fogros2-abcdef-1-b-1'
     node = containers.follow(unnamed, 1, 'abcdef')
-    assert (node.name, node.arguments[-1]) == ('b-1', 'fogros2-abcdef-1-b-1')
+    assert (node.name, node.arguments[-2]) == ('b-1', 'fogros2-abcdef-1-b-1')
 
 
 def test_what_a_machine_is_given_is_checked_where_it_is_written():
@@ -69,9 +83,194 @@ def test_what_a_machine_is_given_is_checked_where_it_is_written():
     assert 'ports' in error.value.hint
 
 
-def test_a_machine_that_can_not_run_them_is_refused_before_it_is_made():
+def test_a_machine_that_can_not_run_them_is_refused_before_it_is_made(monkeypatch):
+    monkeypatch.setattr(ContainerProvider, 'check_containers', lambda self, spec: (
+        super(ContainerProvider, self).check_containers(spec)))
     launch = Launch()
     spec = MachineSpec('m', 'container', containers=('docker run image',))
-    with pytest.raises(ConfigurationError, match='rights that an engine takes'):
+    with pytest.raises(Unsupported, match='rights that an engine takes'):
         launch.prepare([spec])
     launch.down()
+
+
+# --- nodes in images -----------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('image', 'name'), [
+    ('ros:jazzy-perception', 'docker.io/library/ros:jazzy-perception'),
+    ('example/mapper:2', 'docker.io/example/mapper:2'),
+    ('ghcr.io/a/b@sha256:00', 'ghcr.io/a/b@sha256:00'),
+    ('localhost/a', 'localhost/a'), ('host:5000/a', 'host:5000/a'),
+    ('oci-archive:/tmp/a.tar', 'oci-archive:/tmp/a.tar'), ('docker://ros', 'docker://ros'),
+])
+def test_short_names_are_docker_s(image, name):
+    assert containers.qualified(image) == name
+
+
+def test_a_node_in_an_image_is_a_process_with_the_node_s_words_in_it():
+    node = NodeSpec(
+        '1', 'eyes-1', 'demo', 'talker', ('--ros-args', '--params-file', ({'file': 'p'},)),
+        prefix=('nice', '-n', '5'), files={'p': 'a: 1'},
+        environment={'COLOUR': 'red', 'no-name': ''}, cwd='/data', respawn=True, image='demo:1',
+        image_options=('--gpus=all', '-v', '/a:/b'))
+    made = containers.inside(node, 'demo:1', 'abcdef', '/ws', {'MORE': '1'})
+    assert (made.package, made.executable, made.image) == ('', '', '')
+    assert (made.cwd, made.prefix) == (None, ())
+    assert (made.respawn, made.environment) == (True, node.environment)
+    outer, inner = made.arguments[1], made.arguments[6]
+    assert made.arguments == (
+        'sh', outer, 'fogros2-abcdef-eyes-1', 'all', '/ws', '4', inner,
+        '--label', 'fogros2-launch=abcdef', '-v', '/a:/b',
+        '-v', ({'file': 'p'}, ':', {'file': 'p'}, ':ro'), '-w', '/data',
+        'demo:1', 'sh', inner, '/ws', 'demo', 'talker', 'nice -n 5',
+        '--ros-args', '--params-file', ({'file': 'p'},))
+    script = made.files[outer[0]['file']]
+    assert ' COLOUR ' in script and ' MORE ' in script and 'RMW_IMPLEMENTATION' in script
+    assert 'no-name' not in script and '@' not in script.replace('"$@"', '')
+    assert made.files['p'] == 'a: 1'
+
+
+@pytest.mark.parametrize('wrong', [['image2'], ['-v'], ['--', 'sh']])
+def test_options_of_an_image_are_options_alone(wrong):
+    with pytest.raises(ConfigurationError):
+        containers.node_container('image', wrong)
+
+
+def test_a_container_machine_has_the_rights_when_they_are_asked_for():
+    def options(machine):
+        return machine.spec(LaunchContext()).options
+
+    plain, told, asked = (ContainerInstance(name=name) for name in 'abc')
+    CloudNode(machine=plain, package='p', executable='e')
+    told.add_docker_container('docker run image')
+    CloudNode(machine=asked, package='p', executable='e', image='image')
+    assert 'containers' not in options(plain)
+    assert options(asked)['containers'] is True
+    provider = ContainerProvider()
+    for machine in (told, asked):
+        provider.check_containers(machine.spec(LaunchContext()))
+    refused = ContainerInstance(name='d', containers=False)
+    CloudNode(machine=refused, package='p', executable='e', image='image')
+    for machine in (plain, refused):
+        with pytest.raises(Unsupported, match='containers=True'):
+            provider.check_containers(machine.spec(LaunchContext()))
+
+
+@pytest.mark.parametrize('wrong', [
+    {'image_options': ['--gpus=all']}, {'image': 'a', 'image_options': '--gpus=all'}])
+def test_what_an_image_is_told_belongs_to_one(wrong):
+    with pytest.raises(ConfigurationError, match='image_options'):
+        CloudNode(machine='m', package='p', executable='e', **wrong)
+
+
+def test_an_image_is_an_attribute_in_xml(tmp_path):
+    path = tmp_path / 'a.launch.xml'
+    path.write_text("""<launch><cloud_node machine="m" pkg="p" exec="e" image="ros:jazzy"
+        image_options="--gpus=all, --init"/></launch>""")
+    description: LaunchDescription = get_launch_description_from_any_launch_file(str(path))
+    (node,) = description.entities
+    assert node._image == 'ros:jazzy'
+    assert node._image_options == ['--gpus=all', '--init']
+
+
+# --- the scripts, with an engine that notes what it is told --------------------------------------
+
+ENGINE = r"""#!/bin/sh
+printf '%s\n' "$0 $*" >> "$NOTES"
+case $1-$2 in
+    image-inspect) for last; do :; done
+        case " $THERE " in *" $last "*) echo sha256:0123456789abcdef ;; *) exit 1 ;; esac ;;
+    pull-*) [ "$3" != "$WRONG" ] || { echo "Error: $3: manifest unknown" >&2; exit 125; }
+        echo "$3" ;;
+    run-*) echo "$LACKS" ;;
+    build-*) cat >> "$NOTES" ;;
+esac
+"""
+
+
+@pytest.fixture(params=['podman', 'docker'])
+def engine(request, tmp_path, monkeypatch):
+    """Have one engine alone on PATH, beside what a shell needs."""
+    folder = tmp_path / 'bin'
+    folder.mkdir()
+    for name, text in ((request.param, ENGINE), ('sudo', '#!/bin/sh\nshift\nexec "$@"\n')):
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+    for name in ('cat', 'id', 'sh', 'tail', 'tr', 'printf'):
+        (folder / name).symlink_to(f'/bin/{name}' if Path(f'/bin/{name}').exists()
+                                   else f'/usr/bin/{name}')
+    monkeypatch.setenv('NOTES', str(tmp_path / 'notes'))
+    monkeypatch.setenv('PATH', str(folder))
+    return request.param
+
+
+def done(command: Command, **variables: str) -> tuple[str, list[str]]:
+    """Run a command here; return what it printed and what the engine was told."""
+    notes = Path(os.environ['NOTES'])
+    notes.unlink(missing_ok=True)
+    said = subprocess.run(command.argv, env={**os.environ, **variables}, text=True, check=True,
+                          stdout=subprocess.PIPE).stdout
+    return said.strip(), [line.rpartition('/bin/')[2] for line in notes.read_text().splitlines()]
+
+
+def test_an_image_that_is_there_is_not_downloaded(engine):
+    assert done(containers.fetch('ros:jazzy'), THERE='ros:jazzy')[0] == 'ros:jazzy'
+    name, told = done(containers.fetch('ros:jazzy'))
+    assert name == 'docker.io/library/ros:jazzy'
+    assert told[-1] == f'{engine} pull -q docker.io/library/ros:jazzy'
+
+
+def test_an_image_without_the_middleware_gets_it_once(engine):
+    fetch = containers.fetch('ros:jazzy', 'rmw_cyclonedds_cpp')
+    assert done(fetch, THERE='ros:jazzy')[0] == 'ros:jazzy'
+    name, told = done(fetch, THERE='ros:jazzy', LACKS='jazzy')
+    made = 'localhost/fogros2-rmw_cyclonedds_cpp:0123456789ab'
+    assert name == made
+    assert f'{engine} build -q --network host -t {made} -' in told
+    assert 'FROM ros:jazzy' in told
+    assert told[-1].endswith('--no-install-recommends ros-jazzy-rmw-cyclonedds-cpp')
+    name, told = done(fetch, THERE=f'ros:jazzy {made}', LACKS='jazzy')
+    assert name == made and not any('build' in line for line in told)
+
+
+def test_gpus_are_told_in_the_engine_s_words(engine):
+    container = parse('docker run --gpus 1 -p 80:80 image run')
+    told = done(containers.run(container, 0, 'abc', 'image'))[1]
+    gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
+    assert told[-1] == (f'{engine} run -d --name fogros2-abc-0-image {gpus} '
+                        '--label fogros2-launch=abc -p 80:80 image run')
+
+
+def here(command: Command) -> Result:
+    said = subprocess.run(command.argv, text=True, capture_output=True)
+    return Result(said.returncode, said.stdout, said.stderr)
+
+
+def beside(shell: object, *lines: str) -> Containers:
+    job = SimpleNamespace(
+        name='m', spec=MachineSpec('m', 'fake', containers=lines), timeouts=Timeouts(),
+        cancel=threading.Event(), step=lambda name: step(lambda event: None, 'm', name),
+        undoing=lambda name, undo: None, survives=True, launch=SimpleNamespace(
+            id='abc', dds=lambda: SimpleNamespace(rmw='rmw_cyclonedds_cpp')))
+    return Containers(job, shell, '/run/fogros2')
+
+
+def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
+    monkeypatch.setenv('WRONG', 'docker.io/library/no-such:1')
+    node = NodeSpec('1', 'n', 'p', 'e', image='no-such:1')
+    with pytest.raises(PrerequisiteError) as error:
+        beside(FakeShell(handlers={'sh': here})).inside([node])
+    assert str(error.value) == (
+        "'m' can't get the image 'no-such:1': Error: docker.io/library/no-such:1: manifest "
+        'unknown (is its name right, and may anybody download it?)')
+
+
+def test_a_machine_without_an_engine_and_without_apt_says_so():
+    shell = FakeShell(handlers={'sh': lambda command: Result(
+        127 if 'apt-get' in command.argv[-1] else 0, '\n', 'sh: 2: apt-get: not found')})
+    with pytest.raises(PrerequisiteError, match="'m' has neither podman nor docker.*apt-get"):
+        beside(shell, 'docker run image').start()
+
+
+def test_scripts_are_shell():
+    for script in ('FIND', 'INSTALL', 'IMAGE', 'RUN', 'FOLLOW', 'NODE', 'INSIDE', 'REMOVE'):
+        subprocess.run(['sh', '-n'], input=getattr(container_scripts, script).encode(), check=True)

@@ -53,7 +53,7 @@ def test_that_it_is_gone_is_its_provider_s_to_say():
     agent, heard = Told(), []
     machine = RunningMachine(
         SimpleNamespace(ending=False), job, None, None, agent, None,
-        SimpleNamespace(address='198.18.7.2'), 7, None, None)
+        SimpleNamespace(address='198.18.7.2'), 7, None, None, None)
     machine.subscribe(heard.append)
     assert agent.since == 7
     for event in ('lost', 'connection', 'gap'):
@@ -98,6 +98,6 @@ def test_a_machine_that_goes_while_it_is_subscribed_to_is_lost_and_nothing_else(
 
     machine = RunningMachine(
         SimpleNamespace(ending=False), job, None, None, Closing(), None,
-        SimpleNamespace(address='198.18.7.2'), 7, None, None)
+        SimpleNamespace(address='198.18.7.2'), 7, None, None, None)
     machine.subscribe(heard.append)
     assert heard == [{'event': 'lost', 'reason': 'it was deleted'}]

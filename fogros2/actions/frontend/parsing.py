@@ -91,9 +91,14 @@ def cloud_node(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<cloud_node machine="planner" pkg="demo" exec="talker">``, else as ``<node>``."""
     _, kwargs = Node.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
+    known = {'image': keywords.Keyword('image', 'text'),
+             'image_options': keywords.Keyword('image_options', 'list')}
+    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+    kwargs.update({name: words.items(content) if name == 'image_options' else content
+                   for name, content in given.items() if content is not None})
     streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
     _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
-    complete(entity, ('machine', 'stream_topic', *_NODE, *CONDITIONS))
+    complete(entity, ('machine', 'stream_topic', *known, *_NODE, *CONDITIONS))
     return CloudNode, kwargs
 
 

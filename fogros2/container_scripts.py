@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What runs in ``sh`` on a machine for containers: see :mod:`fogros2.containers`."""
+
+# Finds the engine; as root, as the login user may not be in docker's group.
+ENGINE = """\
+engine=; for each in podman docker; do
+    ! command -v $each >/dev/null || { engine=$each; break; }
+done
+as_root=; [ "$(id -u)" = 0 ] || as_root='sudo -n'
+"""
+# A podman without the runtime that its configuration names is of no use.
+FIND = ENGINE + """\
+[ "$engine" != podman ] || $as_root podman ps -q >/dev/null 2>&1 || engine=
+echo $engine
+"""
+INSTALL = """\
+export DEBIAN_FRONTEND=noninteractive
+apt-get update -q
+apt-get install -q -y --no-install-recommends podman
+podman ps -q >/dev/null 2>&1 || apt-get install -q -y --no-install-recommends crun
+"""
+# Prints what the engine knows the image as. An image of ROS without the launch's middleware (none
+# of those that are published has Cyclone DDS) gets a layer with it, once.
+IMAGE = ENGINE + """\
+image=$1 rmw=$3
+there() { $as_root $engine image inspect "$1" >/dev/null 2>&1; }
+if ! there "$image"; then
+    image=$2
+    if ! there "$image"; then
+        pulled=$($as_root $engine pull -q "$image")
+        image=$(echo "$pulled" | tail -n 1)
+    fi
+fi
+if [ -n "$rmw" ]; then
+    id=$($as_root $engine image inspect -f '{{.Id}}' "$image")
+    id=${id#sha256:}
+    with=localhost/fogros2-$rmw:${id%"${id#????????????}"}
+    if there "$with"; then
+        image=$with
+    else
+        distro=$($as_root $engine run --rm --network none --log-driver none \\
+            --entrypoint /bin/sh "$image" -c 'for each in /opt/ros/*; do
+                [ ! -d "$each" ] || [ -e "$each/lib/lib$0.so" ] || echo "${each##*/}"
+            done' "$rmw" | tail -n 1)
+        if [ -n "$distro" ]; then
+            package=ros-$distro-$(echo "$rmw" | tr _ -)
+            printf 'FROM %s\\nUSER 0\\nRUN apt-get update -q && apt-get install -q -y %s %s\\n' \\
+                "$image" --no-install-recommends "$package" |
+                $as_root $engine build -q --network host -t "$with" - >/dev/null
+            image=$with
+        fi
+    fi
+fi
+echo "$image"
+"""
+# Docker takes GPUs by number, podman as what the vendor describes (CDI).
+GPUS = """\
+if [ -n "$gpus" ]; then
+    if [ $engine = docker ]; then set -- --gpus "$gpus" "$@"
+    else set -- --device "nvidia.com/gpu=$gpus" "$@"; fi
+fi
+"""
+RUN = ENGINE + """\
+name=$1 gpus=$2; shift 2
+$as_root $engine rm -f "$name" >/dev/null 2>&1 || :
+""" + GPUS + """\
+$as_root $engine run -d --name "$name" "$@" >/dev/null
+"""
+# Passes its signal on as the engine's own stop, and the exit status of the container back. What
+# begins it again is this script, not the engine: nothing comes back that was told to end.
+FOLLOW = ENGINE + """\
+name=$1 restart=$2 since=; tries=0 asked=
+trap 'asked=1; $as_root $engine stop -t 5 "$name" >/dev/null 2>&1' INT TERM
+while :; do
+    $as_root $engine logs -f $since "$name" & logs=$!
+    $as_root $engine wait "$name" >/dev/null & waiting=$!
+    wait $waiting || wait $waiting
+    wait $logs
+    status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name")
+    [ -z "$asked" ] || break
+    case $restart in
+        always|unless-stopped) ;;
+        on-failure) [ "$status" != 0 ] || break ;;
+        on-failure:*) [ "$status" != 0 ] && [ $tries -lt "${restart#*:}" ] || break ;;
+        *) break ;;
+    esac
+    tries=$((tries + 1))
+    echo "it ended with exit status $status and is started again" >&2
+    sleep 1 & wait $!
+    [ -z "$asked" ] || break
+    since="--since $(date -u +%Y-%m-%dT%H:%M:%S.%NZ)"
+    $as_root $engine start "$name" >/dev/null || break
+done
+$as_root $engine rm -f "$name" >/dev/null 2>&1
+# ended as it was told to, by whichever signal it took
+[ -z "$asked" ] || case $status in 130|137|143) status=0 ;; esac
+exit "$status"
+"""
+# Stands for a node in a container: signals go to the node itself, which isn't the container's
+# first process (that one ignores what it hasn't asked for), its output comes as it is, and its end
+# is this script's. Values of variables travel in a file: a command line is for all to read.
+NODE = ENGINE + """\
+name=$1 gpus=$2 workspace=$3 grace=$4 inside=$5; shift 5
+asked= late=
+passed_on() {
+    asked=1
+    first=$($as_root $engine inspect -f '{{.State.Pid}}' "$name" 2>/dev/null)
+    node=$(cat "/proc/$first/task/$first/children" 2>/dev/null)
+    if [ -n "$node" ]; then $as_root kill -s "$1" $node
+    else $as_root $engine rm -f "$name" >/dev/null 2>&1; fi
+    [ "$1" != TERM ] || [ -n "$late" ] || {
+        (sleep "$grace"; $as_root $engine kill "$name") >/dev/null 2>&1 & late=$!; }
+}
+for each in HUP INT QUIT TERM USR1 USR2; do trap "passed_on $each" $each; done
+umask 077
+list=$(mktemp "${FOGROS2_AGENT_DIRECTORY:-/tmp}/variables-XXXXXX") || exit 125
+newline='
+'
+for each in @VARIABLES@; do
+    eval "value=\\${$each-} given=\\${$each+yes}"
+    case $value in *"$newline"*)
+        echo "$each has more than one line, and isn't there in the container" >&2
+        given= ;;
+    esac
+    [ -z "$given" ] || printf '%s=%s\\n' "$each" "$value"
+done >"$list"
+set -f; IFS=,
+for each in $CYCLONEDDS_URI $FASTDDS_DEFAULT_PROFILES_FILE $FASTRTPS_DEFAULT_PROFILES_FILE \\
+        $ZENOH_SESSION_CONFIG_URI; do
+    each=${each#file://}
+    case $each in /*) [ ! -f "$each" ] || set -- -v "$each:$each:ro" "$@" ;; esac
+done
+set +f; unset IFS
+[ ! -d "$workspace" ] || set -- -v "$workspace:$workspace:ro" "$@"
+set -- -v "$inside:$inside:ro" "$@"
+""" + GPUS + """\
+$as_root $engine rm -f "$name" >/dev/null 2>&1
+$as_root $engine create --pull never --name "$name" --network host --ipc host --log-driver none \\
+    --user "$(id -u):$(id -g)" --env-file "$list" -e HOME=/tmp "$@" >/dev/null
+status=$?
+rm -f "$list"
+[ $status -eq 0 ] || exit 125
+if [ -z "$asked" ]; then
+    $as_root $engine start -a "$name" & client=$!
+    while wait $client; [ -d /proc/$client ]; do :; done
+fi
+status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name" 2>/dev/null) || status=130
+$as_root $engine rm -f "$name" >/dev/null 2>&1
+[ -z "$late" ] || kill $late 2>/dev/null
+if [ "$status" -gt 128 ] && [ "$status" -lt 160 ]; then
+    # as of a node that a signal ended
+    trap - $((status - 128))
+    kill -s $((status - 128)) $$
+fi
+exit "$status"
+"""
+# In the container: an entry point may have set ROS up already.
+INSIDE = """\
+workspace=$1 package=$2 executable=$3 prefix=$4; shift 4
+if [ -z "$AMENT_PREFIX_PATH" ]; then
+    for each in /opt/ros/*/setup.sh; do [ ! -e "$each" ] || . "$each"; done
+fi
+[ ! -e "$workspace/install/local_setup.sh" ] || . "$workspace/install/local_setup.sh"
+if [ -n "$package" ]; then
+    program=; IFS=:
+    for each in $AMENT_PREFIX_PATH; do
+        each=$each/lib/$package/$executable
+        [ -n "$program" ] || [ ! -x "$each" ] || program=$each
+    done
+    unset IFS
+    [ -n "$program" ] || {
+        echo "executable '$executable' of package '$package' not found in the image" >&2
+        exit 127
+    }
+    set -- "$program" "$@"
+fi
+eval "set -- $prefix \\"\\$@\\""
+"$@"
+exit $?
+"""
+REMOVE = ENGINE + """\
+[ -n "$engine" ] || exit 0
+ids=$($as_root $engine ps -aq --filter "label=$1=$2")
+[ -n "$ids" ] || exit 0
+# those that run still had their time to end
+$as_root $engine kill $ids >/dev/null 2>&1 || :
+$as_root $engine rm -f $ids >/dev/null
+"""
