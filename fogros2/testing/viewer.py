@@ -33,7 +33,7 @@ def install(source: Path, cache: Path) -> str:
         fcntl.flock(lock, fcntl.LOCK_EX)  # several runs of tests may come at once
         done = cache / 'installed.json'
         if not done.exists() or done.read_bytes() != wanted:
-            npm = _program('npm')
+            npm = program('npm')
             if npm is None:
                 return 'needs npm'
             shutil.copy(source / 'package.json', cache)
@@ -48,12 +48,13 @@ def install(source: Path, cache: Path) -> str:
             if made.returncode:
                 return f'npm could not install the client: {(made.stderr or made.stdout)[-300:]}'
             done.write_bytes(wanted)
-        for program in source.glob('*.mjs'):
-            shutil.copy(program, cache)  # to where its modules are found from
+        for each in source.glob('*.mjs'):
+            shutil.copy(each, cache)  # to where its modules are found from
     return ''
 
 
-def _program(name: str) -> Optional[str]:
+def program(name: str) -> Optional[str]:
+    """Return the path of ``node`` or ``npm``, None without."""
     return shutil.which(name, path=_environment()['PATH'])
 
 
@@ -73,7 +74,7 @@ class Viewer:
     """
 
     def __init__(self, cache: Path, url: str) -> None:
-        node = _program('node')
+        node = program('node')
         assert node is not None
         self._process = subprocess.Popen(
             [node, str(cache / 'viewer.mjs'), url], stdin=subprocess.PIPE,

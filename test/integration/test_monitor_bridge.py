@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterator
 import itertools
+import json
 import os
 from pathlib import Path
 import re
@@ -13,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -37,6 +39,8 @@ from fogros2.waiting import wait_until
 ROOT = Path(__file__).parents[2]
 CACHE = ROOT / '.cache/node'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+#: Messages a second that the robot publishes to a crowd of viewers.
+RATE = 20.0
 _domains = itertools.count(os.getpid())
 
 
@@ -74,6 +78,12 @@ class Bench:
         self.viewers.append(made)
         made.until('open')
         return made
+
+    def run_node(self, program: str, *words: str) -> subprocess.Popen[str]:
+        """Run a program of Node's, which ends with its input."""
+        return subprocess.Popen(
+            [viewers.program('node'), str(CACHE / program), *words], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, text=True)
 
     def until(self, probe: Callable[[], Any], what: str) -> Any:
         return wait_until(lambda: probe() or None, timeout=20, what=what)
@@ -215,6 +225,68 @@ def test_what_can_not_be_published_is_said(bench):
     viewer.wish(publish='/a b', schemaName='std_msgs/msg/String', definition='string data',
                 message={'data': ''})
     assert '/a b' in viewer.until('status')['status']
+
+
+class Publishing:
+    """A robot's node that publishes at a rate, as far as the computer lets it."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._small = bench.node.create_publisher(String, '/small', 10)
+        self._big = bench.node.create_publisher(String, '/big', 2)
+        self._ended = threading.Event()
+        self.count = 0
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        small, big = String(data='x' * 20_000), String(data='x' * 1_000_000)
+        begin = time.monotonic()
+        while not self._ended.wait(max(0.0, begin + self.count / RATE - time.monotonic())):
+            self._small.publish(small)
+            self._big.publish(big)
+            self.count += 1
+
+    def rate(self, seconds: float) -> float:
+        """Return how often it publishes a second for a while."""
+        count, begin = self.count, time.monotonic()
+        assert not self._ended.wait(seconds)
+        return (self.count - count) / (time.monotonic() - begin)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(10)
+
+
+def memory(process: subprocess.Popen[str]) -> float:
+    """Return a process's memory in MB."""
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    return int(re.search(r'VmRSS:\s+(\d+)', status)[1]) / 1000
+
+
+@pytest.mark.parametrize('seconds', [8.0, pytest.param(30.0, marks=pytest.mark.soak)])
+def test_twenty_viewers_of_which_one_reads_nothing_leave_the_robot_alone(bench, seconds):
+    gate = bench.run('-m', 'fogros2.monitor.gate', '--to', bench.url.rpartition('/')[2],
+                     '--listen', '127.0.0.1:0')
+    port = bench.until(lambda: re.search(
+        r'listening on 127.0.0.1:(\d+)', ''.join(bench.lines)), 'a gate')[1]
+    publishing = Publishing(bench)
+    try:
+        crowd = bench.run_node('crowd.mjs', f'ws://127.0.0.1:{port}', '20', '/small', '/big')
+        assert crowd.stdout.readline() == 'ready\n'
+        # what is kept for the one that doesn't read is full by then
+        begun = publishing.rate(seconds / 2)
+        before = memory(bench.bridge), memory(gate)
+        rate = publishing.rate(seconds / 2)
+        after = memory(bench.bridge), memory(gate)
+        got = json.loads(crowd.communicate()[0])
+    finally:
+        publishing.close()
+    assert min(begun, rate) > 0.95 * RATE
+    assert max(after[0] - before[0], after[1] - before[1]) < 15
+    assert max(after) < 150
+    assert got[0] < min(got[1:])
+    # the other nineteen have all but what was on its way
+    assert min(got[1:]) > 0.9 * seconds * RATE
 
 
 def protobuf(data: bytes) -> dict[int, bytes]:
