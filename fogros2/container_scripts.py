@@ -19,8 +19,9 @@ apt-get update -q
 apt-get install -q -y --no-install-recommends podman
 podman ps -q >/dev/null 2>&1 || apt-get install -q -y --no-install-recommends crun
 """
-# Prints what the engine knows the image as. An image of ROS without the launch's middleware (none
-# of those that are published has Cyclone DDS) gets a layer with it, once.
+# Prints what the engine knows the image as. An image of ROS without the launch's middleware (those
+# that are published have Fast DDS alone) gets a layer with it, once; not by 'build', which takes
+# control groups.
 IMAGE = ENGINE + """\
 image=$1 rmw=$3
 there() { $as_root $engine image inspect "$1" >/dev/null 2>&1; }
@@ -35,18 +36,29 @@ if [ -n "$rmw" ]; then
     id=$($as_root $engine image inspect -f '{{.Id}}' "$image")
     id=${id#sha256:}
     with=localhost/fogros2-$rmw:${id%"${id#????????????}"}
+    distro=$($as_root $engine image inspect \\
+        -f '{{range .Config.Env}}{{println .}}{{end}}' "$image")
+    distro=$(echo "$distro" | sed -n 's/^ROS_DISTRO=//p')
+    ros=/opt/ros/${distro:=jazzy}
     if there "$with"; then
         image=$with
     else
-        distro=$($as_root $engine run --rm --network none --log-driver none \\
-            --entrypoint /bin/sh "$image" -c 'for each in /opt/ros/*; do
-                [ ! -d "$each" ] || [ -e "$each/lib/lib$0.so" ] || echo "${each##*/}"
-            done' "$rmw" | tail -n 1)
-        if [ -n "$distro" ]; then
-            package=ros-$distro-$(echo "$rmw" | tr _ -)
-            printf 'FROM %s\\nUSER 0\\nRUN apt-get update -q && apt-get install -q -y %s %s\\n' \\
-                "$image" --no-install-recommends "$package" |
-                $as_root $engine build -q --network host -t "$with" - >/dev/null
+        looking=$($as_root $engine create --network none "$image" true)
+        has() { $as_root $engine cp "$looking:$1" - >/dev/null 2>&1; }
+        if has "$ros/setup.sh" && ! has "$ros/lib/lib$rmw.so"; then
+            lacks=1
+        else
+            lacks=
+        fi
+        $as_root $engine rm -f "$looking" >/dev/null
+        if [ -n "$lacks" ]; then
+            adding=fogros2-adding-$$
+            trap '$as_root $engine rm -f $adding >/dev/null 2>&1' EXIT
+            $as_root $engine run --name $adding --user 0:0 --network host --log-driver none \\
+                -e DEBIAN_FRONTEND=noninteractive "$image" sh -ec \\
+                'apt-get update -q; apt-get install -q -y --no-install-recommends "$0"' \\
+                "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
+            $as_root $engine commit -q $adding "$with" >/dev/null
             image=$with
         fi
     fi

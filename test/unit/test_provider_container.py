@@ -244,6 +244,24 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
     assert 'AAAA' not in ' '.join(words)
 
 
+@pytest.mark.parametrize('spec', [
+    MachineSpec('m', 'container', containers=('docker run image',)),
+    MachineSpec('m', 'container', {'containers': True}), MachineSpec('m', 'container')])
+@pytest.mark.parametrize('apparmor', [True, False])
+@pytest.mark.parametrize('engine', ['podman', 'docker'])
+def test_containers_of_its_own_take_a_right_that_is_given_where_asked(
+        spec, apparmor, engine, tmp_path, monkeypatch):
+    monkeypatch.setattr(container_options, 'APPARMOR', tmp_path / ('' if apparmor else 'no'))
+    options = Options.parse(spec.options)
+    words = list(container_options.common_flags(Engine(engine), spec, REQUEST, options))
+    asked = container_options.runs_containers(spec, options)
+    assert asked == bool(spec.containers or spec.options)
+    assert ('SYS_ADMIN' in words, '/var/lib/containers' in words) == (asked, asked)
+    assert ('apparmor=unconfined' in words) == (asked and apparmor)
+    assert ('seccomp=unconfined' in words) == (asked and engine == 'docker')
+    assert '--privileged' not in words and not any('unmask' in word for word in words)
+
+
 def test_control_groups_decide_podman_s_flags():
     flags = container_engine.flags_for
     assert flags(unified=True, systemd=True, runc=True) == ()
@@ -350,6 +368,18 @@ def test_the_first_process_is_a_shell_script(tmp_path):
         script = tmp_path / 'entry.sh'
         script.write_text(text(entry_files(agent_config=config), 'opt/fogros2/entry.sh'))
         subprocess.run(['sh', '-n', str(script)], check=True)
+
+
+def test_an_engine_inside_is_told_what_it_can_not_do(tmp_path):
+    data = entry_files(nested=True)
+    settings = text(data, 'etc/containers/containers.conf.d/fogros2.conf')
+    assert 'cgroups = "disabled"' in settings and 'runtime = "crun"' in settings
+    script = tmp_path / 'entry.sh'
+    script.write_text(text(data, 'opt/fogros2/entry.sh'))
+    subprocess.run(['sh', '-n', str(script)], check=True)
+    assert '/proc/sys/net' in script.read_text()
+    assert 'containers' not in text(entry_files(), 'opt/fogros2/entry.sh')
+    assert not any(name.startswith('etc/containers') for name in content(entry_files()))
 
 
 def test_the_guard_gets_its_configuration_alone():

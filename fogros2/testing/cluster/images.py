@@ -171,7 +171,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     """
     packed = wheels.collect()
     its = None if packed.embedded else ros.prefix()
-    with _alone(cache):
+    with alone(cache):
         root = base(cache, say)
         system = cache / f'system-{_checksum(f"1 {root.name}")}'
         has = f'{packed.key} {its} {ros.key(its)}' if its else packed.key
@@ -190,7 +190,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
 
 
 @contextlib.contextmanager
-def _alone(cache: Path) -> Iterator[None]:
+def alone(cache: Path) -> Iterator[None]:
     """Let one run of tests at a time make images; what one that was killed left half made goes."""
     cache.mkdir(parents=True, exist_ok=True)
     with open(cache / 'images.lock', 'w') as lock:
