@@ -77,11 +77,11 @@ set -e
 [ ! -d /run/systemd/system ] || systemctl stop --quiet {TIMER} || :
 """ + """\
 if [ "$1" = remove ]; then
-    for each in /run/fogros2/fog*; do
+    for each in /run/fogros2-vpn/fog*; do
         [ -d "$each" ] || continue
         printf '{"name": "%s"}' "${each##*/}" | /usr/libexec/fogros2/vpn down
     done
-    rm -rf /run/fogros2
+    rm -rf /run/fogros2-vpn
 fi
 dpkg -L ros-jazzy-fogros2 | sed -n 's/\\.py$//p' | while read -r module; do
     folder=${module%/*}/__pycache__

@@ -26,7 +26,7 @@ GROUP = 'fogros2'
 #: What the helper answers to ``check`` if it means by a request what we do.
 PROTOCOL = '1'
 #: Where it keeps private keys, one folder for each interface; the user can't read them.
-KEYS = '/run/fogros2'
+KEYS = '/run/fogros2-vpn'
 
 
 def permitted() -> bool:

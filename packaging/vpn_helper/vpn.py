@@ -45,8 +45,9 @@ from fogros2.vpn.wireguard import WireGuard  # noqa: E402
 
 #: What both sides mean by the words and fields below.
 PROTOCOL = 1
-#: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are.
-RECORDS = Path('/run/fogros2')
+#: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are. Not
+#: where agents are: a robot may be a machine, too.
+RECORDS = Path('/run/fogros2-vpn')
 #: Networks that the administrator allows in place of the usual one: CIDR form, one a line.
 POOLS = Path('/etc/fogros2/pools')
 #: Interfaces that one user may have at a time.

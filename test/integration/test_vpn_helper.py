@@ -166,10 +166,10 @@ def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
         assert again.returncode == 0, again.stderr
         assert copy.ask('fogada', 'status', name=NAME).stdout.count(KEY) == 2
         # the private key is root's alone, and so is the folder of the records
-        assert copy.run('fogada', 'cat', f'/run/fogros2/{NAME}/key').returncode != 0
-        assert copy.run('fogada', 'touch', '/run/fogros2/x').returncode != 0
+        assert copy.run('fogada', 'cat', f'/run/fogros2-vpn/{NAME}/key').returncode != 0
+        assert copy.run('fogada', 'touch', '/run/fogros2-vpn/x').returncode != 0
         assert f'table inet {NAME}' in copy.run('root', 'nft', 'list', 'tables').stdout
-    assert copy.run('root', 'ls', '-A', '/run/fogros2').stdout == ''
+    assert copy.run('root', 'ls', '-A', '/run/fogros2-vpn').stdout == ''
     assert f'{NAME}' not in copy.run('root', 'nft', 'list', 'tables').stdout
     assert copy.ask('fogada', 'down', name=NAME).returncode == 0  # as often as one likes
 
@@ -238,8 +238,8 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
     made = copy.run('fogada', 'sh', '-c', script + 'keys', data=json.dumps(
         {'name': NAME, 'pid': copy.launch('fogada')}).encode())
     assert made.returncode == 0 and len(made.stdout) == 45, made
-    assert copy.run('root', 'stat', '-c%a', '/run/fogros2', f'/run/fogros2/{NAME}',
-                    f'/run/fogros2/{NAME}/key').stdout.split() == ['755', '700', '600']
+    assert copy.run('root', 'stat', '-c%a', '/run/fogros2-vpn', f'/run/fogros2-vpn/{NAME}',
+                    f'/run/fogros2-vpn/{NAME}/key').stdout.split() == ['755', '700', '600']
     said = copy.run('fogbob', 'sh', '-c', f'SUDO_UID=0 sudo -n {HELPER} down',
                     data=json.dumps({'name': NAME}).encode())
     assert 'another user' in said.stderr
@@ -249,7 +249,7 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
 def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     pid = copy.launch('fogada')
     assert copy.ask('fogada', 'keys', name='fog000010', pid=pid).returncode == 0
-    copy.run('root', 'sh', '-ec', 'cd /run/fogros2; for n in 1 2 3 4 5 6 7 8 9 a b c d e f; do '
+    copy.run('root', 'sh', '-ec', 'cd /run/fogros2-vpn; for n in 1 2 3 4 5 6 7 8 9 a b c d e f; do '
              'cp -r fog000010 fog00000$n; sed -i s/fog000010/fog00000$n/ fog00000$n/record; done',
              check=True)
     said = copy.ask('fogada', 'keys', name='fog000000', pid=pid)
@@ -261,7 +261,7 @@ def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     wait_until(lambda: copy.run('root', 'kill', '-0', str(pid)).returncode != 0, timeout=5.0,
                what='the launch to be gone')
     assert copy.run('root', HELPER, 'tidy').stdout.count('is gone') == 16
-    assert copy.run('root', 'ls', '-A', '/run/fogros2').stdout == ''
+    assert copy.run('root', 'ls', '-A', '/run/fogros2-vpn').stdout == ''
 
 
 def without_product(copy: Copy, user: str) -> bool:
@@ -294,7 +294,7 @@ def test_a_launch_takes_it_by_itself(copy: Copy) -> None:
     timer.start()
     try:
         name, key = json.loads(child.stdout.readline())
-        assert key == f'/run/fogros2/{name}/key' and name in copy.links()
+        assert key == f'/run/fogros2-vpn/{name}/key' and name in copy.links()
         rest, _ = child.communicate('\n')
         assert json.loads(rest) == []
         assert name not in copy.links()
@@ -334,7 +334,7 @@ def test_it_is_removed_without_a_trace(copy: Copy) -> None:
             interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820):
         copy.run('root', install, '--remove', check=True)
         assert NAME not in copy.links()
-        for path in (HELPER, str(Path(HELPER).parent), RULES, '/run/fogros2'):
+        for path in (HELPER, str(Path(HELPER).parent), RULES, '/run/fogros2-vpn'):
             assert copy.run('root', 'test', '-e', path).returncode == 1, path
         assert copy.run('root', 'getent', 'group', 'fogros2').returncode != 0
         copy.run('root', install, 'fogada', 'fogbob', check=True)

@@ -23,9 +23,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
 VPN = 'usr/libexec/fogros2/vpn'
-NODES = {'fogros2': {'bridge'},
-         'fogros2_examples': {'camera', 'image_processor', 'listener', 'talker'},
-         'image_transport_h264': {'decoder', 'encoder'}}
+NODES = {package: {path.name for path in (ROOT / package / 'scripts').iterdir() if path.is_file()}
+         for package in ('fogros2', 'fogros2_examples', 'image_transport_h264')}
 
 
 @pytest.fixture(scope='module')
