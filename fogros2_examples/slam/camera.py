@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot's side of the SLAM example: a camera that also measures what comes back.
+
+Publishes ``camera/image`` and ``camera/depth``, or ``camera/right/image``, each with its camera
+info, all stamped alike; takes ``pose`` and ``path``. A round trip is the time from the
+publication of a frame to the pose that bears its stamp. At the end it says how long those took
+and how good the poses were, and draws the trajectory.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+import json
+import math
+from pathlib import Path
+import time
+from typing import Optional
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
+import numpy
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from fogros2_examples.slam import messages, sources
+from fogros2_examples.slam.evaluation import Accuracy, accuracy
+from fogros2_examples.slam.geometry import Array
+from fogros2_examples.slam.sources import Shot
+from fogros2_examples.slam.tum import DatasetError
+
+#: Seconds for the last poses, and the path, to come back.
+PATIENCE = 5.0
+#: Poses of which an error can be told.
+FEWEST = 3
+
+
+class SlamCamera(Node):
+    """Shows frames, collects answers; ``ended`` when both are done."""
+
+    def __init__(self) -> None:
+        super().__init__('slam_camera')
+        self.folder = str(self.declare_parameter('dataset', '').value)
+        self.picture = str(self.declare_parameter('picture', '').value)
+        self.results = str(self.declare_parameter('results', '').value)
+        width = int(self.declare_parameter('width', 640).value)
+        height = int(self.declare_parameter('height', 480).value)
+        count = int(self.declare_parameter('frames', 200).value)
+        stereo = bool(self.declare_parameter('stereo', True).value)
+        seed = int(self.declare_parameter('seed', 1).value)
+        rate = float(self.declare_parameter('rate', 10.0).value)
+        self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
+        self.source = (sources.dataset(Path(self.folder), count) if self.folder
+                       else sources.synthetic(width, height, count, stereo, seed))
+        self.reader = ThreadPoolExecutor(1)
+        self.next: Future[Optional[Shot]] = self._read()
+        self.ended = False
+        #: By stamp: when a frame was sent, where it was taken, when and as what its pose came.
+        self.sent: dict[int, float] = {}
+        self.truth: dict[int, Array] = {}
+        self.answered: dict[int, float] = {}
+        self.live: dict[int, Array] = {}
+        self.final: dict[int, Array] = {}
+        self.deadline = math.inf
+        self.images = self.create_publisher(Image, 'camera/image', 2)
+        self.depths = self.create_publisher(Image, 'camera/depth', 2)
+        self.rights = self.create_publisher(Image, 'camera/right/image', 2)
+        self.infos = self.create_publisher(CameraInfo, 'camera/camera_info', 2)
+        self.right_infos = self.create_publisher(CameraInfo, 'camera/right/camera_info', 2)
+        self.create_subscription(PoseStamped, 'pose', self._take_pose, 10)
+        self.create_subscription(PathMessage, 'path', self._take_path, QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.create_timer(1 / rate, self._shoot)
+        self.get_logger().info(f'{self.source.count} frames of {self.source.camera.width}x'
+                               f'{self.source.camera.height} at {rate:g} Hz')
+
+    def _read(self) -> Future[Optional[Shot]]:
+        # beside the executor, which has answers to take the time of
+        return self.reader.submit(lambda: next(self.source.shots, None))
+
+    def _shoot(self) -> None:
+        """Publish a frame, once there is somebody to see it; after the last, wait for answers."""
+        if not self.sent and not self.images.get_subscription_count():
+            return
+        if self.deadline < math.inf:
+            done = self.sent.keys() <= self.final.keys()
+            self.ended = done or time.monotonic() > self.deadline
+            return
+        if not self.next.done():
+            return  # the disk is slower than the rate
+        shot = self.next.result()
+        if shot is None:
+            self.deadline = time.monotonic() + PATIENCE
+            return
+        self.next = self._read()
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.frame_id)
+        stamp = messages.nanoseconds(header.stamp)
+        if shot.truth is not None:
+            self.truth[stamp] = shot.truth
+        camera = self.source.camera
+        image = messages.image(header, shot.image, 'bgr8')
+        self.infos.publish(messages.camera_info(header, camera, False))
+        if shot.right is not None:
+            right = messages.image(header, shot.right, 'bgr8')
+            self.right_infos.publish(messages.camera_info(header, camera, True))
+            self.sent[stamp] = time.perf_counter()
+            self.images.publish(image)
+            self.rights.publish(right)
+        elif shot.depth is not None:
+            depth = messages.image(header, shot.depth, '16UC1')
+            self.sent[stamp] = time.perf_counter()
+            self.images.publish(image)
+            self.depths.publish(depth)
+
+    def _take_pose(self, pose: PoseStamped) -> None:
+        now = time.perf_counter()
+        stamp = messages.nanoseconds(pose.header.stamp)
+        if stamp in self.sent:
+            self.answered.setdefault(stamp, now)
+            self.live[stamp] = messages.matrix(pose.pose)
+
+    def _take_path(self, path: PathMessage) -> None:
+        poses = ((messages.nanoseconds(p.header.stamp), p.pose) for p in path.poses)
+        self.final = {stamp: messages.matrix(pose) for stamp, pose in poses if stamp in self.sent}
+
+    def close(self) -> None:
+        """End the reading thread, then the node."""
+        self.reader.shutdown(cancel_futures=True)
+        self.destroy_node()
+
+    def report(self) -> None:
+        """Say what was measured, write it to ``results``, draw ``picture``."""
+        log = self.get_logger()
+        trips = numpy.array([when - self.sent[stamp] for stamp, when in self.answered.items()])
+        log.info(f'{len(trips)} of {len(self.sent)} frames were answered')
+        if not len(trips):
+            log.error("no pose came back: see 'slam_state'")
+            return
+        middle, late = 1e3 * numpy.quantile(trips, [0.5, 0.95])
+        log.info(f'round trip: median {middle:.0f} ms, 95 % within {late:.0f} ms')
+        live, final = self._accuracy(self.live), self._accuracy(self.final)
+        for what, one in (('as they came', live), ('as the map has them in the end', final)):
+            if one is not None:
+                log.info(f'poses {what}: ATE {100 * one.ate:.2f} cm, RPE {100 * one.rpe:.2f} cm '
+                         'over a metre')
+        if self.results:
+            Path(self.results).write_text(json.dumps({
+                'sent': len(self.sent), 'round_trips': [float(trip) for trip in trips],
+                **{f'{name}_{error}': getattr(one, error)
+                   for name, one in (('live', live), ('final', final)) if one is not None
+                   for error in ('ate', 'rpe')}}))
+        if self.picture and final is not None:
+            from fogros2_examples.slam.picture import draw
+            draw(Path(self.picture), final, [1e3 * float(trip) for trip in trips],
+                 furnished=not self.folder)
+            log.info(f'the trajectory is drawn in {self.picture}')
+
+    def _accuracy(self, estimate: dict[int, Array]) -> Optional[Accuracy]:
+        both = sorted(estimate.keys() & self.truth.keys())
+        if len(both) < FEWEST:
+            return None
+        return accuracy([self.truth[s] for s in both], [estimate[s] for s in both])
+
+
+def main() -> None:
+    """Run until all frames are answered, or interrupted; a folder that is none ends it at once."""
+    rclpy.init()
+    try:
+        node = SlamCamera()
+    except DatasetError as error:
+        raise SystemExit(f'slam_camera: {error}') from error
+    try:
+        while not node.ended:
+            rclpy.spin_once(node, timeout_sec=0.1)
+    except DatasetError as error:
+        raise SystemExit(f'slam_camera: {error}') from error
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+    else:
+        node.report()
+    finally:
+        node.close()

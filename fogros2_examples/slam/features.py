@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The front end: ORB features (Rublee et al., ICCV 2011) spread over the image, and their depths.
+
+Depths come from a depth image or from the right image of a stereo pair. There each feature is
+followed along its row by pyramidal Lucas-Kanade, there and back: to a fraction of a pixel, and as
+well in images that a video codec has smoothed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from typing import Any
+
+import cv2
+import numpy
+from numpy.typing import NDArray
+
+from fogros2_examples.slam.geometry import Array, Camera
+
+Pixels = NDArray[numpy.uint8]
+#: Corners fainter than this are not looked for; fainter ones are where there are no others.
+FAINT, FAINTEST = 20, 7
+SCALE, LEVELS = 1.2, 8
+#: The image is divided into so many columns and rows, each of which gives its best features.
+CELLS = (10, 8)
+#: Depths that are used, metres; what is nearer or farther counts as unknown.
+NEAREST, FARTHEST = 0.2, 8.0
+#: A match in the right image may be this far from its row, pixels.
+OFF_ROW = 1.5
+#: Of the search there: what is compared, pixels, and how often the images are halved.
+WINDOW, COARSEST = (15, 15), 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Features:
+    """
+    What was found in an image; N features.
+
+    :param pixels: (N, 2).
+    :param octaves: (N,), of the pyramid; a feature's place is known to SCALE ** octave pixels.
+    :param descriptors: (N, 32).
+    :param depths: (N,), metres, nan where unknown.
+    """
+
+    pixels: Array
+    octaves: NDArray[numpy.int32]
+    descriptors: Pixels
+    depths: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def deep(self) -> NDArray[numpy.bool_]:
+        """Which have a depth."""
+        return numpy.isfinite(self.depths)
+
+    def chosen(self, which: NDArray[numpy.int64]) -> Features:
+        """Return some of them, by index."""
+        return Features(self.pixels[which], self.octaves[which], self.descriptors[which],
+                        self.depths[which])
+
+
+class Extractor:
+    """
+    Finds features.
+
+    :param count: the most that an image gives.
+    """
+
+    def __init__(self, camera: Camera, count: int = 1000) -> None:
+        self._camera = camera
+        self._count = count
+        self._strong, self._weak = (
+            cv2.ORB.create(nfeatures=2 * count, scaleFactor=SCALE, nlevels=LEVELS,
+                           fastThreshold=least) for least in (FAINT, FAINTEST))
+
+    def extract(self, grey: Pixels) -> Features:
+        """Return the features of an image (height, width), without depths."""
+        found = self._strong.detect(grey, None)
+        if len(found) < self._count // 2:
+            found = self._weak.detect(grey, None)
+        chosen, descriptors = self._strong.compute(grey, self._spread(found))
+        if descriptors is None:
+            return Features(numpy.empty((0, 2)), numpy.empty(0, numpy.int32),
+                            numpy.empty((0, 32), numpy.uint8), numpy.empty(0))
+        return Features(
+            numpy.array([point.pt for point in chosen]),
+            numpy.array([point.octave for point in chosen], numpy.int32),
+            numpy.asarray(descriptors, numpy.uint8), numpy.full(len(chosen), numpy.nan))
+
+    def _spread(self, found: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+        """Return the best of each cell, no more than the count."""
+        places = numpy.array([point.pt for point in found]).reshape(-1, 2)
+        strength = numpy.array([point.response for point in found])
+        columns, rows = CELLS
+        cell = (places[:, 0] * columns // self._camera.width
+                + columns * (places[:, 1] * rows // self._camera.height)).astype(int)
+        order = numpy.lexsort((-strength, cell))
+        begins = numpy.searchsorted(cell[order], cell[order])
+        rank = numpy.arange(len(order)) - begins
+        # first the best of each cell, then the second best of each, and so on
+        return [found[index] for index in order[numpy.argsort(rank, kind='stable')][:self._count]]
+
+
+def with_depth(features: Features, image: NDArray[numpy.generic], camera: Camera) -> Features:
+    """
+    Return features with depths from a depth image.
+
+    :param image: (height, width), metres as float, or millimetres as integer; 0 or nan is unknown.
+    """
+    columns, rows = numpy.round(features.pixels).astype(int).T
+    depths = image[numpy.clip(rows, 0, camera.height - 1),
+                   numpy.clip(columns, 0, camera.width - 1)].astype(float)
+    if numpy.issubdtype(image.dtype, numpy.integer):
+        depths /= 1000
+    return dataclasses.replace(features, depths=_plausible(depths))
+
+
+def with_pair(features: Features, left: Pixels, right: Pixels, camera: Camera) -> Features:
+    """Return features of the left image with depths from the right one."""
+    if not len(features):
+        return features
+    begin = features.pixels.astype(numpy.float32)
+    options: dict[str, Any] = {'winSize': WINDOW, 'criteria': (
+        cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)}
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        left, right, begin, begin.copy(), maxLevel=COARSEST, **options)
+    # the way back is known but for a pixel, if it is the right one
+    back, again, _ = cv2.calcOpticalFlowPyrLK(
+        right, left, there, begin.copy(), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        **options)
+    shift = begin - there
+    good = (found.ravel() > 0) & (again.ravel() > 0) & (numpy.abs(shift[:, 1]) < OFF_ROW) & (
+        numpy.abs(back - begin).max(1) < 0.7) & (shift[:, 0] > 0.1)
+    depths = numpy.full(len(features), numpy.nan)
+    depths[good] = camera.fx * camera.baseline / shift[good, 0]
+    return dataclasses.replace(features, depths=_plausible(depths))
+
+
+def _plausible(depths: Array) -> Array:
+    with numpy.errstate(invalid='ignore'):
+        return numpy.where((depths > NEAREST) & (depths < FARTHEST), depths, numpy.nan)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The pinhole camera and rigid transforms.
+
+A pose is an array (4, 4) that takes points of the camera to the world's; the camera looks along
+its z, its y points down (REP 103's optical frame). Lengths are metres, image points pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[numpy.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """
+    A rectified camera without distortion.
+
+    :param baseline: to the right camera, metres. With a depth image there is none: then it is
+        what weighs depth against pixels, as in ORB-SLAM2 (Mur-Artal and Tardos, 2017).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float = 0.08
+
+    @property
+    def matrix(self) -> Array:
+        """Return K, (3, 3)."""
+        return numpy.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def project(self, points: Array) -> Array:
+        """Return where points (N, 3) of the camera are in the image, (N, 2); z must be > 0."""
+        z = points[:, 2]
+        return numpy.stack([self.fx * points[:, 0] / z + self.cx,
+                            self.fy * points[:, 1] / z + self.cy], 1)
+
+    def lift(self, pixels: Array, depths: Array) -> Array:
+        """Return the points (N, 3) of the camera at pixels (N, 2) and depths (N,)."""
+        return numpy.stack([(pixels[:, 0] - self.cx) / self.fx * depths,
+                            (pixels[:, 1] - self.cy) / self.fy * depths, depths], 1)
+
+
+def inverse(pose: Array) -> Array:
+    """Return the pose the other way round."""
+    back = numpy.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
+
+
+def moved(pose: Array, points: Array) -> Array:
+    """Return points (N, 3) taken through a pose."""
+    return numpy.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def from_vectors(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Return the pose of a rotation vector and a translation."""
+    pose = numpy.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(numpy.asarray(rotation, float).reshape(3, 1))[0]
+    pose[:3, 3] = numpy.asarray(translation, float).ravel()
+    return pose
+
+
+def angle(pose: Array) -> float:
+    """Return by how much a pose turns, radians."""
+    cosine = (numpy.trace(pose[:3, :3]) - 1) / 2
+    return float(numpy.arccos(numpy.clip(cosine, -1.0, 1.0)))
+
+
+def quaternion(pose: Array) -> Array:
+    """Return a pose's rotation as (x, y, z, w), w >= 0 (Shepperd, 1978)."""
+    r = pose[:3, :3]
+    squares = numpy.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
+                           1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + numpy.trace(r)])
+    largest = int(numpy.argmax(squares))
+    q = numpy.empty(4)
+    q[largest] = squares[largest]
+    if largest == 3:
+        q[:3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q[j], q[k], q[3] = r[i, j] + r[j, i], r[i, k] + r[k, i], r[k, j] - r[j, k]
+    q /= numpy.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def from_quaternion(translation: Array, q: Array) -> Array:
+    """
+    Return the pose of a translation (3,) and a quaternion (x, y, z, w).
+
+    :raises ValueError: it has no direction.
+    """
+    length = float(numpy.linalg.norm(q))
+    if not 0.5 < length < 2.0:
+        raise ValueError(f'a quaternion of length {length:.3g}')
+    x, y, z, w = numpy.asarray(q, float) / length
+    pose = numpy.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    pose[:3, 3] = translation
+    return pose

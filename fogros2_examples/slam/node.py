@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Visual SLAM as a node.
+
+Takes ``camera/image`` with ``camera/camera_info``, and with the same stamps either
+``camera/depth`` or ``camera/right/image`` with its ``camera_info``: whichever comes. Publishes,
+under the stamp of the image, ``pose`` and ``/tf``; ``slam_state``; and, as the map grows,
+``path`` and the cloud ``map_points``. World and camera are called ``map`` and the image's frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Optional
+
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Path
+import numpy
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header, String
+from tf2_msgs.msg import TFMessage
+
+from fogros2_examples.slam import messages
+from fogros2_examples.slam.tracking import Slam, State, Tracked
+
+#: The newest alone: who is slow is to be late for one image, not for all.
+NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: Who comes late gets the last one.
+KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+#: Images that wait for their other half, and those without one after which that is said.
+WAITING, ALONE = 8, 30
+
+
+class SlamNode(Node):
+    """Parameters: ``features`` per image, ``map_frame``."""
+
+    def __init__(self) -> None:
+        super().__init__('slam')
+        self.features = int(self.declare_parameter('features', 1000).value)
+        self.map_frame = str(self.declare_parameter('map_frame', 'map').value)
+        self.slam: Optional[Slam] = None
+        self.infos: dict[str, CameraInfo] = {}
+        self.halves: dict[str, dict[int, Image]] = {'image': {}, 'depth': {}, 'right': {}}
+        self.alone = 0
+        self.said = ''
+        self.changed = False
+        self.frame = ''
+        self.poses = self.create_publisher(PoseStamped, 'pose', 10)
+        self.transforms = self.create_publisher(TFMessage, '/tf', 10)
+        self.states = self.create_publisher(String, 'slam_state', KEPT)
+        self.paths = self.create_publisher(Path, 'path', KEPT)
+        self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
+        for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
+            self.create_subscription(Image, f'camera/{topic}', self._taker(half), NEWEST)
+        for half, topic in (('image', 'camera_info'), ('right', 'right/camera_info')):
+            self.create_subscription(
+                CameraInfo, f'camera/{topic}', self._learner(half), NEWEST)
+        self.create_timer(1.0, self._show_map)
+        self._say(State.STARTING, 'no image yet')
+
+    def _learner(self, half: str) -> Any:
+        def learn(info: CameraInfo) -> None:
+            self.infos[half] = info
+        return learn
+
+    def _taker(self, half: str) -> Any:
+        def take(image: Image) -> None:
+            key = messages.nanoseconds(image.header.stamp)
+            self.halves[half][key] = image
+            other = 'right' if key in self.halves['right'] else 'depth'
+            if key in self.halves['image'] and key in self.halves[other]:
+                self._process(self.halves['image'][key], other, self.halves[other][key])
+                self.alone = 0
+                for waiting in self.halves.values():
+                    for old in [one for one in waiting if one <= key]:
+                        del waiting[old]
+            elif half == 'image':
+                self.alone += 1
+                if self.alone == ALONE:
+                    self._say(State.STARTING if self.slam is None else self.slam.state,
+                              'neither a depth image nor a right one has the stamps of the images')
+            while len(self.halves[half]) > WAITING:
+                del self.halves[half][min(self.halves[half])]
+        return take
+
+    def _process(self, image: Image, other: str, second: Image) -> None:
+        """Track a frame and tell where it was; then put it into the map."""
+        try:
+            slam = self._algorithm(other)
+            if slam is None:
+                return
+            grey = messages.grey(image)
+            tracked = slam.track(
+                messages.nanoseconds(image.header.stamp), grey,
+                **({'right': messages.grey(second)} if other == 'right'
+                   else {'depth': messages.depth(second)}))
+        except ValueError as error:
+            # what a driver sends is no reason to end: the next one may be better
+            self._say(State.LOST if self.slam else State.STARTING, str(error))
+            return
+        self._publish(image.header, tracked)
+        self.changed = slam.extend(tracked) or self.changed or tracked.pose is not None
+        self.frame = image.header.frame_id
+
+    def _algorithm(self, other: str) -> Optional[Slam]:
+        """Return the algorithm, made for this camera; None while that isn't known."""
+        if self.slam is None:
+            needed = other if other == 'right' else 'image'
+            if 'image' not in self.infos or needed not in self.infos:
+                self._say(State.STARTING, 'no camera info yet')
+                return None
+            self.slam = Slam(messages.camera(self.infos[needed], other == 'right'),
+                             self.features)
+        return self.slam
+
+    def _publish(self, header: Header, tracked: Tracked) -> None:
+        self._say(tracked.state, tracked.why)
+        if tracked.pose is None:
+            return
+        there = Header(stamp=header.stamp, frame_id=self.map_frame)
+        pose = messages.pose(tracked.pose)
+        self.poses.publish(PoseStamped(header=there, pose=pose))
+        transform = TransformStamped(header=there, child_frame_id=header.frame_id)
+        at, to = pose.position, transform.transform.translation
+        to.x, to.y, to.z = at.x, at.y, at.z
+        transform.transform.rotation = pose.orientation
+        self.transforms.publish(TFMessage(transforms=[transform]))
+
+    def _say(self, state: State, why: str) -> None:
+        """Publish and log the state, where it isn't the same as before."""
+        # numbers change with each image
+        said = f'{state.value}: {why}' if why else state.value
+        kind = ''.join(letter for letter in said if not letter.isdigit())
+        if kind != self.said:
+            self.said = kind
+            self.states.publish(String(data=said))
+            if why and self.infos:
+                self.get_logger().warning(said)
+            else:
+                self.get_logger().info(said)
+
+    def _show_map(self) -> None:
+        """Publish path and points where they changed; points to those alone who look at them."""
+        if not self.changed or self.slam is None:
+            return
+        self.changed = False
+        track = self.slam.trajectory()
+        if not track:
+            return
+        path = Path()
+        path.header.frame_id = self.map_frame
+        for stamp, pose in track:
+            stamped = PoseStamped(pose=messages.pose(pose))
+            stamped.header.frame_id = self.map_frame
+            stamped.header.stamp = messages.time(stamp)
+            path.poses.append(stamped)
+        path.header.stamp = path.poses[-1].header.stamp
+        self.paths.publish(path)
+        if self.clouds.get_subscription_count():
+            points = self.slam.map.points(self.slam.map.keyframes).places
+            self.clouds.publish(messages.cloud(path.header, numpy.asarray(points)))
+
+
+def main() -> None:
+    """Run until interrupted."""
+    rclpy.init()
+    try:
+        rclpy.spin(SlamNode())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way

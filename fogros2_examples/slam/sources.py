@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the camera of the SLAM example shows: a TUM RGB-D folder, or the synthetic room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+from pathlib import Path
+from typing import Optional
+
+import numpy
+from numpy.typing import NDArray
+
+from fogros2_examples.slam import room, tum
+from fogros2_examples.slam.geometry import Array, Camera
+
+Pixels = NDArray[numpy.uint8]
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """
+    What the camera took at once.
+
+    :param image: (height, width, 3) of BGR, the left one of a pair.
+    :param depth: (height, width), millimetres; or ``right``, as ``image``.
+    :param truth: where the camera was, if that is known.
+    """
+
+    image: Pixels
+    depth: Optional[NDArray[numpy.uint16]] = None
+    right: Optional[Pixels] = None
+    truth: Optional[Array] = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """
+    A camera and what it takes.
+
+    :param shots: to be read once.
+    :param count: how many there are.
+    """
+
+    camera: Camera
+    shots: Iterator[Shot]
+    count: int
+
+
+def synthetic(width: int, height: int, count: int, stereo: bool, seed: int = 1) -> Source:
+    """Return a walk through the synthetic room, rendered before this returns."""
+    camera = room.camera(width, height)
+    made = room.Room(camera, seed)
+    shots = []
+    for number, pose in enumerate(room.trajectory(count)):
+        if stereo:
+            left, right = made.pair(pose, number)
+            shots.append(Shot(left, right=right, truth=pose))
+        else:
+            image, depth = made.colour_and_depth(pose, number)
+            shots.append(Shot(image, depth=depth, truth=pose))
+    return Source(camera, iter(shots), count)
+
+
+def dataset(folder: Path, count: int = 0) -> Source:
+    """
+    Return a TUM RGB-D folder, its images read as they are asked for.
+
+    :param count: the most images, 0 for all.
+    :raises DatasetError: it is none; as ``shots`` do where an image is missing.
+    """
+    found = tum.read(folder)
+    pairs = found.pairs[:count or None]
+    found = dataclasses.replace(found, pairs=pairs)
+    times = numpy.array([time for time, _ in found.truth])
+
+    def shots() -> Iterator[Shot]:
+        for time, image, depth in found.frames():
+            truth = None
+            if len(times):
+                nearest = int(numpy.argmin(numpy.abs(times - time)))
+                if abs(times[nearest] - time) <= tum.APART:
+                    truth = found.truth[nearest][1]
+            yield Shot(image, depth=depth, truth=truth)
+
+    return Source(found.camera, shots(), len(pairs))

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Visual SLAM: where the camera is, frame by frame, and the map it makes on the way.
+
+``Slam.track`` answers as soon as the pose is known; ``Slam.extend`` then adds to the map what the
+frame shows, so that nobody waits for that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import Optional
+
+import numpy
+from numpy.typing import NDArray
+
+from fogros2_examples.slam import features as front
+from fogros2_examples.slam import matching
+from fogros2_examples.slam.features import Features
+from fogros2_examples.slam.geometry import Array, Camera, inverse, moved
+from fogros2_examples.slam.mapping import apart, Keyframe, Map
+from fogros2_examples.slam.pose import solve
+
+Pixels = NDArray[numpy.uint8]
+#: Points that have to agree on a pose.
+LEAST = 20
+#: Features with a depth that a keyframe has to have.
+DEEP = 60
+#: Pixels around where a point is expected, and around where it was when that fails.
+RADIUS, WIDE = 20.0, 80.0
+
+
+class State(enum.Enum):
+    """What is known of the camera's place."""
+
+    STARTING = 'starting'
+    TRACKING = 'tracking'
+    LOST = 'lost'
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracked:
+    """
+    What a frame told.
+
+    :param pose: (4, 4), None unless tracking.
+    :param why: what is in the way, unless tracking.
+    :param known: (N,), features that are points of the map.
+    """
+
+    stamp: int
+    state: State
+    features: Features
+    pose: Optional[Array] = None
+    why: str = ''
+    known: NDArray[numpy.bool_] = dataclasses.field(default_factory=lambda: numpy.empty(0, bool))
+
+
+class Slam:
+    """
+    Simultaneous localisation and mapping; the first frame's camera is the world's origin.
+
+    :param features: looked for in each image.
+    """
+
+    def __init__(self, camera: Camera, features: int = 1000) -> None:
+        self.camera = camera
+        self.map = Map(camera)
+        self.state = State.STARTING
+        self._extractor = front.Extractor(camera, features)
+        self._reference: Optional[Keyframe] = None
+        #: Relative to the reference, so that it moves with the map.
+        self._last = numpy.eye(4)
+        self._track: list[tuple[int, Keyframe, Array]] = []
+        self._motion = numpy.eye(4)
+
+    def track(self, stamp: int, grey: Pixels, *, depth: Optional[NDArray[numpy.generic]] = None,
+              right: Optional[Pixels] = None) -> Tracked:
+        """
+        Return where the camera was when it took a frame.
+
+        :param stamp: nanoseconds.
+        :param grey: (height, width), of the left camera where there are two.
+        :param depth: of the same size, metres as float or millimetres as integer.
+        :param right: the right image, in place of depth.
+        :raises ValueError: images of other sizes than the camera's.
+        """
+        size = (self.camera.height, self.camera.width)
+        for image in (grey, depth, right):
+            if image is not None and image.shape != size:
+                raise ValueError(f'an image of {image.shape[1]}x{image.shape[0]} from a camera '
+                                 f'of {size[1]}x{size[0]}')
+        found = self._extractor.extract(grey)
+        if depth is not None:
+            found = front.with_depth(found, depth, self.camera)
+        elif right is not None:
+            found = front.with_pair(found, grey, right, self.camera)
+        if self._reference is None:
+            return self._start(stamp, found)
+        tracked = self._follow(stamp, found) if self.state is State.TRACKING else None
+        tracked = tracked or self._find(stamp, found)
+        if tracked is None:
+            self.state, self._motion = State.LOST, numpy.eye(4)
+            return Tracked(stamp, State.LOST, found, why=(
+                f'{len(found)} features in the image' if len(found) < 2 * LEAST
+                else 'nothing known is in view'))
+        self._track.append((stamp, self._reference, self._last))
+        return tracked
+
+    def trajectory(self) -> list[tuple[int, Array]]:
+        """Return stamps and poses of all frames tracked, as the map has them by now."""
+        return [(stamp, keyframe.pose @ pose) for stamp, keyframe, pose in self._track]
+
+    def extend(self, tracked: Tracked) -> bool:
+        """Make a keyframe of a frame that shows new things; return whether the map changed."""
+        reference = self._reference
+        if tracked.pose is None or reference is None or tracked.features.deep.sum() < DEEP or (
+                min(apart(k.pose, tracked.pose) for k in self.map.around(reference)) < 1
+                and tracked.known.sum() > 0.25 * len(tracked.known)):
+            return False
+        keyframe = self.map.add(tracked.stamp, tracked.pose, tracked.features, tracked.known,
+                                reference)
+        self.map.recognise(keyframe)
+        self._reference, self._last = keyframe, numpy.eye(4)
+        return True
+
+    def _start(self, stamp: int, found: Features) -> Tracked:
+        deep = int(found.deep.sum())
+        if deep < DEEP:
+            return Tracked(stamp, State.STARTING, found, why=(
+                f'{len(found)} features in the image' if len(found) < DEEP
+                else f'{deep} of {len(found)} features have a depth'))
+        none = numpy.zeros(len(found), bool)
+        self._reference = self.map.add(stamp, numpy.eye(4), found, none)
+        self.state = State.TRACKING
+        self._track.append((stamp, self._reference, self._last))
+        # it is a keyframe already
+        return Tracked(stamp, State.TRACKING, found, numpy.eye(4), known=~none)
+
+    def _follow(self, stamp: int, found: Features) -> Optional[Tracked]:
+        """Look for the points around the last place, where they should be now."""
+        assert self._reference is not None
+        last = self._reference.pose @ self._last
+        for guess, radius in ((last @ self._motion, RADIUS), (last, WIDE)):
+            tracked = self._at(stamp, found, guess, radius)
+            if tracked is not None and tracked.pose is not None:
+                self._motion = inverse(last) @ tracked.pose
+                return tracked
+        return None
+
+    def _find(self, stamp: int, found: Features) -> Optional[Tracked]:
+        """Look for the place among all that were ever seen."""
+        for place in self.map.similar(found, set(), 3):
+            between = self.map.seen_from(place, found)
+            if between is not None:
+                self._reference = place
+                self._motion = numpy.eye(4)
+                return self._at(stamp, found, place.pose @ between, RADIUS)
+        return None
+
+    def _at(self, stamp: int, found: Features, guess: Array, radius: float) -> Optional[Tracked]:
+        """Return where the camera is, given where it should be nearly."""
+        assert self._reference is not None
+        around = self.map.around(self._reference)
+        points = self.map.points(around)
+        seen = moved(inverse(guess), points.places)
+        ahead = numpy.flatnonzero(seen[:, 2] > front.NEAREST)
+        pixels = self.camera.project(seen[ahead])
+        inside = ((pixels > -radius) & (
+            pixels < numpy.array([self.camera.width, self.camera.height]) + radius)).all(1)
+        ahead, pixels = ahead[inside], pixels[inside]
+        one, two = matching.match_near(points.descriptors[ahead], pixels, found.descriptors,
+                                       found.pixels, radius)
+        solution = solve(self.camera, points.places[ahead[one]], found.chosen(two), LEAST, guess)
+        if solution is None:
+            return None
+        known = numpy.zeros(len(found), bool)
+        known[two[solution.inliers]] = True
+        self._reference = min(around, key=lambda k: apart(k.pose, solution.pose))
+        self._last = inverse(self._reference.pose) @ solution.pose
+        self.state = State.TRACKING
+        return Tracked(stamp, State.TRACKING, found, solution.pose, known=known)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Folders in the TUM RGB-D format (Sturm et al., IROS 2012).
+
+``rgb.txt`` and ``depth.txt`` list images by time, ``groundtruth.txt`` poses as time, place and
+quaternion; depth is PNG of 16 bits, 5000 a metre. What the format doesn't have is the camera: it
+is TUM's own where the folder's name says which (freiburg1 to 3), else what ``camera.txt`` says
+(``fx fy cx cy``), else a Kinect's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy
+from numpy.typing import NDArray
+
+from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
+
+Pixels = NDArray[numpy.uint8]
+#: Units of depth in a metre.
+SCALE = 5000
+#: Seconds between an image and the depth, or the pose, that belong to it.
+APART = 0.02
+_CAMERAS = {'freiburg1': (517.3, 516.5, 318.6, 255.3), 'freiburg2': (520.9, 521.0, 325.1, 249.7),
+            'freiburg3': (535.4, 539.2, 320.1, 247.6)}
+_KINECT = (525.0, 525.0, 319.5, 239.5)
+
+
+class DatasetError(ValueError):
+    """A folder isn't what it should be; says where."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """
+    A line of one of the lists.
+
+    :param where: file and line, for messages.
+    """
+
+    time: float
+    rest: tuple[str, ...]
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """
+    What a folder has.
+
+    :param pairs: image and depth, by time.
+    :param truth: poses by time, empty where there are none.
+    """
+
+    folder: Path
+    camera: Camera
+    pairs: list[tuple[Line, Line]]
+    truth: list[tuple[float, Array]]
+
+    def frames(self) -> Iterator[tuple[float, Pixels, NDArray[numpy.uint16]]]:
+        """
+        Yield time, image (height, width, 3) of BGR, and depth (height, width), millimetres.
+
+        :raises DatasetError: a file is missing, or no image of this size.
+        """
+        for image, deep in self.pairs:
+            colours = _image(self.folder, image, cv2.IMREAD_COLOR)
+            depth = _image(self.folder, deep, cv2.IMREAD_UNCHANGED)
+            if depth.dtype != numpy.uint16 or depth.shape != colours.shape[:2]:
+                raise DatasetError(f'{deep.where}: {deep.rest[0]} is no depth of 16 bits of the '
+                                   f'size of {image.rest[0]}')
+            size = (self.camera.height, self.camera.width)
+            if depth.shape != size:
+                raise DatasetError(f'{image.where}: {image.rest[0]} is not of the size of the '
+                                   'first image')
+            yield image.time, colours, (depth.astype(int) * 1000 // SCALE).astype(numpy.uint16)
+
+
+def read(folder: Path) -> Dataset:
+    """
+    Return what is in a folder; images are read later.
+
+    :raises DatasetError: it is none of this format.
+    """
+    images, depths = (_lines(folder / name, 1) for name in ('rgb.txt', 'depth.txt'))
+    pairs = _associated(images, depths)
+    if not pairs:
+        raise DatasetError(f'{folder}: no image of rgb.txt has a depth image within '
+                           f'{APART} seconds in depth.txt')
+    truth = []
+    if (folder / 'groundtruth.txt').exists():
+        for line in _lines(folder / 'groundtruth.txt', 7):
+            values = numpy.array([_number(word, line.where) for word in line.rest[:7]])
+            try:
+                truth.append((line.time, from_quaternion(values[:3], values[3:])))
+            except ValueError as error:
+                raise DatasetError(f'{line.where}: {error}') from error
+    first = _image(folder, pairs[0][0], cv2.IMREAD_COLOR)
+    return Dataset(folder, _camera(folder, first.shape[1], first.shape[0]), pairs, truth)
+
+
+def write(folder: Path, camera: Camera,
+          frames: Iterable[tuple[float, Pixels, NDArray[numpy.uint16]]],
+          truth: Iterable[tuple[float, Array]]) -> None:
+    """Write a folder; frames as ``Dataset.frames`` yields them."""
+    for name in ('rgb', 'depth'):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    times = []
+    for time, image, depth in frames:
+        cv2.imwrite(str(folder / f'rgb/{time:.6f}.png'), image)
+        cv2.imwrite(str(folder / f'depth/{time:.6f}.png'),
+                    (depth.astype(int) * (SCALE // 1000)).clip(0, 65535).astype(numpy.uint16))
+        times.append(f'{time:.6f}')
+    for name in ('rgb', 'depth'):
+        (folder / f'{name}.txt').write_text(''.join(f'{t} {name}/{t}.png\n' for t in times))
+    (folder / 'groundtruth.txt').write_text('# time tx ty tz qx qy qz qw\n' + ''.join(
+        ' '.join([f'{time:.6f}', *(f'{v:.9f}' for v in (*pose[:3, 3], *quaternion(pose)))]) + '\n'
+        for time, pose in truth))
+    (folder / 'camera.txt').write_text(f'{camera.fx} {camera.fy} {camera.cx} {camera.cy}\n')
+
+
+def _lines(path: Path, words: int) -> list[Line]:
+    """Return the lines of a list, in the order of their times."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f'{path}: {getattr(error, "strerror", None) or error}') from error
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        parts = line.replace(',', ' ').split()
+        if not parts or parts[0].startswith('#'):
+            continue
+        where = f'{path}:{number}'
+        if len(parts) < 1 + words:
+            raise DatasetError(f'{where}: {len(parts)} words where {1 + words} belong')
+        found.append(Line(_number(parts[0], where), tuple(parts[1:]), where))
+    if not found:
+        raise DatasetError(f'{path}: nothing in it')
+    return sorted(found, key=lambda line: line.time)
+
+
+def _number(word: str, where: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        raise DatasetError(f"{where}: '{word}' is no number") from None
+    if not numpy.isfinite(value):
+        raise DatasetError(f"{where}: '{word}' is no number")
+    return value
+
+
+def _associated(images: list[Line], depths: list[Line]) -> list[tuple[Line, Line]]:
+    """Return each image with the depth nearest in time, each depth once."""
+    times = numpy.array([line.time for line in depths])
+    pairs: list[tuple[Line, Line]] = []
+    taken = -1
+    for image in images:
+        nearest = int(numpy.argmin(numpy.abs(times - image.time)))
+        if abs(times[nearest] - image.time) <= APART and nearest > taken:
+            pairs.append((image, depths[nearest]))
+            taken = nearest
+    return pairs
+
+
+def _image(folder: Path, line: Line, how: int) -> NDArray[Any]:
+    image = cv2.imread(str(folder / line.rest[0]), how)
+    if image is None:
+        raise DatasetError(f'{line.where}: {line.rest[0]} is missing, or no image')
+    return numpy.asarray(image)
+
+
+def _camera(folder: Path, width: int, height: int) -> Camera:
+    values = next((c for name, c in _CAMERAS.items() if name in folder.resolve().name), _KINECT)
+    path = folder / 'camera.txt'
+    if path.exists():
+        words = path.read_text().split()
+        if len(words) != 4:
+            raise DatasetError(f'{path}:1: {len(words)} words where fx, fy, cx and cy belong')
+        fx, fy, cx, cy = (_number(word, f'{path}:1') for word in words)
+        values = (fx, fy, cx, cy)
+    return Camera(width, height, *values)
