@@ -44,7 +44,8 @@ HANDSHAKE = 10.0
 CONNECTIONS = 100
 #: Addresses and causes remembered as logged.
 LOGGED = 1000
-_BLOCK = 65536
+#: Bytes handed on at once at the most: an image takes few turns.
+_BLOCK = 1 << 18
 
 Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
 
@@ -147,7 +148,7 @@ class Gate:
         """Hand a request on to whom it is for, or answer it."""
         if request.websocket:
             try:
-                inner = await asyncio.open_connection(*self._to)
+                inner = await asyncio.open_connection(*self._to, limit=_BLOCK)
             except OSError as error:
                 raise Refused(
                     '502 Bad Gateway', f'the bridge does not answer: {error}') from error
