@@ -108,8 +108,15 @@ class Browser:
                 deviceScaleFactor=1, mobile=False)
 
     def open(self, url: str) -> None:
-        """Go to an address."""
+        """Go to an address, and wait until what it leads to is there."""
         self.do('Page.navigate', url=url)
+        self.until('document.readyState === "complete"')
+
+    def reload(self) -> None:
+        """Load the page anew."""
+        self.ask('window.before = true')
+        self.do('Page.reload')
+        self.until('!window.before && document.readyState === "complete"')
 
     def ask(self, expression: str) -> Any:
         """Return the value of an expression in the page, awaited where it is a promise."""

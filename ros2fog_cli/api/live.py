@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 import dataclasses
 import json
+import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TextIO
 
 from fogros2 import journal
 from fogros2.errors import FogError, MachineNotFound
@@ -51,9 +52,30 @@ class _Launch:
 
     pid: int = 0
     alive: bool = True
-    stamp: tuple[int, int] = (0, 0)
+    #: Open, as it goes with the launch's folder, and its last lines with it.
+    file: Optional[TextIO] = None
+    size: int = 0
     steps: tuple[journal.Step, ...] = ()
     ended: float = 0.0
+
+    def read(self, folder: Path) -> None:
+        """Read what the journal has by now."""
+        try:
+            if self.file is None:
+                self.file = open(folder / journal.FILE, errors='replace')
+            size = os.fstat(self.file.fileno()).st_size
+            if size != self.size:
+                self.size = size
+                self.file.seek(0)
+                self.steps = tuple(journal.steps(self.file.read().splitlines()))
+        except OSError:
+            return  # there is none yet
+
+    def close(self) -> None:
+        """Read no more."""
+        if self.file is not None:
+            self.file.close()
+            self.file = None
 
 
 class Live:
@@ -106,6 +128,8 @@ class Live:
         for follower in followers:
             follower.join(2.0)
         self._threads[0].join(5.0)
+        for launch in self._launches.values():
+            launch.close()
 
     # -- what others ask ------------------------------------------------------------------------
 
@@ -253,11 +277,12 @@ class Live:
         for name, path in there.items():
             launch = self._launches.setdefault(name, _Launch())
             launch.pid, launch.alive = _process(path)
-            stamp = _stamp(path / journal.FILE)
-            if stamp != launch.stamp:
-                launch.stamp, launch.steps = stamp, tuple(journal.read(path))
+            launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in there:
+                if launch.file is not None:
+                    launch.read(folder / name)
+                    launch.close()
                 launch.alive = False
                 launch.ended = launch.ended or now
                 if now - launch.ended > KEPT:
@@ -371,14 +396,6 @@ def _phase(shown: _Shown) -> str:
     if record is not None and record.launch_alive:
         return phase(shown.steps) if shown.steps or not record.agent else 'running'
     return shown.entry.state.partition(' ')[0]
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_mtime_ns, status.st_size
 
 
 def _process(folder: Path) -> tuple[int, bool]:

@@ -35,7 +35,6 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 
-from fogros2.monitor.dashboard import shots
 from fogros2.monitor.dashboard.meter import Meter
 from fogros2.monitor.dashboard.ways import (
     Crossing,
@@ -48,8 +47,6 @@ from fogros2.monitor.dashboard.ways import (
     Topic,
 )
 from fogros2.monitor.definitions import message_class
-from image_transport_h264.message import picture
-from image_transport_h264.picture import BadPicture
 
 #: Seconds between two looks at the graph, from one picture of a topic to the next, and after
 #: which one that doesn't come is asked for anew.
@@ -123,6 +120,10 @@ class _Camera:
     def _take(self, data: bytes) -> None:
         if not self._due:
             return
+        # where images are streamed there is what this takes
+        from fogros2.monitor.dashboard import shots
+        from image_transport_h264.message import picture
+        from image_transport_h264.picture import BadPicture
         self._due, self._asked = False, time.monotonic()
         if not self._stay:
             self.close()

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dashboard in a browser, from before a launch begins until its machine is deleted there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import re
+import secrets
+import signal
+import subprocess
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed')
+pytest.importorskip('cv2', reason='the extra "video" is not installed')
+
+from fogros2.testing.browser import Browser, program
+from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.timeout(180),
+    pytest.mark.skipif(program() is None, reason='needs Chromium'),
+]
+#: Where the last run's screenshots are.
+PICTURES = Path(__file__).parents[2] / '.cache/screenshots'
+MARKUP = '</pre><img src=x onerror="document.title=1"><script>document.title=1</script>'
+LAUNCH_FILE = """
+from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
+from launch.actions import ExecuteProcess
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name={name!r}, on_exit='keep')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='image_processor',
+                  stream_topics=[('/camera', 'h264'),
+                                 StreamTopic('/annotated', 'h264', 'to_robot')]),
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
+        CloudGroup(machine=machine, actions=[ExecuteProcess(cmd=['echo', {markup!r}])]),
+        Node(package='fogros2_examples', executable='camera'),
+        Node(package='fogros2_examples', executable='listener'),
+    ])
+"""
+
+
+class Dashboard:
+    """``ros2 fog dashboard`` as a process of a test's own."""
+
+    def __init__(self) -> None:
+        self.child = subprocess.Popen(
+            ['ros2', 'fog', 'dashboard', '--no-browser'], stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, text=True, start_new_session=True)
+        assert self.child.stdout is not None
+        self.url = self.child.stdout.readline().split()[4]
+
+    def seconds(self) -> float:
+        """Return how much of a processor it has had, with what it started and what has ended."""
+        times = Path(f'/proc/{self.child.pid}/stat').read_text().rpartition(')')[2].split()[11:15]
+        return sum(map(int, times)) / os.sysconf('SC_CLK_TCK')
+
+    def close(self) -> int:
+        """Press Ctrl-C, and return its exit status."""
+        self.child.send_signal(signal.SIGINT)
+        try:
+            code = self.child.wait(20)
+        finally:
+            self.child.kill()
+        assert self.child.stdout is not None
+        self.child.stdout.close()
+        return code
+
+
+@pytest.fixture
+def dashboard(nothing_left: None) -> Iterator[Dashboard]:
+    made = Dashboard()
+    try:
+        yield made
+    finally:
+        if made.child.poll() is None:
+            made.close()
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    made = Browser(width=1400, height=1180)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def article(name: str) -> str:
+    return f'document.querySelector(\'article[data-key="{name}"]\')'
+
+
+def test_nothing_goes_on(dashboard: Dashboard, browser: Browser) -> None:
+    browser.open(dashboard.url)
+    browser.until('document.getElementById("link").textContent === "live"')
+    paint = browser.until(
+        'performance.getEntriesByName("first-contentful-paint")[0]?.startTime')
+    assert paint < 1000  # ms
+    # neither in the address nor in what was asked for
+    token = dashboard.url.partition('#')[2]
+    assert browser.ask('location.href') == dashboard.url.partition('#')[0]
+    assert len(token) > 20 and not any(token in url for url in browser.requested[1:])
+    browser.reload()
+    browser.until('document.getElementById("link").textContent === "live"')
+
+    def idle() -> bool:
+        begin, before = time.monotonic(), dashboard.seconds()
+        browser.ask('new Promise(done => setTimeout(done, 3000))')
+        return (dashboard.seconds() - before) / (time.monotonic() - begin) < 0.02
+
+    # other runs on this computer may have machines that come and go
+    assert idle() or idle() or idle()
+
+    browser.open(dashboard.url.partition('#')[0] + '#wrong')
+    browser.reload()
+    browser.until('document.getElementById("link").textContent === "no access"')
+    assert 'token is missing or wrong' in browser.text()
+    assert dashboard.close() == 0
+    assert all(url.startswith(('http://127.0.0.1:', 'data:')) for url in browser.requested)
+
+
+def test_a_launch_from_its_begin_to_its_end(
+    engine: str, dashboard: Dashboard, browser: Browser, tmp_path: Path,
+    watched: Callable[[str], Path],
+) -> None:
+    name = f'dash-{secrets.token_hex(2)}'
+    watching = watched(name)
+    file = tmp_path / 'dash.launch.py'
+    file.write_text(LAUNCH_FILE.format(name=name, markup=MARKUP))
+    browser.open(dashboard.url)
+    browser.until('document.getElementById("link").textContent === "live"')
+    browser.ask("""
+        window.seen = new Set();
+        new MutationObserver(() => document.querySelectorAll('article').forEach(
+            a => { seen.add(a.dataset.phase);
+                   a.querySelectorAll('.steps > li').forEach(s => seen.add(s.className)); })
+        ).observe(document.body, {subtree: true, childList: true, attributes: true});""")
+    with launching() as launch:
+        launched = launch(str(file))
+        browser.until(f'{article(name)} && {article(name)}.dataset.phase === "running"',
+                      timeout=60)
+        assert {'coming', 'running', 'done'} <= set(browser.ask('[...seen]'))
+        steps = browser.ask(
+            f'[...{article(name)}.querySelectorAll(".steps .label")].map(e => e.innerText)')
+        assert {'machine', 'connect', 'VPN', 'agent'} <= {
+            step.split('\n')[0].split(' ')[0] for step in steps}
+
+        # nodes, the VPN, what crosses it
+        browser.until(f'/talker-\\d+\\s+running/.test({article(name)}.innerText)')
+        browser.until(f'/round trip\\s+[0-9.]+ ms/.test({article(name)}.innerText)')
+        browser.until('/\\/chatter\\s+std_msgs.*\\s+' + name
+                      + ' → robot\\s+[0-9.]+\\s+[0-9]+ B\\/s/'
+                      '.test(document.getElementById("topics").innerText)', timeout=30)
+        pictures_move(browser)
+        screen = in_a_terminal('ros2', 'fog', 'status', name, '--watch')
+        assert screen.startswith('\x1b[?1049h') and screen.rstrip().endswith('\x1b[?1049l')
+        assert 'handshake' in screen and 'round trip' in screen and '\x1b[32m' in screen
+
+        # what a node prints is text
+        browser.until(f'{article(name)}.querySelector(".log").textContent.includes('
+                      '"<img src=x onerror=")')
+        assert browser.ask('document.querySelector("img[src=x]") === null')
+        assert browser.ask('document.title') == 'FogROS2'
+
+        for dark in (False, True):
+            browser.prefer(dark=dark)
+            browser.screenshot(PICTURES / f"dashboard-{'dark' if dark else 'light'}.png")
+        browser.prefer(dark=False)
+        browser.size(420, 900)
+        assert browser.ask('document.documentElement.scrollWidth') <= 420
+        browser.size(1400, 1180)
+
+        launched.interrupt()
+        assert launched.ended() == 0, launched.text
+    browser.until(f'/keep\\s+done/.test({article(name)}.innerText)')
+    browser.until('document.querySelector(".launch").innerText.includes("launch over")')
+    delete_by_keyboard(browser, name)
+    browser.until(f'{article(name)}.dataset.phase === "gone"', timeout=30)
+    assert name not in ros2('fog', 'list').stdout
+    wait_until(lambda: f'{name}: gone' in watching.read_text(), timeout=20.0, what='its end')
+    lines = watching.read_text()
+    assert f'{name}: no such machine yet' in lines and f'{name}: coming up; machine ' in lines
+    assert re.search('talker-[0-9] running', lines) and '\x1b' not in lines
+    assert browser.complaints == []
+    assert all(url.startswith(('http://127.0.0.1:', 'blob:http://127.0.0.1:', 'data:'))
+               for url in browser.requested)
+    assert dashboard.close() == 0
+
+
+def pictures_move(browser: Browser) -> None:
+    """See that both streams have pictures that change, of the camera's size."""
+    seen: dict[str, set[Any]] = {'/camera': set(), '/annotated': set()}
+
+    def moved() -> bool:
+        for topic, shots in seen.items():
+            at = f'document.querySelector(\'figure[data-topic="{topic}"] img\')'
+            shot = browser.ask(f'{at} && {at}.complete && {at}.naturalWidth === 640 && {at}.src')
+            if shot:
+                shots.add(shot)
+        return all(len(shots) >= 3 for shots in seen.values())
+
+    wait_until(moved, timeout=30.0, what='pictures that move', longest=0.2)
+    browser.until('[...document.querySelectorAll("figure .rates b")].every('
+                  'e => Number(e.textContent) > 1)', timeout=30)
+
+
+def delete_by_keyboard(browser: Browser, name: str) -> None:
+    """Press the button, think better of it, and press it again."""
+    button = f'{article(name)}.querySelector("button.delete")'
+    browser.ask(f'{button}.focus()')
+    browser.press('Enter', 13)
+    browser.until('document.getElementById("ask").open')
+    assert browser.ask('document.activeElement.textContent') == 'Keep it'
+    said = browser.ask('document.getElementById("ask").innerText')
+    assert name in said and 'everything made for it' in said
+    browser.press('Escape', 27)
+    browser.until('!document.getElementById("ask").open')
+    assert browser.ask(f'{article(name)}.dataset.phase') == 'running'
+    browser.ask(f'{button}.focus()')
+    browser.press('Enter', 13)
+    browser.until('document.getElementById("ask").open')
+    browser.press('Tab', 9)
+    assert browser.ask('document.activeElement.id') == 'ask-yes'
+    browser.press('Enter', 13)
+
+
+@pytest.fixture
+def watched(tmp_path: Path, nothing_left: None) -> Iterator[Callable[[str], Path]]:
+    """Return what watches a machine into a file, from before it is there until the test's end."""
+    watching: list[subprocess.Popen[bytes]] = []
+
+    def watch(name: str) -> Path:
+        with open(tmp_path / 'watched', 'wb') as said:
+            watching.append(subprocess.Popen(
+                ['ros2', 'fog', 'status', name, '--watch', '--interval', '0.2'],
+                stdin=subprocess.DEVNULL, stdout=said, start_new_session=True))
+        return tmp_path / 'watched'
+
+    yield watch
+    for child in watching:
+        child.send_signal(signal.SIGINT)
+        try:
+            assert child.wait(20) == 0
+        finally:
+            child.kill()
+
+
+def in_a_terminal(*words: str) -> str:
+    """Return what a command draws until it is told of nodes and the VPN, and gets a Ctrl-C."""
+    import fcntl
+    import pty
+    import select
+    import struct
+    import termios
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execvpe(words[0], words, {**os.environ, 'TERM': 'xterm'})
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 40, 100, 0, 0))
+    said, pressed = b'', False
+    deadline = time.monotonic() + 40.0
+    while time.monotonic() < deadline:
+        if select.select([terminal], [], [], 0.2)[0]:
+            try:
+                more = os.read(terminal, 65536)
+            except OSError:
+                break  # it has ended
+            if not more:
+                break
+            said += more
+        if b'talker' in said and b'handshake' in said and not pressed:
+            os.write(terminal, b'\x03')
+            pressed = True
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
+    return said.decode()

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live state, over a store and a provider in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import dataclasses
+from decimal import Decimal
+import json
+import os
+import time
+from typing import Any
+
+import pytest
+
+from fogros2.errors import MachineNotFound, NameTaken, ProviderError
+from fogros2.journal import Journal
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.report import silent, StepDone, StepStarted
+from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.waiting import wait_until
+from ros2fog_cli.api.board import Board
+from ros2fog_cli.api.live import Live
+
+
+class Memory(MemoryProvider):
+    """A provider with its machines in a dictionary."""
+
+    name = 'memory'
+    machines: dict[str, Machine] = {}
+
+    def destroy(self, machine_id: str) -> None:
+        if machine_id == 'id-stuck':
+            raise ProviderError('the cloud said no', 'ask again')
+        super().destroy(machine_id)
+
+
+@pytest.fixture(autouse=True)
+def provider(monkeypatch: pytest.MonkeyPatch) -> None:
+    Memory.machines = {}
+    instead(monkeypatch, 'fogros2.provider', {'memory': Memory})
+
+
+@pytest.fixture
+def live() -> Iterator[Live]:
+    made = Live()
+    made.start()
+    yield made
+    made.close()
+
+
+def machine(name: str, **changes: Any) -> Record:
+    Memory.machines[f'id-{name}'] = Machine(
+        f'id-{name}', name, 'memory', MachineState.RUNNING, time.time() - 600,
+        Endpoint('ssh', '198.51.100.7', 22, 'fog'), cost_per_hour=Decimal('0.6'),
+        tags={TAG_NAME: name, TAG_ROBOT: robot_name()})
+    made = Record(name, 'memory', MachineSpec(name, 'memory'), machine_id=f'id-{name}',
+                  created=time.time() - 600, launch='abc123')
+    return Store().machine(name).save(dataclasses.replace(made, **changes))
+
+
+def alive() -> dict[str, Any]:
+    return {'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0}
+
+
+def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """Return a machine of the state once it is as it should be."""
+    def found() -> Any:
+        return next((one for one in live.state()['machines']
+                     if one['name'] == name and fits(one)), None)
+
+    answer: dict[str, Any] = wait_until(found, timeout=10.0, what=name)
+    return answer
+
+
+def test_a_machine_from_its_steps_to_its_end(live: Live) -> None:
+    assert live.state(0, 5.0)['machines'] == []
+    folder = Store().launch('abc123')
+    (folder / 'process.json').write_text(json.dumps(alive()))
+    keep = Journal(silent, folder)
+    keep(StepStarted('', 'VPN interface'))
+    keep(StepStarted('a', 'machine'))
+    machine('a', **alive())
+    shown = when(live, 'a', lambda one: bool(one['steps']))
+    assert shown['phase'] == 'coming' and shown['launch_pid'] == os.getpid()
+    keep(StepDone('a', 'machine', 1.5, 'there'))
+    shown = when(live, 'a', lambda one: one['steps'][0]['state'] == 'done')
+    assert shown['steps'][0]['detail'] == 'there'
+    shown = when(live, 'a', lambda one: one['cost_per_hour'] is not None)
+    assert shown['cost_per_hour'] == '0.6' and shown['address'] == '198.51.100.7'
+    (launch,) = live.state()['launches']
+    assert launch['alive'] and [step['step'] for step in launch['steps']] == ['VPN interface']
+    json.dumps(live.state())
+
+    version = live.state()['version']
+    begin = time.monotonic()
+    assert live.state(version, 0.3)['version'] == version
+    assert time.monotonic() - begin >= 0.3
+
+    keep(StepStarted('a', 'delete'))
+    when(live, 'a', lambda one: one['phase'] == 'ending')
+    Memory.machines.clear()
+    Store().machine('a').delete()
+    shown = when(live, 'a', lambda one: one['phase'] == 'gone')
+    assert shown['ended'] and not shown['launch_alive']
+    assert [step['state'] for step in shown['steps']] == ['done', 'done']
+    with pytest.raises(MachineNotFound):
+        live.delete('a')
+
+
+def test_an_end_is_refused_forced_and_told(live: Live) -> None:
+    machine('a', **alive())
+    machine('stuck')
+    when(live, 'a', lambda one: one['cost_per_hour'] is not None)
+    with pytest.raises(NameTaken, match='has the machine'):
+        live.delete('a')
+    assert 'id-a' in Memory.machines
+    live.delete('a', force=True)
+    wait_until(lambda: 'id-a' not in Memory.machines, timeout=10.0, what='its end')
+    live.delete('stuck', force=True)
+    shown = when(live, 'stuck', lambda one: bool(one['trouble']))
+    assert 'the cloud said no' in shown['trouble'] and not shown['deleting']
+    with pytest.raises(MachineNotFound):
+        live.delete('nobody')
+
+
+def test_a_machine_that_no_record_names_is_shown_and_one_of_another_robot_is_not(
+    live: Live,
+) -> None:
+    machine('orphan')
+    Store().machine('orphan').delete()
+    machine('others')
+    Store().machine('others').delete()
+    Memory.machines['id-others'] = dataclasses.replace(
+        Memory.machines['id-others'], tags={TAG_NAME: 'others', TAG_ROBOT: 'another'})
+    assert '(orphan)' in when(live, 'orphan', lambda one: True)['state']
+    assert [one['name'] for one in live.state()['machines']] == ['orphan']
+
+
+def test_a_launch_that_was_killed_and_a_record_that_is_damaged(live: Live) -> None:
+    machine('left', pid=1 << 22, pid_start=1)
+    (Store().machine('torn').path).mkdir(parents=True)
+    (Store().machine('torn').path / 'record.json').write_text('{')
+    shown = when(live, 'left', lambda one: 'launch gone' in one['state'])
+    assert not shown['launch_alive'] and shown['phase'] == 'running'
+    assert 'record damaged' in when(live, 'torn', lambda one: True)['state']
+
+
+def test_nothing_is_asked_while_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr('ros2fog_cli.api.live.PRESENT', 0.5)
+    monkeypatch.setattr(Store, 'machines', lambda store: asked.append(time.monotonic()) or [])
+    board = Board(topics=False)
+    board.start()
+    try:
+        wait_until(lambda: asked and time.monotonic() - asked[-1] > 1.0, timeout=10.0,
+                   what='quiet')
+        before = len(asked)
+        board.state(-1, 0.0)
+        wait_until(lambda: len(asked) > before, timeout=5.0, what='a look')
+    finally:
+        board.close()
