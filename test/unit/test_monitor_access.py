@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may watch, by value: networks, what opens and closes a firewall, what the verbs say."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from types import SimpleNamespace
+
+from launch import LaunchContext
+from launch.substitutions import TextSubstitution
+import pytest
+
+from fogros2 import ContainerInstance, Foxglove
+from fogros2.actions import networks
+from fogros2.deploy import Launch, RunningMachine
+from fogros2.deploy import launch as launches
+from fogros2.deploy.creating import Creation
+from fogros2.deploy.job import Job
+from fogros2.errors import AgentError, ConfigurationError, ProviderError
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
+from fogros2.monitor import credentials
+from fogros2.provider.kubernetes import publishing
+from fogros2.provider.kubernetes.names import MachineId
+from fogros2.store import process_start, Record, record_from_json, Store
+from fogros2.testing.fakes import FakeProvider, FakeShell
+from ros2fog_cli.api import monitor
+from ros2fog_cli.api.machines import Entry
+
+SOURCES = ('198.51.100.0/28',)
+VPN = VpnInterface('fog1', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
+
+
+@pytest.mark.parametrize(('text', 'found'), [
+    ('198.51.100.0/28', '198.51.100.0/28'), (' 198.51.100.7 ', '198.51.100.7/32'),
+    ('2001:db8::1', '2001:db8::1/128')])
+def test_networks_are_in_one_form(text, found):
+    given = networks.items([text, TextSubstitution(text=text)])
+    assert networks.resolve(LaunchContext(), given) == (found, found)
+    assert networks.resolve(LaunchContext(), networks.items(None)) == ()
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    (['198.51.100.7/28'], "write '198.51.100.0/28', or the address alone"),
+    (['everybody'], "'everybody' is no network"),
+    ('198.51.100.0/28', 'is no list of networks'),
+    ([''], "'' is no network")])
+def test_what_is_no_network_is_refused_where_it_is_written(given, said):
+    for make in (lambda: ContainerInstance(name='a', monitor_allow=given),
+                 lambda: Foxglove('a', monitor_allow=given)):
+        with pytest.raises(ConfigurationError, match=said):
+            make()
+
+
+@pytest.fixture
+def provider(monkeypatch):
+    fake = FakeProvider()
+    monkeypatch.setattr(FakeProvider, 'firewall', True)
+    monkeypatch.setattr(launches, 'provider', lambda name: fake)
+    return fake
+
+
+@pytest.fixture
+def deployment(tmp_path, provider):
+    made = Launch(store=Store(tmp_path), environment={})
+    made._robot = SimpleNamespace(interface=VPN, down=True)
+    return made
+
+
+@pytest.mark.parametrize(
+    ('on_exit', 'closed'), [('keep', True), ('stop', True), ('delete', False)])
+def test_a_port_is_open_until_the_launch_ends_unless_it_goes_with_the_machine(
+        deployment, provider, monkeypatch, on_exit, closed):
+    job = Job(deployment, MachineSpec('planner', 'fake', on_exit=on_exit))
+    job.save(machine_id='fake-1')
+    job.failed = False
+    machine = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING, vpn_host='198.51.100.9')
+    monkeypatch.setattr(FakeProvider, 'owned', False)
+    running = RunningMachine(
+        deployment, job, machine, None, None, None, VPN, 1, None, None, None)
+    monkeypatch.setattr(FakeProvider, 'owned', True)
+    assert running.publish(8766, SOURCES) == ('198.51.100.9', 8766)
+    assert provider.allowed == {('fake-1', 8766): list(SOURCES)}
+    assert job.folder.load().monitor_open == '198.51.100.9:8766'
+    running.close()
+    assert provider.allowed == {('fake-1', 8766): [] if closed else list(SOURCES)}
+
+
+def test_what_a_killed_launch_left_open_is_closed_and_forgotten_by_the_next(
+        deployment, provider):
+    spec = MachineSpec('planner', 'fake', on_exit='keep')
+    job = Job(deployment, spec)
+    with job.folder.lock():
+        job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766')
+        provider._machines['fake-1'] = machine = Machine(
+            'fake-1', 'planner', 'fake', MachineState.RUNNING)
+        Creation(job)._adopt(machine)
+    assert provider.allowed == {('fake-1', 8766): []}
+    after = job.folder.load()
+    assert (after.monitor, after.monitor_open) == (0, '')
+
+
+def test_a_record_of_before_has_no_networks():
+    spec = {'name': 'a', 'provider': 'fake'}
+    assert record_from_json({'name': 'a', 'provider': 'fake', 'spec': spec}).spec == MachineSpec(
+        'a', 'fake')
+
+
+def entry(**changes):
+    made = Record(
+        'planner', 'fake', MachineSpec('planner', 'fake'), machine_id='fake-1', launch='abc123',
+        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, vpn=VPN, monitor=8765,
+        monitor_open='198.51.100.9:8766', agent='/run/fogros2')
+    return Entry('planner', 'fake', Machine(
+        'fake-1', 'planner', 'fake', MachineState.RUNNING, shell=Endpoint('fake')),
+        dataclasses.replace(made, **changes))
+
+
+def test_where_topics_are_seen_is_told_while_a_launch_serves_them():
+    assert entry().monitor == ('http://198.18.7.2:8765/?ds=foxglove-websocket&'
+                               'ds.url=ws%3A%2F%2F198.18.7.2%3A8765')
+    assert entry().to_json()['monitor_open'] == '198.51.100.9:8766'
+    for changes in ({'monitor': 0}, {'pid': 0}, {'vpn': None}):
+        assert entry(**changes).monitor == ''
+        assert entry(**changes).to_json()['monitor_open'] is None
+
+
+def test_the_token_is_the_machine_s_to_tell(tmp_path):
+    if shutil.which('openssl') is None:
+        pytest.skip('needs openssl')
+    made = credentials.make(tmp_path / 'monitor' / 'x', 'planner')
+    text = made.token.read_text() + made.certificate.read_text()
+    shell = FakeShell(handlers={'cat': lambda command: Result(0, text, '')})
+    where, token, fingerprint = monitor.credentials_of(entry(), shell)
+    assert (where, token) == ('198.51.100.9:8766', made.token.read_text().strip())
+    assert fingerprint == credentials.fingerprint(made.certificate.read_text())
+    assert shell.commands[0].argv[1] == '/run/fogros2/monitor-8765/abc123/token'
+    for changes, kind, said in (
+            ({'monitor': 0}, AgentError, 'serves the topics'),
+            ({'pid': 0}, AgentError, 'serves the topics'),
+            ({'monitor_open': ''}, ConfigurationError, 'nobody but this robot')):
+        with pytest.raises(kind, match=said):
+            monitor.credentials_of(entry(**changes), shell)
+
+
+def test_a_pod_s_service_keeps_the_callers_addresses():
+    where = MachineId('robots', 'fogros2-planner', 'u-1', '')
+    made = publishing.service('LoadBalancer', where, 8766, SOURCES)
+    assert made['metadata']['name'] == 'fogros2-planner-8766'
+    assert made['metadata']['ownerReferences'][0]['uid'] == 'u-1'
+    assert made['spec']['loadBalancerSourceRanges'] == list(SOURCES)
+    assert made['spec']['externalTrafficPolicy'] == 'Local'
+    assert 'loadBalancerSourceRanges' not in publishing.service(
+        'NodePort', where, 8766, SOURCES)['spec']
+
+
+def test_a_service_that_can_not_be_removed_says_how():
+    from fogros2.kubernetes_api import ApiError
+
+    class Api:
+        def request(self, *_, **__):
+            raise ApiError('may not', status=403, reason='Forbidden')
+
+    with pytest.raises(ProviderError, match="port 8766 of 'fogros2-planner' can't be closed"):
+        publishing.close(Api(), MachineId('robots', 'fogros2-planner', 'u-1', ''), 8766)
