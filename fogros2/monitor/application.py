@@ -55,7 +55,8 @@ class Application:
         :raises FogError: that doesn't work.
         """
         if not self._engine:
-            raise PrerequisiteError('neither podman nor docker is there')
+            raise PrerequisiteError(
+                'neither podman nor docker is there', 'sudo apt-get install podman')
         try:
             self._call('image', 'inspect', self._image)
         except CommandError:
@@ -107,7 +108,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     except Cancelled:
         pass
     except FogError as error:
-        say(f'no web application here: {error.args[0]}')
+        say(f'no web application here: {error}')
     ended.wait()
     application.stop()
 
