@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts, watches and stops processes as a launch description says: ROS 2 Jazzy's API."""
+from . import _aliases as _aliases
 from . import actions as actions
 from . import conditions as conditions
 from . import descriptions as descriptions

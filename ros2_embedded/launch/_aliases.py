@@ -3,7 +3,6 @@
 from importlib.machinery import ModuleSpec
 import sys
 from types import ModuleType
-from typing import Any, Callable
 
 #: Modules whose names don't follow from a class or function in them.
 _OTHERS = {
@@ -38,13 +37,3 @@ class _AliasFinder:
 
 sys.meta_path.append(_AliasFinder)
 
-
-def lacking(module: str, names: str) -> Callable[[str], Any]:
-    """Give a module's ``__getattr__``, for names that ROS 2 has there and this hasn't."""
-    def look_up(name: str) -> Any:
-        if name in names.split():
-            from rclpy.exceptions import NotEmbeddedError
-            # Of an AttributeError an import statement wouldn't show the text.
-            raise ImportError(str(NotEmbeddedError(f'{module}.{name}')))
-        raise AttributeError(f"module '{module}' has no attribute '{name}'")
-    return look_up

@@ -18,6 +18,7 @@ from rclpy.utilities import (
     try_shutdown,
 )
 from rclpy.utilities import shutdown as _shutdown
+import rosidl_embedded.lacking  # noqa: F401 - names the modules that aren't here
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor

@@ -25,8 +25,8 @@ ANY_STATE = 0x7f
 ALIVE = 16
 
 # bits of a status mask (dds.h, DDS_*_STATUS_ID)
-INCONSISTENT_TOPIC, OFFERED_DEADLINE, REQUESTED_DEADLINE, OFFERED_QOS, REQUESTED_QOS, \
-    SAMPLE_LOST = (1 << bit for bit in range(6))
+OFFERED_DEADLINE, REQUESTED_DEADLINE, OFFERED_QOS, REQUESTED_QOS, SAMPLE_LOST = (
+    1 << bit for bit in range(1, 6))
 LIVELINESS_LOST, LIVELINESS_CHANGED, PUBLICATION_MATCHED, SUBSCRIPTION_MATCHED = (
     1 << bit for bit in range(9, 13))
 
@@ -106,7 +106,7 @@ _SIGNATURES: list[tuple[str, Any, list[Any]]] = [  # functions, what they return
     ('dds_create_guardcondition dds_create_waitset dds_delete dds_assert_liveliness', _E, [_E]),
     ('dds_set_guardcondition', _I32, [_E, ct.c_bool]),
     ('dds_take_guardcondition dds_get_status_changes dds_get_guid dds_get_instance_handle '
-     'dds_get_entity_sertype dds_get_qos dds_writecdr dds_get_publication_matched_status '
+     'dds_get_entity_sertype dds_writecdr dds_get_publication_matched_status '
      'dds_get_subscription_matched_status dds_get_offered_deadline_missed_status '
      'dds_get_requested_deadline_missed_status dds_get_liveliness_lost_status '
      'dds_get_liveliness_changed_status dds_get_offered_incompatible_qos_status '
@@ -345,15 +345,6 @@ class _Entity:
         self.guid = guid(self.handle)
         self.watched = 0  # statuses that somebody waits for
         self.watch(0)
-
-    def policies(self) -> Policies:
-        """Ask for the policies in force."""
-        qos = _lib.dds_create_qos()
-        try:
-            _checked(_lib.dds_get_qos(self.handle, qos), 'get quality of service')
-            return _read_qos(qos)
-        finally:
-            _lib.dds_delete_qos(qos)
 
     def status(self, name: str) -> tuple[tuple[int, int, int, int], int]:
         """Take status ``name``: its numbers in dds.h's order, and its handle if it has one."""

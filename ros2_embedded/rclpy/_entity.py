@@ -2,6 +2,7 @@
 """What an executor and a node know of the things that have callbacks."""
 
 from collections.abc import Callable
+import struct
 from typing import Any
 
 from rclpy.exceptions import InvalidHandle
@@ -19,6 +20,8 @@ class Entity:
 
     callback_group: Any = None
     _destroyed = False
+    _reader: Any
+    _logger_name: str
 
     def __init__(self, *ends: Any) -> None:
         self._ends = list(ends)
@@ -39,11 +42,15 @@ class Entity:
         if self._destroyed:
             raise InvalidHandle('cannot use Destroyable because destruction was requested')
 
-    @property
-    def handle(self) -> Any:
-        """Itself: programs ask for it to see whether there is one."""
-        self._check_alive()
-        return self
+    def _read(self, parse: Callable[[Any], Any], what: str) -> tuple[Any, Any]:
+        """Take the next sample that can be parsed, and what it gives; else (None, None)."""
+        for sample in () if self._destroyed else self._reader.take():
+            try:
+                return sample, parse(sample.data)
+            except (ValueError, struct.error) as error:
+                from rclpy.logging import get_logger
+                get_logger(self._logger_name).error(f'Dropped {what}: {error}')
+        return None, None
 
     def destroy(self) -> None:
         """Free it; a program calls a node's ``destroy_publisher()`` and so on."""

@@ -47,14 +47,8 @@ class NodeGraph:
     """Asks for nodes, topics and services; a part of :class:`.Node`."""
 
     _graph: Graph
-
-    def get_name(self) -> str:
-        """Give the node's name."""
-        raise AssertionError
-
-    def get_namespace(self) -> str:
-        """Give the node's namespace."""
-        raise AssertionError
+    _name: str
+    _namespace: str
 
     # --- nodes ---
 
@@ -135,7 +129,7 @@ class NodeGraph:
         return _services(self._all())
 
     def _full(self, name: str, is_service: bool = False) -> str:
-        full = expand(name, self.get_name(), self.get_namespace())
+        full = expand(name, self._name, self._namespace)
         validate_full_topic_name(full, is_service=is_service)
         return full
 

@@ -16,10 +16,6 @@ class CallbackGroup:
         """Add a subscription, timer, client, service, guard condition or waitable."""
         self.entities.add(weakref.ref(entity, self.entities.discard))
 
-    def has_entity(self, entity: Any) -> bool:
-        """Say whether an entity was added."""
-        return weakref.ref(entity) in self.entities
-
     def can_execute(self, entity: Any) -> bool:
         """Say whether the entity's callback could be executed."""
         raise NotImplementedError()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clients of services."""
 
-import struct
 import threading
 import time
 from typing import Any
@@ -43,27 +42,21 @@ class Client(Introspected):
         return None if self._destroyed else self._reader.condition
 
     def _take(self, executor: Any) -> Work | None:
-        if self._destroyed:
-            return None
-        for sample in self._reader.take():
-            try:
-                client, number = REQUEST_HEADER.unpack_from(sample.data, 4)
-                if client != self._identity:
-                    return None  # another client's response
-                response = cdr.deserialize(sample.data, self.srv_type.Response, 20)
-            except (ValueError, struct.error) as error:
-                from rclpy.logging import get_logger
-                get_logger(self._logger_name).error(
-                    f"Dropped a response of service '{self.srv_name}': {error}")
-                continue
+        def parse(data: Any) -> tuple[Future | None, int, Any]:
+            client, number = REQUEST_HEADER.unpack_from(data, 4)
             with self._lock:
                 future = self._pending_requests.get(number)
-            if future is None:
-                return None  # nobody waits for it any more
-            self._tell(3, self._writer.guid, number, response=response)
-            future._set_executor(executor)
-            return future.set_result, (response,), None
-        return None
+            if future is None or client != self._identity:
+                return None, number, None  # nobody waits for it any more; another client's
+            return future, number, cdr.deserialize(data, self.srv_type.Response, 20)
+
+        sample, parsed = self._read(parse, f"a response of service '{self.srv_name}'")
+        future, number, response = parsed or (None, 0, None)
+        if future is None:
+            return None
+        self._tell(3, self._writer.guid, number, response=response)
+        future._set_executor(executor)
+        return future.set_result, (response,), None
 
     def call(self, request: Any, timeout_sec: float | None = None) -> Any:
         """
@@ -104,15 +97,6 @@ class Client(Introspected):
             self.remove_pending_request(future)
             raise
         return future
-
-    def get_pending_request(self, sequence_number: int) -> Future:
-        """
-        Give the future of a request.
-
-        :raises KeyError: if it isn't pending.
-        """
-        with self._lock:
-            return self._pending_requests[sequence_number]
 
     def remove_pending_request(self, future: Future) -> None:
         """Wait no longer for a response."""

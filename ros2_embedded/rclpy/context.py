@@ -29,11 +29,6 @@ class Context(AbstractContextManager['Context']):
         self._arguments: Arguments | None = None
         self._domain_id = 0
 
-    @property
-    def handle(self) -> 'Context | None':
-        """Itself once it is initialized."""
-        return self if self._graph is not None else None
-
     def init(self, args: list[str] | None = None, *, initialize_logging: bool = True,
              domain_id: int | None = None) -> None:
         """

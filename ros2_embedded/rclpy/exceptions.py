@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rclpy raises."""
 
+from functools import partialmethod
 from typing import Any
 
 
@@ -26,19 +27,6 @@ class NodeNameNonExistentError(RCLError):
 
 class UnsupportedEventTypeError(RCLError):
     """The middleware doesn't have that event."""
-
-
-class NotEmbeddedError(RuntimeError):
-    """
-    A part of ROS 2 that the embedded default doesn't have.
-
-    :param part: its name, as in ROS 2's documentation.
-    """
-
-    def __init__(self, part: str) -> None:
-        super().__init__(
-            f'{part} is not part of the embedded default; ROS 2 Jazzy has it: '
-            'https://docs.ros.org/en/jazzy/Installation.html')
 
 
 class NotInitializedException(Exception):
@@ -67,29 +55,25 @@ class NameValidationException(Exception):
 class InvalidNamespaceException(NameValidationException):
     """A namespace is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('namespace', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'namespace')
 
 
 class InvalidNodeNameException(NameValidationException):
     """A node's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('node name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'node name')
 
 
 class InvalidTopicNameException(NameValidationException):
     """A topic's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('topic name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'topic name')
 
 
 class InvalidServiceNameException(NameValidationException):
     """A service's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('service name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'service name')
 
 
 class ParameterException(Exception):
@@ -102,22 +86,20 @@ class ParameterException(Exception):
 class ParameterNotDeclaredException(ParameterException):
     """A parameter was used that nobody declared."""
 
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__('Invalid access to undeclared parameter(s)', parameters)
+    __init__ = partialmethod(
+        ParameterException.__init__, 'Invalid access to undeclared parameter(s)')
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
     """A parameter was declared twice."""
 
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__('Parameter(s) already declared', parameters)
+    __init__ = partialmethod(ParameterException.__init__, 'Parameter(s) already declared')
 
 
 class InvalidParameterException(ParameterException):
     """A parameter's name is invalid."""
 
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__('Invalid parameter name', parameter_name)
+    __init__ = partialmethod(ParameterException.__init__, 'Invalid parameter name')
 
 
 class InvalidParameterTypeException(ParameterException):
@@ -141,8 +123,8 @@ class InvalidParameterValueException(ParameterException):
 class ParameterImmutableException(ParameterException):
     """A read-only parameter was to be changed."""
 
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__('Attempted to modify read-only parameter', parameter_name)
+    __init__ = partialmethod(
+        ParameterException.__init__, 'Attempted to modify read-only parameter')
 
 
 class ParameterUninitializedException(ParameterException):

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rclpy._arguments import Arguments
 
 __all__ = ['LoggingSeverity', 'RcutilsLogger', 'clear_config', 'get_logger',
-           'get_logger_effective_level', 'get_logger_level',
-           'get_logging_severity_from_string', 'initialize', 'set_logger_level', 'shutdown']
+           'get_logger_effective_level', 'get_logger_level', 'initialize', 'set_logger_level',
+           'shutdown']
 
 _COLOURS = {LoggingSeverity.DEBUG: '\033[32m', LoggingSeverity.INFO: '\033[0m',
             LoggingSeverity.WARN: '\033[33m', LoggingSeverity.ERROR: '\033[31m',
@@ -87,18 +87,6 @@ def get_logger_effective_level(name: str) -> LoggingSeverity:
             return LoggingSeverity(level)
         name = name.rpartition('.')[0]
     return _default_level
-
-
-def get_logging_severity_from_string(log_severity: str) -> LoggingSeverity:
-    """
-    Find a severity by its name.
-
-    :raises RuntimeError: if there is none of that name.
-    """
-    try:
-        return LoggingSeverity[log_severity.upper()]
-    except KeyError:
-        raise RuntimeError(f"'{log_severity}' is no logging severity") from None
 
 
 def _coloured(stream: TextIO) -> bool:

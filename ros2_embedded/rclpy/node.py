@@ -2,28 +2,15 @@
 """Nodes."""
 
 from collections.abc import Callable
-from copy import copy
 import sys
 from typing import Any, TypeVar
 import weakref
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
-from rclpy import _arguments, logging
+from rclpy import _arguments, _names, exceptions, logging, qos
 from rclpy._dds import Reader, Writer
 from rclpy._entity import Entity
 from rclpy._graph import Graph, type_hash_data
-from rclpy._names import (
-    dds_type,
-    expand,
-    join,
-    REQUEST_PREFIX,
-    RESPONSE_PREFIX,
-    TOPIC_PREFIX,
-    validate_full_topic_name,
-    validate_namespace,
-    validate_node_name,
-    validate_topic_name,
-)
 from rclpy._node_graph import NodeGraph
 from rclpy._node_parameters import NodeParameters
 from rclpy.callback_groups import (
@@ -35,35 +22,14 @@ from rclpy.client import Client
 from rclpy.clock import Clock, ROSClock
 from rclpy.constants import S_TO_NS
 from rclpy.context import Context
-from rclpy.duration import Duration
-from rclpy.event_handler import (
-    EventHandler,
-    PublisherEventCallbacks,
-    SubscriptionEventCallbacks,
-)
-from rclpy.exceptions import (
-    NameValidationException,
-    NodeNameNonExistentError,
-    NotEmbeddedError,
-    NotInitializedException,
-    RCLError,
-)
+from rclpy.event_handler import EventHandler, PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import NodeNameNonExistentError, RCLError
 from rclpy.executors import Executor
-from rclpy.guard_condition import GuardCondition
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DeadlineBestAvailable,
-    DurabilityPolicy,
-    LivelinessPolicy,
-    qos_profile_parameter_events,
-    qos_profile_rosout_default,
-    qos_profile_services_default,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import qos_profile_services_default, QoSProfile
 from rclpy.service import Service
 from rclpy.service_introspection import Introspected
 from rclpy.subscription import Subscription
@@ -71,11 +37,14 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Rate, Timer
 from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 from rclpy.utilities import get_default_context
+from rosidl_embedded.lacking import lacking, NotEmbeddedError
 
 __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 
 HIDDEN_NODE_PREFIX = '_'
 _T = TypeVar('_T', bound=Entity)
+_lacking = lacking('rclpy.node.Node', 'create_guard_condition destroy_guard_condition guards '
+                   'set_descriptor', AttributeError)
 
 
 class Node(NodeParameters, NodeGraph):
@@ -111,7 +80,6 @@ class Node(NodeParameters, NodeGraph):
         self._clients: list[Client] = []
         self._services: list[Service] = []
         self._timers: list[Timer] = []
-        self._guards: list[GuardCondition] = []
         self._waitables: list[EventHandler] = []
         self._default_callback_group: CallbackGroup = MutuallyExclusiveCallbackGroup()
         self._rate_group = ReentrantCallbackGroup()
@@ -119,7 +87,7 @@ class Node(NodeParameters, NodeGraph):
         self._destroyed = False
         self._init_parameters(allow_undeclared_parameters)
         if not self._context.ok() or self._context._graph is None:
-            raise NotInitializedException('cannot create node')
+            raise exceptions.NotInitializedException('cannot create node')
         self._graph: Graph = self._context._graph
         own = _arguments.parse(['--ros-args', *(cli_args or [])])
         _arguments.check_known(own)
@@ -128,16 +96,16 @@ class Node(NodeParameters, NodeGraph):
         self._name = self._settings.node_name(node_name)
         space = self._settings.namespace(node_name, namespace or '/')
         self._namespace = space if space.startswith('/') else '/' + space
-        validate_node_name(self._name)
-        validate_namespace(self._namespace)
-        self._logger_name = join(self._namespace, self._name)[1:].replace('/', '.')
+        _names.validate_node_name(self._name)
+        _names.validate_namespace(self._namespace)
+        self._logger_name = _names.join(self._namespace, self._name)[1:].replace('/', '.')
         self._logger = logging.get_logger(self._logger_name)
         with self._graph.held():
             self._record = self._graph.add_node(self._namespace, self._name)
             if enable_rosout and self._settings.switch('rosout'):
                 self._start_rosout()
             self._parameter_event_publisher: Publisher | None = self.create_publisher(
-                ParameterEvent, '/parameter_events', qos_profile_parameter_events)
+                ParameterEvent, '/parameter_events', qos.qos_profile_parameter_events)
             self._clock = ROSClock()
             self._start_parameters(parameter_overrides,
                                    automatically_declare_parameters_from_overrides)
@@ -149,7 +117,7 @@ class Node(NodeParameters, NodeGraph):
 
     def _start_rosout(self) -> None:
         from rcl_interfaces.msg import Log
-        publisher = self.create_publisher(Log, '/rosout', qos_profile_rosout_default)
+        publisher = self.create_publisher(Log, '/rosout', qos.qos_profile_rosout_default)
         reference = weakref.ref(publisher)
 
         def publish(stamp: int, severity: int, name: str, message: str, file: str,
@@ -196,13 +164,15 @@ class Node(NodeParameters, NodeGraph):
     clients = property(lambda self: iter(self._clients), doc='Its clients.')
     services = property(lambda self: iter(self._services), doc='Its services.')
     timers = property(lambda self: iter(self._timers), doc='Its timers.')
-    guards = property(lambda self: iter(self._guards), doc='Its guard conditions.')
     waitables = property(lambda self: iter(self._waitables), doc='Its handlers of events.')
 
     def _entities(self) -> list[Entity]:
         """All that an executor waits for, in the order it is executed in."""
-        return [*self._waitables, *self._timers, *self._subscriptions, *self._guards,
-                *self._clients, *self._services]
+        return [*self._waitables, *self._timers, *self._subscriptions, *self._clients,
+                *self._services]
+
+    def __getattr__(self, name: str) -> Any:
+        return _lacking(name)
 
     @property
     def executor(self) -> Executor | None:
@@ -240,11 +210,6 @@ class Node(NodeParameters, NodeGraph):
         """The callback group of what is created without one."""
         return self._default_callback_group
 
-    @property
-    def handle(self) -> 'Node':
-        """Itself."""
-        return self
-
     def get_name(self) -> str:
         """Give its name."""
         return self._name
@@ -255,7 +220,7 @@ class Node(NodeParameters, NodeGraph):
 
     def get_fully_qualified_name(self) -> str:
         """Give its name with its namespace."""
-        return join(self._namespace, self._name)
+        return _names.join(self._namespace, self._name)
 
     def get_clock(self) -> Clock:
         """Give its clock, of ROS time."""
@@ -268,12 +233,12 @@ class Node(NodeParameters, NodeGraph):
     # --- names ---
 
     def _resolve(self, name: str, only_expand: bool, is_service: bool) -> str:
-        validate_topic_name(name, is_service=is_service)
-        full = expand(name, self._name, self._namespace)
+        _names.validate_topic_name(name, is_service=is_service)
+        full = _names.expand(name, self._name, self._namespace)
         if not only_expand:
             full = self._settings.remap(full, self._name, self._namespace,
                                         'rosservice' if is_service else 'rostopic')
-        validate_full_topic_name(full, is_service=is_service)
+        _names.validate_full_topic_name(full, is_service=is_service)
         return full
 
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
@@ -282,10 +247,7 @@ class Node(NodeParameters, NodeGraph):
 
         :raises RCLError: if it is invalid.
         """
-        try:
-            return self._resolve(topic, only_expand, False)
-        except (NameValidationException, ValueError) as error:
-            raise RCLError(f'failed to resolve name: {error}') from error
+        return self._resolved(topic, only_expand, False)
 
     def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
         """
@@ -293,9 +255,12 @@ class Node(NodeParameters, NodeGraph):
 
         :raises RCLError: if it is invalid.
         """
+        return self._resolved(service, only_expand, True)
+
+    def _resolved(self, *name: Any) -> str:
         try:
-            return self._resolve(service, only_expand, True)
-        except (NameValidationException, ValueError) as error:
+            return self._resolve(*name)
+        except (exceptions.NameValidationException, ValueError) as error:
             raise RCLError(f'failed to resolve name: {error}') from error
 
     # --- creating ---
@@ -318,47 +283,18 @@ class Node(NodeParameters, NodeGraph):
             raise ValueError('history depth must be greater than or equal to zero')
         return QoSProfile(depth=qos_or_depth)
 
-    def _available(self, profile: QoSProfile, topic: str, publisher: bool) -> QoSProfile:
-        """Replace what is BEST_AVAILABLE by the strictest that all others go together with."""
-        if ReliabilityPolicy.BEST_AVAILABLE != profile.reliability \
-                and DurabilityPolicy.BEST_AVAILABLE != profile.durability \
-                and LivelinessPolicy.BEST_AVAILABLE != profile.liveliness:
-            return profile
-        others = [one.policies for one in self._graph.endpoints(writers=not publisher)
-                  if one.topic == topic]
-        chosen = copy(profile)
-        if profile.reliability == ReliabilityPolicy.BEST_AVAILABLE:
-            chosen.reliability = ReliabilityPolicy.RELIABLE \
-                if publisher or all(one.reliable for one in others) \
-                else ReliabilityPolicy.BEST_EFFORT
-        if profile.durability == DurabilityPolicy.BEST_AVAILABLE:
-            chosen.durability = DurabilityPolicy.TRANSIENT_LOCAL \
-                if publisher or all(one.transient_local for one in others) \
-                else DurabilityPolicy.VOLATILE
-        if profile.liveliness == LivelinessPolicy.BEST_AVAILABLE:
-            manual = [one.manual_liveliness for one in others]
-            chosen.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC \
-                if (any(manual) if publisher else manual and all(manual)) \
-                else LivelinessPolicy.AUTOMATIC
-        for name in ('deadline', 'liveliness_lease_duration'):
-            if getattr(profile, name) == DeadlineBestAvailable:
-                setattr(chosen, name, Duration())
-        return chosen
-
     def _topic_entity(self, kind: Any, msg_type: Any, topic: str, profile: QoSProfile,
-                      options: None) -> tuple[Any, QoSProfile]:
+                      options: None) -> Any:
         if options is not None:
             raise NotEmbeddedError('qos_overriding_options')
         check_is_valid_msg_type(msg_type)
-        publishes = kind is Writer
         full = self._resolve(topic, False, False)
-        name = topic if profile.avoid_ros_namespace_conventions else TOPIC_PREFIX + full
-        profile = self._available(profile, name, publishes)
+        name = topic if profile.avoid_ros_namespace_conventions else _names.TOPIC_PREFIX + full
         type_name = msg_type._definition.name
-        entity = kind(self._graph.participant, name, dds_type(type_name),
+        entity = kind(self._graph.participant, name, _names.dds_type(type_name),
                       profile._policies(type_hash_data(type_name)))
         self._graph.add_endpoints(self._record, entity)
-        return entity, profile
+        return entity
 
     def create_publisher(
             self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, *,
@@ -372,8 +308,8 @@ class Node(NodeParameters, NodeGraph):
         :param qos_profile: a profile, or how many messages are kept.
         :param callback_group: of its events.
         """
-        writer, profile = self._topic_entity(
-            Writer, msg_type, topic, self._profile(qos_profile), qos_overriding_options)
+        profile = self._profile(qos_profile)
+        writer = self._topic_entity(Writer, msg_type, topic, profile, qos_overriding_options)
         publisher = publisher_class(
             writer, msg_type, topic, profile, event_callbacks or PublisherEventCallbacks(),
             callback_group or self._default_callback_group, self._context, self._logger_name)
@@ -393,8 +329,8 @@ class Node(NodeParameters, NodeGraph):
         :param raw: give the callback bytes, not messages.
         """
         group = callback_group or self._default_callback_group
-        reader, profile = self._topic_entity(
-            Reader, msg_type, topic, self._profile(qos_profile), qos_overriding_options)
+        profile = self._profile(qos_profile)
+        reader = self._topic_entity(Reader, msg_type, topic, profile, qos_overriding_options)
         try:
             subscription = Subscription(
                 reader, msg_type, topic, callback, group, profile, raw,
@@ -409,21 +345,21 @@ class Node(NodeParameters, NodeGraph):
                         serves: bool) -> tuple[Reader, Writer]:
         check_is_valid_srv_type(srv_type)
         full = self._resolve(name, False, True)
-        topics = {'Request': f'{REQUEST_PREFIX}{full}Request',
-                  'Response': f'{RESPONSE_PREFIX}{full}Reply'}
+        topics = {'Request': f'{_names.REQUEST_PREFIX}{full}Request',
+                  'Response': f'{_names.RESPONSE_PREFIX}{full}Reply'}
         identity = f"{'serviceid' if serves else 'clientid'}={self._graph.service_id()};".encode()
         reads, writes = ('Request', 'Response') if serves else ('Response', 'Request')
         made: list[Any] = []
         for kind, part in ((Reader, reads), (Writer, writes)):
             type_name = f'{srv_type._service}_{part}'
-            made.append(kind(self._graph.participant, topics[part], dds_type(type_name),
+            made.append(kind(self._graph.participant, topics[part], _names.dds_type(type_name),
                              profile._policies(identity + type_hash_data(type_name))))
         self._graph.add_endpoints(self._record, *made)
         return made[0], made[1]
 
     def _event_writer(self, of: Introspected, profile: QoSProfile) -> Writer:
         topic = self.resolve_service_name(of.srv_name) + '/_service_event'
-        writer: Writer = self._topic_entity(Writer, of.srv_type.Event, topic, profile, None)[0]
+        writer: Writer = self._topic_entity(Writer, of.srv_type.Event, topic, profile, None)
         return writer
 
     def create_client(self, srv_type: Any, srv_name: str, *,
@@ -467,13 +403,6 @@ class Node(NodeParameters, NodeGraph):
                       clock or self._clock, context=self._context, autostart=autostart,
                       wake=self._wake_executor)
         return self._add(self._timers, timer)
-
-    def create_guard_condition(self, callback: Callable[..., Any],
-                               callback_group: CallbackGroup | None = None) -> GuardCondition:
-        """Create a guard condition."""
-        group = callback_group or self._default_callback_group
-        guard = GuardCondition(callback, group, context=self._context)
-        return self._add(self._guards, guard)
 
     def create_rate(self, frequency: float, clock: Clock | None = None) -> Rate:
         """
@@ -525,10 +454,6 @@ class Node(NodeParameters, NodeGraph):
         """Destroy a timer; False if it isn't the node's."""
         return self._destroy(self._timers, timer)
 
-    def destroy_guard_condition(self, guard: GuardCondition) -> bool:
-        """Destroy a guard condition; False if it isn't the node's."""
-        return self._destroy(self._guards, guard)
-
     def destroy_rate(self, rate: Rate) -> bool:
         """Destroy a rate; False if it isn't the node's."""
         done = self.destroy_timer(rate._timer)
@@ -548,8 +473,7 @@ class Node(NodeParameters, NodeGraph):
                 (self._publishers, self.destroy_publisher),
                 (self._subscriptions, self.destroy_subscription),
                 (self._clients, self.destroy_client), (self._services, self.destroy_service),
-                (self._timers, self.destroy_timer),
-                (self._guards, self.destroy_guard_condition))
+                (self._timers, self.destroy_timer))
             for things, destroy in all_things:
                 while things:
                     destroy(things[0])

@@ -7,6 +7,7 @@ import warnings
 
 from rclpy._dds import Policies
 from rclpy.duration import Duration
+from rosidl_embedded.lacking import NotEmbeddedError
 
 
 class QoSPolicyKind(IntEnum):
@@ -172,6 +173,9 @@ class QoSProfile:
 
     def _policies(self, user_data: bytes, ignore_local: bool = False) -> Policies:
         """Translate to DDS as rmw_cyclonedds does."""
+        for name in ('reliability', 'durability', 'liveliness'):
+            if getattr(self, name).name == 'BEST_AVAILABLE':
+                raise NotEmbeddedError(f'the policy BEST_AVAILABLE for {name}')
         keep_all = self.history == HistoryPolicy.KEEP_ALL
         return Policies(
             depth=0 if keep_all else max(self.depth, 1),

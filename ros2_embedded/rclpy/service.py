@@ -60,23 +60,19 @@ class Service(Introspected):
         return None if self._destroyed else self._reader.condition
 
     def _take(self, executor: Any) -> Work | None:
-        if self._destroyed:
+        def parse(data: Any) -> tuple[int, int, Any]:
+            return (*REQUEST_HEADER.unpack_from(data, 4),
+                    cdr.deserialize(data, self.srv_type.Request, 20))
+
+        sample, parsed = self._read(parse, f"a request to service '{self.srv_name}'")
+        if sample is None:
             return None
-        for sample in self._reader.take():
-            try:
-                client, number = REQUEST_HEADER.unpack_from(sample.data, 4)
-                request = cdr.deserialize(sample.data, self.srv_type.Request, 20)
-            except (ValueError, struct.error) as error:
-                from rclpy.logging import get_logger
-                get_logger(self._logger_name).error(
-                    f"Dropped a request to service '{self.srv_name}': {error}")
-                continue
-            info = ServiceInfo(sample.source_timestamp, time.time_ns(),
-                               RequestId(client, number, sample.publication))
-            self._tell(1, info.request_id.gid, number, request=request)
-            return (self.callback, (request, self.srv_type.Response()),
-                    partial(self.send_response, header=info))
-        return None
+        client, number, request = parsed
+        info = ServiceInfo(sample.source_timestamp, time.time_ns(),
+                           RequestId(client, number, sample.publication))
+        self._tell(1, info.request_id.gid, number, request=request)
+        return (self.callback, (request, self.srv_type.Response()),
+                partial(self.send_response, header=info))
 
     def _reader_is_known(self, publication: int) -> bool | None:
         """Whether the client's reader is matched; None if the client is gone."""

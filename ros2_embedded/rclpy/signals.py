@@ -29,7 +29,6 @@ class SignalHandlerOptions(IntEnum):
 
 _contexts: 'weakref.WeakSet[Context]' = weakref.WeakSet()
 _previous: dict[int, Any] = {}
-_installed = SignalHandlerOptions.NO
 _descriptors: tuple[int, int, int] | None = None  # read, write, who had it before
 
 
@@ -64,7 +63,7 @@ def _listen(read: int, forward: int) -> None:
 
 def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
     """Handle signals from now on; only possible in the main thread, elsewhere nothing happens."""
-    global _installed, _descriptors
+    global _descriptors
     if threading.current_thread() is not threading.main_thread():
         return
     uninstall_signal_handlers()
@@ -81,17 +80,11 @@ def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions
                      daemon=True).start()
     for number in wanted:
         _previous[number] = signal.signal(number, _handle)
-    _installed = options
-
-
-def get_current_signal_handlers_options() -> SignalHandlerOptions:
-    """Say which signals are handled."""
-    return _installed
 
 
 def uninstall_signal_handlers() -> None:
     """Put back what handled the signals before."""
-    global _installed, _descriptors
+    global _descriptors
     if threading.current_thread() is not threading.main_thread() or _descriptors is None:
         return
     for number, previous in _previous.items():
@@ -104,6 +97,3 @@ def uninstall_signal_handlers() -> None:
         signal.set_wakeup_fd(current)
     os.close(write)  # ends the thread
     _descriptors = None
-    _installed = SignalHandlerOptions.NO
-
-

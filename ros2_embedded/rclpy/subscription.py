@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 import inspect
 import time
 from typing import Any
@@ -44,32 +45,18 @@ class Subscription(Entity):
     def _handle(self) -> int | None:
         return None if self._destroyed else self._reader.condition
 
-    def _next(self) -> tuple[Any, dict[str, Any]] | None:
-        """Take the next message and what is known of it."""
-        if self._destroyed:
-            return None
-        for sample in self._reader.take():
-            try:
-                message = bytes(sample.data) if self.raw else cdr.deserialize(
-                    sample.data, self.msg_type)
-            except ValueError as error:
-                from rclpy.logging import get_logger
-                get_logger(self._logger_name).error(
-                    f"Dropped a message on topic '{self.topic}': {error}")
-                continue
-            return message, {
-                'source_timestamp': sample.source_timestamp,
-                'received_timestamp': time.time_ns(),
-                'publication_sequence_number': None,
-                'reception_sequence_number': None}
-        return None
-
     def _take(self, executor: Any) -> Work | None:
-        taken = self._next()
-        if taken is None:
+        parse = bytes if self.raw else partial(cdr.deserialize, cls=self.msg_type)
+        sample, message = self._read(parse, f"a message on topic '{self.topic}'")
+        if sample is None:
             return None
-        with_info = self._callback_type is Subscription.CallbackType.WithMessageInfo
-        return self._callback, taken if with_info else taken[:1], None
+        if self._callback_type is Subscription.CallbackType.MessageOnly:
+            return self._callback, (message,), None
+        return self._callback, (message, {
+            'source_timestamp': sample.source_timestamp,
+            'received_timestamp': time.time_ns(),
+            'publication_sequence_number': None,
+            'reception_sequence_number': None}), None
 
     def get_publisher_count(self) -> int:
         """Count the publishers it receives from."""

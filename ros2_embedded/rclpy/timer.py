@@ -7,10 +7,8 @@ from typing import Any
 
 from rclpy._entity import Entity, Work
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, JumpThreshold
-from rclpy.clock_type import ClockType
+from rclpy.clock import Clock
 from rclpy.context import Context
-from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle, RCLError, ROSInterruptException
 
 
@@ -31,16 +29,11 @@ class Timer(Entity):
         self._cancelled = not autostart
         self._last = clock._now()
         self._next = self._last + self._period
-        self._jump = None
-        if clock.clock_type is ClockType.ROS_TIME:
-            self._jump = clock.create_jump_callback(
-                JumpThreshold(min_forward=Duration(nanoseconds=1),
-                              min_backward=Duration(nanoseconds=-1)),
-                post_callback=self._jumped)
+        clock._jumps.append(self._jumped)
 
-    def _jumped(self, jump: Any) -> None:
+    def _jumped(self, source_changed: bool) -> None:
         now = self._clock._now()
-        if jump.clock_change.name.endswith('ACTIVATED') or now < self._last:
+        if source_changed or now < self._last:
             self._last = now  # times before and after can't be compared
             self._next = now + self._period
         self._wake()
@@ -60,9 +53,9 @@ class Timer(Entity):
 
     def destroy(self) -> None:
         """Free it; a program calls :meth:`.Node.destroy_timer`."""
-        self._destroyed = True
-        if self._jump is not None:
-            self._jump.unregister()
+        if not self._destroyed:
+            self._destroyed = True
+            self._clock._jumps.remove(self._jumped)
 
     @property
     def clock(self) -> Clock:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import sys
 import threading
 
-from rclpy.constants import S_TO_NS
 from rclpy.context import Context
 
 _default: Context | None = None
@@ -47,15 +46,3 @@ def try_shutdown(*, context: Context | None = None) -> None:
 def get_rmw_implementation_identifier() -> str:
     """Name the middleware."""
     return 'rmw_cyclonedds_cpp'
-
-
-def get_available_rmw_implementations() -> set[str]:
-    """Name the middlewares there are."""
-    return {get_rmw_implementation_identifier()}
-
-
-def timeout_sec_to_nsec(timeout_sec: float | None) -> int:
-    """Convert a time-out to nanoseconds; none and negative ones to -1, for ever."""
-    if timeout_sec is None or timeout_sec < 0:
-        return -1
-    return int(float(timeout_sec) * S_TO_NS)

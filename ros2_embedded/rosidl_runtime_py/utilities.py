@@ -4,7 +4,7 @@
 import importlib
 from typing import Any
 
-from rclpy.exceptions import NotEmbeddedError
+from rosidl_embedded.lacking import NotEmbeddedError
 
 
 def _import(identifier: str, kind: str | None) -> Any:

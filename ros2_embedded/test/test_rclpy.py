@@ -12,7 +12,7 @@ from builtin_interfaces.msg import Time as TimeMessage
 from example_interfaces.srv import AddTwoInts
 import pytest
 import rclpy
-from rclpy.clock import Clock, ClockChange, JumpThreshold, ROSClock
+from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration, Infinite
@@ -467,14 +467,15 @@ def test_clocks(context):
     before = steady.now()
     assert steady.sleep_for(Duration(seconds=0.02), context)
     assert steady.now() - before >= Duration(seconds=0.02)
-    simulated, jumps = ROSClock(), []
-    threshold = JumpThreshold(min_forward=Duration(seconds=1), min_backward=None)
-    with simulated.create_jump_callback(threshold, post_callback=jumps.append):
-        simulated._set_ros_time_is_active(True)
-        simulated.set_ros_time_override(Time(seconds=5, clock_type=ClockType.ROS_TIME))
+    simulated = ROSClock()
+    simulated._set_ros_time_is_active(True)
+    simulated.set_ros_time_override(Time(seconds=5, clock_type=ClockType.ROS_TIME))
     assert simulated.now().nanoseconds == 5_000_000_000
-    assert [jump.clock_change for jump in jumps] == [
-        ClockChange.ROS_TIME_ACTIVATED, ClockChange.ROS_TIME_NO_CHANGE]
+    until = Time(seconds=6, clock_type=ClockType.ROS_TIME)
+    threading.Timer(0.05, simulated.set_ros_time_override, [until]).start()
+    assert simulated.sleep_until(until, context)
+    threading.Timer(0.05, simulated._set_ros_time_is_active, [False]).start()
+    assert not simulated.sleep_for(Duration(seconds=60), context)
 
 
 def test_a_simulators_clock_drives_time_and_timers(world):
@@ -520,29 +521,17 @@ def test_rate(context):
 
 # --- executors ----------------------------------------------------------------------------------
 
-def test_guard_conditions(world):
-    node, called = world.node(), []
-    guard = node.create_guard_condition(lambda: called.append(True))
-    world.spin(0.02)
-    assert not called
-    guard.trigger()
-    world.until(lambda: called)
-    world.spin(0.02)
-    assert len(called) == 1
-    node.destroy_guard_condition(guard)
-
-
 def test_spin_once_does_one_thing(world):
     node, called = world.node(), []
-    guards = [node.create_guard_condition(lambda: called.append(True)) for _ in range(2)]
-    for guard in guards:
-        guard.trigger()
+    timers = [node.create_timer(0.01, lambda: called.append(True)) for _ in range(2)]
+    time.sleep(0.02)
     world.executor.spin_once(timeout_sec=LIMIT)
     assert len(called) <= 1
     before = time.monotonic()
     world.until(lambda: len(called) == 2)
-    world.executor.spin_once(timeout_sec=0.05)
     assert time.monotonic() - before < LIMIT
+    for timer in timers:
+        timer.cancel()
 
 
 def test_an_exception_of_a_callback_is_raised_by_spin(world):

@@ -21,12 +21,14 @@ publisher.wait_for_all_acked()
 '''
 LISTENER = '''
 import rclpy
-from rclpy.wait_for_message import wait_for_message
+from rclpy.task import Future
 from std_msgs.msg import String
 rclpy.init()
 node = rclpy.create_node('listener')
-found, message = wait_for_message(String, node, 'chatter', qos_profile=10, time_to_wait=15)
-print(message.data if found else 'nothing', flush=True)
+found = Future()
+node.create_subscription(String, 'chatter', found.set_result, 10)
+rclpy.spin_until_future_complete(node, found, timeout_sec=15)
+print(found.result().data if found.done() else 'nothing', flush=True)
 '''
 NETWORKS = {
     'loopback': 'ip link set lo up',

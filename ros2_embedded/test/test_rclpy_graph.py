@@ -31,7 +31,6 @@ from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -272,17 +271,6 @@ def test_rosout(world):
     assert found['moving'].name == 'talker.arm' and found['careful'].stamp.sec > 0
     assert found['careful'].file.endswith('test_rclpy_graph.py')
     assert found['careful'].function == 'test_rosout'
-
-
-def test_waiting_for_a_message(world):
-    talker, reader = world.node('talker'), world.node('reader', 1)
-    publisher = talker.create_publisher(String, 'once', QoSProfile(
-        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    publisher.publish(String(data='here'))
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    assert wait_for_message(String, reader, 'once', qos_profile=latched,
-                            time_to_wait=LIMIT) == (True, String(data='here'))
-    assert wait_for_message(String, reader, 'never', time_to_wait=0.05) == (False, None)
 
 
 # --- lifecycle ----------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do."""
-from .._aliases import lacking
+from rosidl_embedded.lacking import lacking
+
 from ._simple import *  # noqa: F403
 from ._structure import *  # noqa: F403
 from .execute_local import ExecuteLocal as ExecuteLocal

@@ -2,7 +2,8 @@
 """Conditions of actions."""
 from __future__ import annotations
 
-from .._aliases import lacking
+from rosidl_embedded.lacking import lacking
+
 from .._base import Condition, SomeSubstitutionsType, Substitution
 from ..launch_context import LaunchContext
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions

@@ -9,8 +9,8 @@ import os
 from typing import Any, Iterable, Sequence
 
 import launch.logging
+from rosidl_embedded.lacking import lacking
 
-from .._aliases import lacking
 from .._base import SomeSubstitutionsType, Substitution
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext

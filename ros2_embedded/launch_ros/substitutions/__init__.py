@@ -7,11 +7,11 @@ import shutil
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from launch import SomeSubstitutionsType
-from launch._aliases import lacking
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
 from launch.substitutions import described, ParsedSubstitution, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from rosidl_embedded.lacking import lacking
 
 __all__ = ['ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare']
 __getattr__ = lacking(__name__, 'Parameter')

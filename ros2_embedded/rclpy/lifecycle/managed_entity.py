@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What takes part in a node's transitions."""
 
-from collections.abc import Callable
 from enum import Enum
-from functools import wraps
 from typing import Any
 
 
@@ -45,17 +43,3 @@ class SimpleManagedEntity(ManagedEntity):
     def is_activated(self) -> bool:
         """Whether it is active."""
         return self._enabled
-
-    @staticmethod
-    def when_enabled(wrapped: Any = None, *,
-                     when_not_enabled: Callable[[], None] | None = None) -> Any:
-        """Decorate a method that does nothing while inactive."""
-        def decorate(method: Any) -> Any:
-            @wraps(method)
-            def call(self: SimpleManagedEntity, *args: Any, **kwargs: Any) -> None:
-                if self._enabled:
-                    method(self, *args, **kwargs)
-                elif when_not_enabled is not None:
-                    when_not_enabled()
-            return call
-        return decorate if wrapped is None else decorate(wrapped)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Managed nodes: the states and transitions of ROS 2's node lifecycle design."""
 
+from collections.abc import Container
 from functools import partialmethod
 from typing import Any, NamedTuple
 
@@ -214,17 +215,17 @@ class LifecycleNodeMixin(ManagedEntity):
         return response
 
     def _on_available(self, request: Any, response: Any) -> Any:
-        return self._describe(response, lambda start: start == self._state)
+        return self._describe(response, {self._state})
 
     def _on_graph(self, request: Any, response: Any) -> Any:
-        return self._describe(response, lambda start: True)
+        return self._describe(response, _STATES)
 
     @staticmethod
-    def _describe(response: Any, wanted: Any) -> Any:
+    def _describe(response: Any, states: Container[int]) -> Any:
         response.available_transitions = [
             msg.TransitionDescription(transition=Transition(id=number, label=label),
                                       start_state=_message(start), goal_state=_message(goal))
-            for number, label, start, goal in _TRANSITIONS if wanted(start)]
+            for number, label, start, goal in _TRANSITIONS if start in states]
         return response
 
 

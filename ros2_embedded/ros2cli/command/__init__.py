@@ -69,7 +69,7 @@ class _Lacking:
         self.name = name
 
     def main(self, **_: Any) -> None:
-        from rclpy.exceptions import NotEmbeddedError
+        from rosidl_embedded.lacking import NotEmbeddedError
         raise NotEmbeddedError(f"'{self.name}'")
 
 

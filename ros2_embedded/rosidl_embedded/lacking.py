@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors for what ROS 2 has and the embedded default hasn't."""
+
+from collections.abc import Callable
+import sys
+from typing import Any
+
+_MODULES = {f'rclpy.{name}' for name in (
+    'action', 'guard_condition', 'impl.implementation_singleton', 'parameter_event_handler',
+    'qos_overriding_options', 'wait_for_message', 'waitable')}
+
+
+class NotEmbeddedError(RuntimeError):
+    """
+    A part of ROS 2 that the embedded default doesn't have.
+
+    :param part: its name, as in ROS 2's documentation.
+    """
+
+    def __init__(self, part: str) -> None:
+        super().__init__(
+            f'{part} is not part of the embedded default; ROS 2 Jazzy has it: '
+            'https://docs.ros.org/en/jazzy/Installation.html')
+
+
+def lacking(where: str, names: str,
+            error: type[Exception] = ImportError) -> Callable[[str], Any]:
+    """Give a ``__getattr__``, by default a module's, for names that only ROS 2 has there."""
+    def look_up(name: str) -> Any:
+        if name in names.split():
+            # by default no AttributeError: an import statement wouldn't show its text
+            raise error(str(NotEmbeddedError(f'{where}.{name}')))
+        raise AttributeError(f"'{where}' has no attribute '{name}'")
+    return look_up
+
+
+class _Finder:
+    """Finds none of the modules that only ROS 2 has; it is asked when nobody else finds them."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> None:
+        if name in _MODULES:
+            raise ImportError(str(NotEmbeddedError(name)), name=name)
+
+
+sys.meta_path.append(_Finder)  # type: ignore[arg-type]
