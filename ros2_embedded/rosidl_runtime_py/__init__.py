@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interfaces by name, and messages as text and dictionaries."""
 
-from rosidl_runtime_py.convert import message_to_csv, message_to_ordereddict, message_to_yaml
+from rosidl_embedded.lacking import lacking
+
+from rosidl_runtime_py.convert import message_to_ordereddict, message_to_yaml
 from rosidl_runtime_py.set_message import set_message_fields
 
-__all__ = ['message_to_csv', 'message_to_ordereddict', 'message_to_yaml', 'set_message_fields']
+__all__ = ['message_to_ordereddict', 'message_to_yaml', 'set_message_fields']
+__getattr__ = lacking(__name__, 'get_action_interfaces get_interfaces get_message_interfaces '
+                      'get_service_interfaces import_message_from_namespaced_type '
+                      'message_to_csv')

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as YAML, CSV and dictionaries."""
+"""Messages as YAML and dictionaries."""
 
 import array
 from collections import OrderedDict
-from collections.abc import Callable
 import sys
 from typing import Any
 
@@ -47,43 +46,29 @@ def message_to_yaml(msg: Any, *, truncate_length: int | None = None, no_arr: boo
     return text
 
 
-def message_to_csv(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
-                   no_str: bool = False) -> str:
-    """Write all a message holds, separated by commas; see :func:`message_to_yaml`."""
-    def flat(value: Any) -> str:
-        if isinstance(value, dict):
-            value = list(value.values())
-        if not isinstance(value, list):
-            return str(value)
-        return ','.join(map(flat, value)).lstrip(',')  # as ROS 2: none before the first text
-
-    return flat(_convert(msg, None, str, truncate_length, no_arr, no_str))
-
-
 def message_to_ordereddict(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
                            no_str: bool = False) -> 'OrderedDict[str, Any]':
     """Convert a message to a dictionary; see :func:`message_to_yaml`."""
-    converted: OrderedDict[str, Any] = _convert(
-        msg, None, lambda octets: ''.join(map(chr, octets)), truncate_length, no_arr, no_str)
+    converted: OrderedDict[str, Any] = _convert(msg, None, truncate_length, no_arr, no_str)
     return converted
 
 
-def _convert(value: Any, field: Field | None, octets: Callable[[bytes], str], *how: Any) -> Any:
+def _convert(value: Any, field: Field | None, *how: Any) -> Any:
     truncate_length, no_arr, no_str = how
     if hasattr(value, '_definition'):
-        return OrderedDict((one.name, _convert(getattr(value, one.name), one, octets, *how))
+        return OrderedDict((one.name, _convert(getattr(value, one.name), one, *how))
                            for one in value._definition.fields)
     if isinstance(value, (bytes, str)):
         if no_str and isinstance(value, str):
             return f'<string length: <{len(value)}>>'
-        text = value if isinstance(value, str) else octets(value)
+        text = value if isinstance(value, str) else ''.join(map(chr, value))
         if truncate_length is not None and len(value) > truncate_length:
             return text[:truncate_length] + '...'
         return text
     if _is_many(value):
         if no_arr and field is not None:
             return _abbreviated(value, field)
-        items = [_convert(item, None, octets, *how) for item in value[:truncate_length]]
+        items = [_convert(item, None, *how) for item in value[:truncate_length]]
         if truncate_length is not None and len(value) > truncate_length:
             items.append('...')
         return items

@@ -17,7 +17,6 @@ from rcl_interfaces.msg import Log, ParameterDescriptor, ParameterValue
 from rcl_interfaces.srv import ListParameters
 from rclpy.serialization import deserialize_message, serialize_message
 from rosidl_runtime_py import (
-    message_to_csv,
     message_to_ordereddict,
     message_to_yaml,
     set_message_fields,
@@ -223,12 +222,9 @@ def test_damaged_bytes_are_an_error_not_a_crash():
             assert not isinstance(error, (MemoryError, SystemError))
 
 
-def test_yaml_csv_and_dictionaries():
+def test_yaml_and_dictionaries():
     header = Header(stamp=Time(sec=1, nanosec=2), frame_id='map')
     assert message_to_yaml(header) == 'stamp:\n  sec: 1\n  nanosec: 2\nframe_id: map\n'
-    assert message_to_csv(header) == '1,2,map'
-    assert message_to_csv(ParameterValue(bool_array_value=[True])) == \
-        '0,False,0,0.0,,,True,,,'
     assert list(message_to_ordereddict(header)) == ['stamp', 'frame_id']
     numbers = UInt8MultiArray(data=range(9))
     assert message_to_ordereddict(numbers, truncate_length=2)['data'] == [0, 1, '...']

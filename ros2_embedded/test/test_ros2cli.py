@@ -167,7 +167,6 @@ def test_a_launch_file_is_launched(package):
     (['pkg', 'twice.launch.py'], "file 'twice.launch.py' was found more than once in the share"),
     (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "
                                     "'<name>:=<value>'"),
-    (['--launch-prefix-filter', 'x', 'pkg', 'a.launch.py'], '--launch-prefix must be specified'),
 ])
 def test_errors_are_one_line_and_status_1(package, arguments, error):
     status, out, err = ros2('launch', *arguments)
@@ -214,10 +213,9 @@ def test_two_nodes_until_interrupted(package):
     assert 'All log files can be found below' in lines[0]
 
 
-def test_a_prefix_for_some_executables(package):
+def test_a_prefix_for_executables(package):
     status, out, _ = ros2(
-        'launch', '--launch-prefix', 'echo prefixed', '--launch-prefix-filter', 'slee.*', '-a',
-        'pkg', 'a.launch.py', 'word:=0')
+        'launch', '--launch-prefix', 'echo prefixed', '-a', 'pkg', 'a.launch.py', 'word:=0')
     assert status == 0
     assert f'prefixed {package}/lib/pkg/sleeper --ros-args -r __node:=one' in out
 

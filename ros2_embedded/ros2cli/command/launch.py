@@ -72,8 +72,6 @@ class LaunchCommand(CommandExtension):
         add('-a', '--show-all-subprocesses-output', action='store_true',
             help="Show all launched subprocesses' output, whatever the launch file says")
         add('--launch-prefix', help='Words to put before all executables')
-        add('--launch-prefix-filter',
-            help='Regex of the names of those executables that --launch-prefix is for')
         add('package_name', help='Name of the ROS package which contains the launch file')
         add('launch_file_name', nargs='?', help='Name of the launch file')
         add('launch_arguments', nargs='*',
@@ -89,14 +87,10 @@ class LaunchCommand(CommandExtension):
             words[:0] = [args.launch_file_name] if args.launch_file_name else []
         else:
             path = _find(args.package_name, args.launch_file_name)
-        if args.launch_prefix is None and args.launch_prefix_filter is not None:
-            raise RuntimeError(
-                '--launch-prefix must be specified if --launch-prefix-filter is provided')
         if args.show_all_subprocesses_output:
             os.environ['OVERRIDE_LAUNCH_PROCESS_OUTPUT'] = 'both'
-        for name in ('launch-prefix', 'launch-prefix-filter'):
-            if value := getattr(args, name.replace('-', '_')):
-                words.append(f'{name}:={value}')
+        if args.launch_prefix:
+            words.append(f'launch-prefix:={args.launch_prefix}')
         import launch
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import get_launch_description_from_any_launch_file

@@ -22,15 +22,10 @@ class ListVerb(VerbExtension):
         add_arguments(parser)
         parser.add_argument('-a', '--all', action='store_true',
                             help='Display all nodes even hidden ones')
-        parser.add_argument('-c', '--count-nodes', action='store_true',
-                            help='Only display the number of nodes discovered')
 
     def main(self, *, args: Any) -> Any:
         with NodeStrategy(args) as node:
             names = get_node_names(node, args.all)
-        if args.count_nodes:
-            print(len(names))
-            return
         if len(set(names)) < len(names):
             print('WARNING: Be aware that there are nodes in the graph that share an exact '
                   'name, which can have unintended side effects.', file=sys.stderr)

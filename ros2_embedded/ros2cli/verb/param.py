@@ -79,11 +79,6 @@ class GetVerb(VerbExtension):
         parser.add_argument('--timeout', metavar='N', type=int, default=1,
                             help='Wait for N seconds until node becomes available')
         parser.add_argument('parameter_name', help='Name of the parameter')
-        self.add_more(parser)
-
-    def add_more(self, parser: Any) -> None:
-        """Add this verb's own arguments."""
-        parser.add_argument('--hide-type', action='store_true', help='Hide the type information')
 
     def main(self, *, args: Any) -> Any:
         name = f"/{args.node_name.removeprefix('/')}"
@@ -103,13 +98,14 @@ class GetVerb(VerbExtension):
             return 'Parameter not set'
         value = parameter_value_to_python(values[0])
         label = _LABELS[Parameter.Type(values[0].type).name]
-        print(*([value] if args.hide_type else [label] if value is None else [label, value]))
+        print(*[label] if value is None else [label, value])
 
 
 class SetVerb(GetVerb):
     """Set parameter."""
 
-    def add_more(self, parser: Any) -> None:
+    def add_arguments(self, parser: Any, cli_name: str) -> None:
+        super().add_arguments(parser, cli_name)
         parser.add_argument('value', help='Value of the parameter')
 
     def do(self, node: Any, name: str, args: Any) -> Any:

@@ -2,7 +2,6 @@
 """Verbs of ``ros2 service``."""
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
@@ -24,14 +23,10 @@ class CallVerb(VerbExtension):
         add('service_type', help="Type of the ROS service (e.g. 'std_srvs/srv/Empty')")
         add('values', nargs='?', default='{}',
             help="Values to fill the service request with in YAML format (e.g. '{a: 1, b: 2}')")
-        add('-r', '--rate', metavar='N', type=float,
-            help='Repeat the call at a specific rate in Hz')
 
     def main(self, *, args: Any) -> Any:
         import rclpy
         from rosidl_runtime_py.utilities import get_service
-        if args.rate is not None and args.rate <= 0:
-            raise RuntimeError('rate must be greater than zero')
         try:
             kind = get_service(args.service_type)
         except (AttributeError, ModuleNotFoundError):
@@ -60,15 +55,10 @@ class CallVerb(VerbExtension):
         if not client.service_is_ready():
             print('waiting for service to become available...')
             client.wait_for_service()
-        while True:
-            print(f'requester: making request: {request!r}\n')
-            started = time.monotonic()
-            future = client.call_async(request)
-            rclpy.spin_until_future_complete(node, future)
-            if future.result() is None:
-                raise RuntimeError(
-                    f'Exception while calling service: {future.exception()!r}')
-            print(f'response:\n{future.result()!r}\n')
-            if args.rate is None or not rclpy.ok():
-                return None
-            time.sleep(max(started + 1.0 / args.rate - time.monotonic(), 0.0))
+        print(f'requester: making request: {request!r}\n')
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(node, future)
+        if future.result() is None:
+            raise RuntimeError(f'Exception while calling service: {future.exception()!r}')
+        print(f'response:\n{future.result()!r}\n')
+        return None

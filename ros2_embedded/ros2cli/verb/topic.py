@@ -105,36 +105,16 @@ class ListVerb(VerbExtension):
         what = self.WHAT
         parser.add_argument('-t', '--show-types', action='store_true',
                             help=f'Additionally show the {what} type')
-        parser.add_argument('-c', f'--count-{what}s', action='store_true', dest='count',
-                            help=f'Only display the number of {what}s discovered')
         parser.add_argument(f'--include-hidden-{what}s', action='store_true', dest='hidden',
                             help=f'Consider hidden {what}s as well')
-        if what == 'topic':
-            parser.add_argument('-v', '--verbose', action='store_true',
-                                help='List full details about each topic')
 
     def main(self, *, args: Any) -> Any:
         from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
         with NodeStrategy(args) as node:
             pairs = getattr(node, f'get_{self.WHAT}_names_and_types')()
-            pairs = [(name, types) for name, types in pairs
-                     if args.hidden or not topic_or_service_is_hidden(name)]
-            if args.count:
-                print(len(pairs))
-            elif pairs and getattr(args, 'verbose', False):
-                self._print_counts('Published', 'publisher', node.count_publishers, pairs)
-                self._print_counts('Subscribed', 'subscriber', node.count_subscribers, pairs)
-            else:
-                for name, types in pairs:
+            for name, types in pairs:
+                if args.hidden or not topic_or_service_is_hidden(name):
                     print(f"{name} [{', '.join(types)}]" if args.show_types else name)
-
-    @staticmethod
-    def _print_counts(title: str, one: str, count_of: Any, pairs: Any) -> None:
-        print(f'{title} topics:')
-        for name, types in pairs:
-            if count := count_of(name):
-                print(f" * {name} [{', '.join(types)}] {count} {one}{'s' * (count > 1)}")
-        print()
 
 
 class InfoVerb(VerbExtension):

@@ -24,7 +24,6 @@ class EchoVerb(VerbExtension):
         add('topic_name', help="Name of the ROS topic to listen to (e.g. '/chatter')")
         add('message_type', nargs='?', help="Type of the message (e.g. 'std_msgs/msg/String')")
         add_qos_arguments(parser, 'sensor_data')
-        add('--csv', action='store_true', help='Output all fields separated by commas')
         add('--field', help="Echo a selected field of a message, such as 'pose.pose.position'")
         add('--full-length', '-f', action='store_true',
             help='Output all elements of arrays, bytes and strings')
@@ -32,13 +31,7 @@ class EchoVerb(VerbExtension):
             help='The length to truncate arrays, bytes, and string to (default: 128)')
         add('--no-arr', action='store_true', help="Don't print array fields of messages")
         add('--no-str', action='store_true', help="Don't print string fields of messages")
-        add('--flow-style', action='store_true', help='Print collections in the flow style')
-        add('--no-lost-messages', action='store_true', help="Don't report lost messages")
-        add('--raw', action='store_true', help='Echo the raw binary representation')
-        add('--filter', dest='filter_expr', help='Python expression, over the message m, that '
-                                                 'is true for messages to be printed')
         add('--once', action='store_true', help='Print the first message received and exit')
-        add('--timeout', metavar='N', type=above(0, float), help='Exit after so many seconds')
 
     def _profile(self, node: Any, args: Any) -> Any:
         """Make a profile that goes together with all publishers, unless options say another."""
@@ -72,25 +65,19 @@ class EchoVerb(VerbExtension):
             if kind is None:
                 raise RuntimeError('Could not determine the type for the passed topic')
             done = Future()
-            if args.timeout:
-                node.create_timer(args.timeout, lambda: done.set_result(True))
-            events = None if args.no_lost_messages else SubscriptionEventCallbacks(
-                message_lost=lambda status: print(
-                    f'A message was lost!!!\n\ttotal count change:{status.total_count_change}\n\t'
-                    f'total count: {status.total_count}', end='---\n'))
+            events = SubscriptionEventCallbacks(message_lost=lambda status: print(
+                f'A message was lost!!!\n\ttotal count change:{status.total_count_change}\n\t'
+                f'total count: {status.total_count}', end='---\n'))
             node.create_subscription(
-                kind, args.topic_name, _printer(args, done), profile, event_callbacks=events,
-                raw=args.raw)
+                kind, args.topic_name, _printer(args, done), profile, event_callbacks=events)
             rclpy.spin_until_future_complete(node, done)
 
 
 def _printer(args: Any, done: Any) -> Any:
     """Make the callback that prints messages as the options say."""
-    from rosidl_runtime_py import message_to_csv, message_to_yaml
+    from rosidl_runtime_py import message_to_yaml
     fields = [name for name in (args.field or '').split('.') if name]
-    wanted = compile(args.filter_expr or 'True', '<filter>', 'eval')
-    options = {'truncate_length': None if args.full_length else args.truncate_length,
-               'no_arr': args.no_arr, 'no_str': args.no_str}
+    length = None if args.full_length else args.truncate_length
 
     def show(message: Any) -> None:
         for name in fields:
@@ -98,15 +85,12 @@ def _printer(args: Any, done: Any) -> Any:
                 message = getattr(message, name)
             except AttributeError as error:
                 raise RuntimeError(f"Invalid field '{args.field}': {error}") from error
-        if not eval(wanted, {'m': message}):  # noqa: S307 - the user's own
-            return
         if args.once:
             done.set_result(True)
         if not hasattr(message, 'get_fields_and_field_types'):
             print(message, end='\n---\n')
-        elif args.csv:
-            print(message_to_csv(message, **options))
         else:
-            print(message_to_yaml(message, flow_style=args.flow_style, **options), end='---\n')
+            print(message_to_yaml(message, truncate_length=length, no_arr=args.no_arr,
+                                  no_str=args.no_str), end='---\n')
 
     return show

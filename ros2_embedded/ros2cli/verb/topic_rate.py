@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 import statistics
-import time
 from typing import Any
 
 from ros2cli.node.direct import add_arguments, DirectNode
@@ -12,8 +11,8 @@ from ros2cli.verb import VerbExtension
 from ros2cli.verb.topic import above, get_msg_class
 
 
-def _measure(args: Any, topic: str, callback: Any, report: Any, raw: bool) -> None:
-    """Subscribe to a topic and report each second, until the end."""
+def _measure(args: Any, topic: str, callback: Any, report: Any) -> None:
+    """Subscribe to a topic's bytes and report each second, until the end."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     with DirectNode(args) as direct:
@@ -23,8 +22,8 @@ def _measure(args: Any, topic: str, callback: Any, report: Any, raw: bool) -> No
             return
         clock = node.get_clock()
         node.create_subscription(
-            kind, topic, lambda message: callback(message, clock.now().nanoseconds),
-            qos_profile_sensor_data, raw=raw)
+            kind, topic, lambda data: callback(data, clock.now().nanoseconds),
+            qos_profile_sensor_data, raw=True)
         node.create_timer(1.0, lambda: report(clock.now().nanoseconds))
         while rclpy.ok():
             rclpy.spin_once(node)
@@ -40,24 +39,15 @@ class HzVerb(VerbExtension):
             '--window', '-w', dest='window_size', type=above(0), default=10000,
             metavar='WINDOW',
             help='window size, in # of messages, for calculating rate (default: 10000)')
-        parser.add_argument(
-            '--filter', dest='filter_expr', default=None, metavar='EXPR',
-            help='only measure messages matching the specified Python expression')
-        parser.add_argument('--wall-time', dest='use_wtime', action='store_true',
-                            help='calculates rate using wall time')
         add_arguments(parser)
 
     def main(self, *, args: Any) -> Any:
-        wanted = compile(args.filter_expr or 'True', '<filter>', 'eval')
         gaps: deque[float] = deque(maxlen=args.window_size)
         last: int | None = None
         reported: int | None = None
 
-        def received(message: Any, now: int) -> None:
+        def received(data: bytes, now: int) -> None:
             nonlocal last
-            if not eval(wanted, {'m': message}):  # noqa: S307 - the user's own
-                return
-            now = time.time_ns() if args.use_wtime else now
             if last is not None and now >= last:
                 gaps.append((now - last) / 1e9)
             elif last is not None:
@@ -75,7 +65,7 @@ class HzVerb(VerbExtension):
                   f'max: {max(gaps):.3f}s std dev: {statistics.pstdev(gaps, mean):.5f}s '
                   f'window: {len(gaps)}')
 
-        _measure(args, args.topic_name, received, report, raw=args.filter_expr is None)
+        _measure(args, args.topic_name, received, report)
 
 
 class BwVerb(VerbExtension):
@@ -106,5 +96,4 @@ class BwVerb(VerbExtension):
                   f'max: {text(max(sizes))}')
 
         print(f'Subscribed to [{args.topic}]')
-        _measure(args, args.topic, lambda data, now: received.append((now, len(data))), report,
-                 raw=True)
+        _measure(args, args.topic, lambda data, now: received.append((now, len(data))), report)
