@@ -46,9 +46,6 @@ class Condition:
     def __init__(self, *, predicate: Callable[[LaunchContext], bool] | None = None) -> None:
         self._predicate = predicate
 
-    def describe(self) -> str:
-        return repr(self)
-
     def evaluate(self, context: LaunchContext) -> bool:
         return False if self._predicate is None else self._predicate(context)
 
@@ -179,20 +176,10 @@ class Action(LaunchDescriptionEntity):
         return [(f'Conditionally included by {self.describe()}', self.get_sub_entities())]
 
     def visit(self, context: LaunchContext) -> Entities | None:
-        """Execute if the condition holds; ExecutionComplete follows, if anybody listens."""
+        """Execute if the condition holds."""
         if self.__condition is not None and not self.__condition.evaluate(context):
             return None
-        try:
-            return self.execute(context)
-        finally:
-            from .events import ExecutionComplete
-            event = ExecutionComplete(action=self)
-            if context.would_handle_event(event):
-                future = self.get_asyncio_future()
-                if future is None:
-                    context.emit_event_sync(event)
-                else:
-                    future.add_done_callback(lambda _: context.emit_event_sync(event))
+        return self.execute(context)
 
     def execute(self, context: LaunchContext) -> Entities | None:
         """Do the action's work, without blocking; return what is to be visited next."""

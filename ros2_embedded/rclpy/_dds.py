@@ -346,13 +346,12 @@ class _Entity:
         self.watched = 0  # statuses that somebody waits for
         self.watch(0)
 
-    def status(self, name: str) -> tuple[tuple[int, int, int, int], int]:
-        """Take status ``name``: its numbers in dds.h's order, and its handle if it has one."""
+    def status(self, name: str) -> list[int]:
+        """Take status ``name``: its numbers in dds.h's order."""
         value = _Status()
         function = getattr(_lib, f'dds_get_{name}_status')
         _checked(function(self.handle, ct.byref(value)), f'get status {name}')
-        first, second, third, fourth = value.numbers
-        return (first, second, third, fourth), value.handle
+        return list(value.numbers)
 
     def status_changes(self) -> int:
         """Give the mask of the statuses that changed since they were last taken."""

@@ -2,6 +2,7 @@
 """Names: what is valid, how they are expanded, and what DDS makes of them."""
 
 import re
+import string
 from typing import Literal
 
 from rclpy.exceptions import (
@@ -13,6 +14,8 @@ from rclpy.exceptions import (
 )
 
 _ALPHANUMERIC = re.compile(r'[^A-Za-z0-9_/]')
+_LETTERS = f'{string.ascii_letters}{string.digits}_'
+_TOPIC = re.compile(r'~?(?:[A-Za-z0-9_/]|\{(?:[A-Za-z_][A-Za-z0-9_]*)?\})*')  # how far it is fine
 _SUBSTITUTION = re.compile(r'\{([^{}]*)\}')
 
 TOPIC_PREFIX, REQUEST_PREFIX, RESPONSE_PREFIX = 'rt', 'rq', 'rr'
@@ -77,31 +80,24 @@ def topic_name_fault(name: str) -> Fault | None:
         return 'topic name token must not start with a number', 0
     if name[-1] == '/':
         return 'topic name must not end with a forward slash', len(name) - 1
-    opened = -1
-    for place, char in enumerate(name):
-        if opened >= 0:
-            if char == '}':
-                opened = -1
-            elif char == '{':
-                return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
-            elif not (char.isascii() and char.isalnum() or char == '_'):
-                return ('substitution name must not contain characters other than '
-                        "alphanumerics or '_'", place)
-            elif char.isdigit() and place == opened + 1:
-                return 'substitution name must not start with a number', place
-        elif char == '{':
-            opened = place
-        elif char == '}':
-            return "topic name must not have unmatched (unbalanced) curly braces '{}'", place
-        elif char == '~':
-            if place:
-                return ("topic name must not have tilde '~' unless it is the first character",
-                        place)
-        elif not (char.isascii() and char.isalnum() or char in '_/'):
-            return ('topic name must not contain characters other than alphanumerics, '
-                    "'_', '~', '{', or '}'", place)
-    if opened >= 0:
-        return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
+    place = _TOPIC.match(name).end()  # type: ignore[union-attr]
+    rest = name[place:]
+    unbalanced = "topic name must not have unmatched (unbalanced) curly braces '{}'", place
+    if rest.startswith('{'):
+        inside = len(rest) - len(rest[1:].lstrip(_LETTERS))
+        if rest[1:2].isdigit():
+            return 'substitution name must not start with a number', place + 1
+        if rest[inside:inside + 1] in ('', '{'):
+            return unbalanced
+        return ("substitution name must not contain characters other than alphanumerics or '_'",
+                place + inside)
+    if rest.startswith('}'):
+        return unbalanced
+    if rest.startswith('~'):
+        return "topic name must not have tilde '~' unless it is the first character", place
+    if rest:
+        return ('topic name must not contain characters other than alphanumerics, '
+                "'_', '~', '{', or '}'", place)
     if len(name) > 2 and name[0] == '~' and name[1] != '/':
         return ("topic name must not have a tilde '~' that is not followed by a "
                 "forward slash '/'", 1)

@@ -124,26 +124,11 @@ class Client(Introspected):
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
         """Wait until :meth:`service_is_ready`, or for a number of seconds."""
         limit = None if timeout_sec is None else time.monotonic() + timeout_sec
-        if self.service_is_ready():
-            return True
-        waiting, guard = _dds.WaitSet(), _dds.Guard()
-        self.context._wakers.add(guard.trigger)
-        try:
-            self._writer.watch(_dds.PUBLICATION_MATCHED)
-            self._reader.watch(_dds.SUBSCRIPTION_MATCHED)
-            waiting.attach({self._writer.handle, self._reader.handle, guard.handle})
-            while self.context.ok() and not self.service_is_ready():
-                left = 2 ** 62 if limit is None else int((limit - time.monotonic()) * 1e9)
-                if left <= 0:
-                    break
-                waiting.wait(left)
-                self._writer.status('publication_matched')
-                self._reader.status('subscription_matched')
-        finally:
-            self.context._wakers.discard(guard.trigger)
-            waiting.close()
-            guard.close()
-        return self.service_is_ready()
+        while not self.service_is_ready():
+            if not self.context.ok() or limit is not None and time.monotonic() >= limit:
+                return False
+            time.sleep(0.005)
+        return True
 
     @property
     def service_name(self) -> str:

@@ -2,36 +2,17 @@
 """Events of publishers and subscriptions: matches, missed deadlines, incompatible QoS."""
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 from rclpy import _dds
 from rclpy._entity import Entity, Work
 from rclpy.callback_groups import CallbackGroup
-from rclpy.exceptions import UnsupportedEventTypeError
+from rclpy.exceptions import UnsupportedEventTypeError as UnsupportedEventTypeError
 from rclpy.logging import get_logger
 from rclpy.qos import qos_policy_name_from_kind, QoSPolicyKind
+from rosidl_embedded.lacking import lacking
 
-
-class QoSPublisherEventType(IntEnum):
-    """Events of a publisher."""
-
-    RCL_PUBLISHER_OFFERED_DEADLINE_MISSED = 0
-    RCL_PUBLISHER_LIVELINESS_LOST = 1
-    RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS = 2
-    RCL_PUBLISHER_INCOMPATIBLE_TYPE = 3
-    RCL_PUBLISHER_MATCHED = 4
-
-
-class QoSSubscriptionEventType(IntEnum):
-    """Events of a subscription."""
-
-    RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED = 0
-    RCL_SUBSCRIPTION_LIVELINESS_CHANGED = 1
-    RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS = 2
-    RCL_SUBSCRIPTION_MESSAGE_LOST = 3
-    RCL_SUBSCRIPTION_INCOMPATIBLE_TYPE = 4
-    RCL_SUBSCRIPTION_MATCHED = 5
+__getattr__ = lacking(__name__, 'QoSPublisherEventType QoSSubscriptionEventType')
 
 
 class _Count(NamedTuple):
@@ -81,56 +62,42 @@ QoSPublisherMatchedInfo = QoSSubscriptionMatchedInfo
 _POLICIES = {2: QoSPolicyKind.DURABILITY, 4: QoSPolicyKind.DEADLINE, 8: QoSPolicyKind.LIVELINESS,
              11: QoSPolicyKind.RELIABILITY, 13: QoSPolicyKind.HISTORY, 21: QoSPolicyKind.LIFESPAN}
 
-# an event's status in DDS, its bit, and what ROS tells of it
-_PUBLISHER: dict[int, tuple[str, int, Any]] = {
-    0: ('offered_deadline_missed', _dds.OFFERED_DEADLINE, QoSOfferedDeadlineMissedInfo),
-    1: ('liveliness_lost', _dds.LIVELINESS_LOST, QoSLivelinessLostInfo),
-    2: ('offered_incompatible_qos', _dds.OFFERED_QOS, QoSOfferedIncompatibleQoSInfo),
-    4: ('publication_matched', _dds.PUBLICATION_MATCHED, QoSPublisherMatchedInfo)}
-_SUBSCRIPTION: dict[int, tuple[str, int, Any]] = {
-    0: ('requested_deadline_missed', _dds.REQUESTED_DEADLINE, QoSRequestedDeadlineMissedInfo),
-    1: ('liveliness_changed', _dds.LIVELINESS_CHANGED, QoSLivelinessChangedInfo),
-    2: ('requested_incompatible_qos', _dds.REQUESTED_QOS, QoSRequestedIncompatibleQoSInfo),
-    3: ('sample_lost', _dds.SAMPLE_LOST, QoSMessageLostInfo),
-    5: ('subscription_matched', _dds.SUBSCRIPTION_MATCHED, QoSSubscriptionMatchedInfo)}
+class Kind(NamedTuple):
+    """A kind of event: its status and that status's bit in DDS, and what ROS tells of it."""
+
+    status: str
+    bit: int
+    info: Any
 
 
 class EventHandler(Entity):
-    """
-    Calls back for an event.
-
-    :raises UnsupportedEventTypeError: if the middleware doesn't have it.
-    """
+    """Calls back for an event."""
 
     def __init__(self, *, callback_group: CallbackGroup, callback: Callable[[Any], Any],
-                 event_type: IntEnum, parent_impl: _dds.Reader | _dds.Writer) -> None:
-        table = _PUBLISHER if isinstance(event_type, QoSPublisherEventType) else _SUBSCRIPTION
-        if event_type not in table:
-            raise UnsupportedEventTypeError(f'{event_type.name} is not supported')
+                 event_type: Kind, parent_impl: _dds.Reader | _dds.Writer) -> None:
         super().__init__()
         self.callback_group = callback_group
         callback_group.add_entity(self)
         self.event_type = event_type
         self.callback = callback
-        self._name, self._bit, self._info = table[event_type]
         self._entity = parent_impl
-        parent_impl.watched |= self._bit
+        parent_impl.watched |= event_type.bit
         parent_impl.watch(parent_impl.watched)
 
     def _handle(self) -> int | None:
         return self._entity.handle
 
     def _is_triggered(self) -> bool:
-        return bool(self._entity.status_changes() & self._bit)
+        return bool(self._entity.status_changes() & self.event_type.bit)
 
     def _take(self, executor: Any) -> Work | None:
         if not self._is_triggered():
             return None
-        numbers, _ = self._entity.status(self._name)
-        values: list[int] = list(numbers[:len(self._info._fields)])
-        if self._info is QoSRequestedIncompatibleQoSInfo:
+        info = self.event_type.info
+        values = list(self._entity.status(self.event_type.status)[:len(info._fields)])
+        if info is QoSRequestedIncompatibleQoSInfo:
             values[2] = _POLICIES.get(values[2], QoSPolicyKind.INVALID)
-        return self.callback, (self._info(*values),), None
+        return self.callback, (info(*values),), None
 
 
 QoSEventHandler = EventHandler
@@ -139,7 +106,7 @@ QoSEventHandler = EventHandler
 class _Callbacks:
     """Callbacks for events, given by name; a name that there isn't is a TypeError."""
 
-    _kinds: dict[str, IntEnum]  # an event's name, and its kind
+    _kinds: dict[str, Kind]
     _warning: str
 
     def __init__(self, *, use_default_callbacks: bool = True,
@@ -177,11 +144,15 @@ class SubscriptionEventCallbacks(_Callbacks):
     """A subscription's callbacks for events."""
 
     _kinds = {
-        'deadline': QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED,
-        'incompatible_qos': QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS,
-        'liveliness': QoSSubscriptionEventType.RCL_SUBSCRIPTION_LIVELINESS_CHANGED,
-        'message_lost': QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST,
-        'matched': QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED}
+        'deadline': Kind('requested_deadline_missed', _dds.REQUESTED_DEADLINE,
+                         QoSRequestedDeadlineMissedInfo),
+        'incompatible_qos': Kind('requested_incompatible_qos', _dds.REQUESTED_QOS,
+                                 QoSRequestedIncompatibleQoSInfo),
+        'liveliness': Kind('liveliness_changed', _dds.LIVELINESS_CHANGED,
+                           QoSLivelinessChangedInfo),
+        'message_lost': Kind('sample_lost', _dds.SAMPLE_LOST, QoSMessageLostInfo),
+        'matched': Kind('subscription_matched', _dds.SUBSCRIPTION_MATCHED,
+                        QoSSubscriptionMatchedInfo)}
     _warning = ("New publisher discovered on topic '{}', offering incompatible QoS. No messages "
                 'will be received from it. Last incompatible policy: {}')
 
@@ -190,9 +161,12 @@ class PublisherEventCallbacks(_Callbacks):
     """A publisher's callbacks for events."""
 
     _kinds = {
-        'deadline': QoSPublisherEventType.RCL_PUBLISHER_OFFERED_DEADLINE_MISSED,
-        'liveliness': QoSPublisherEventType.RCL_PUBLISHER_LIVELINESS_LOST,
-        'incompatible_qos': QoSPublisherEventType.RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS,
-        'matched': QoSPublisherEventType.RCL_PUBLISHER_MATCHED}
+        'deadline': Kind('offered_deadline_missed', _dds.OFFERED_DEADLINE,
+                         QoSOfferedDeadlineMissedInfo),
+        'incompatible_qos': Kind('offered_incompatible_qos', _dds.OFFERED_QOS,
+                                 QoSOfferedIncompatibleQoSInfo),
+        'liveliness': Kind('liveliness_lost', _dds.LIVELINESS_LOST, QoSLivelinessLostInfo),
+        'matched': Kind('publication_matched', _dds.PUBLICATION_MATCHED,
+                        QoSPublisherMatchedInfo)}
     _warning = ("New subscription discovered on topic '{}', requesting incompatible QoS. No "
                 'messages will be sent to it. Last incompatible policy: {}')

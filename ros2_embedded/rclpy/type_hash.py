@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Type hashes."""
 
+from dataclasses import dataclass
 
+
+@dataclass
 class TypeHash:
     """A type's hash: version 1 is RIHS01, 32 bytes."""
 
-    def __init__(self, version: int = -1, value: bytes = bytes(32)) -> None:
-        self.version = version
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, TypeHash) and (
-            self.version, self.value) == (other.version, other.value)
-
-    __hash__ = None  # type: ignore[assignment]
+    version: int = -1
+    value: bytes = bytes(32)
 
     def __str__(self) -> str:
         if self.version != 1 or len(self.value) != 32:

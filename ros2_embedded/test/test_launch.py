@@ -37,7 +37,7 @@ from launch.conditions import (
     InvalidConditionExpressionError,
     UnlessCondition,
 )
-from launch.event_handlers import event_named, OnExecutionComplete, OnProcessExit, OnShutdown
+from launch.event_handlers import event_named, OnProcessExit, OnShutdown
 from launch.launch_description_sources import (
     AnyLaunchDescriptionSource,
     InvalidLaunchFileError,
@@ -223,16 +223,6 @@ def test_locals_last_as_long_as_an_event():
     assert notes == [('Asked', False), (1, 1), ('Asked', False), (1, 2)]
     with pytest.raises(AttributeError, match="does not contain attribute 'nothing'"):
         _ = LaunchContext().locals.nothing
-
-
-def test_execution_complete_comes_when_the_future_is_done():
-    notes = []
-    timer = TimerAction(period=0.05, actions=[note(notes, 'timer')])
-    assert run(
-        RegisterEventHandler(OnExecutionComplete(
-            target_action=timer, on_completion=[note(notes, 'complete')])),
-        timer, note(notes, 'after')) == 0
-    assert notes[0] == 'after' and sorted(notes[1:]) == ['complete', 'timer']
 
 
 def test_timers_and_shutdown():

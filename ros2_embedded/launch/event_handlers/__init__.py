@@ -5,6 +5,8 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, Callable, TYPE_CHECKING
 
+from rosidl_embedded.lacking import lacking
+
 from .._base import (
     Action,
     BaseEventHandler,
@@ -14,12 +16,14 @@ from .._base import (
     LaunchDescriptionEntity,
     SomeEntitiesType,
 )
-from ..events import ExecutionComplete, IncludeLaunchDescription, Shutdown
+from ..events import IncludeLaunchDescription, Shutdown
 from ..events.process import ProcessExited, ProcessIO, ProcessStarted
 from ..utilities import is_a_subclass
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
+
+__getattr__ = lacking(__name__, 'OnExecutionComplete')
 
 SomeTarget = Callable[[Any], bool] | Action | None
 #: Entities to be visited, or what returns some for an event and the context.
@@ -79,16 +83,6 @@ class OnActionEventBase(BaseEventHandler):
 
     def describe(self) -> tuple[str, list[Any]]:
         return super().describe()[0], [*self.__entities]
-
-
-class OnExecutionComplete(OnActionEventBase):
-
-    def __init__(
-        self, *, target_action: SomeTarget = None, on_completion: SomeReaction, **kwargs: Any
-    ) -> None:
-        super().__init__(
-            action_matcher=target_action, on_event=on_completion,
-            target_event_cls=ExecutionComplete, target_action_cls=Action, **kwargs)
 
 
 class OnProcessExit(OnActionEventBase):

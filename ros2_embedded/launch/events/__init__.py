@@ -8,13 +8,6 @@ from .._base import Action, Event
 from . import process as process
 
 
-class ExecutionComplete(Event):
-    """An action, and what its future stands for, has been executed."""
-
-    def __init__(self, *, action: Action) -> None:
-        self.action = action
-
-
 class IncludeLaunchDescription(Event):
     """A launch description is to be visited."""
 
