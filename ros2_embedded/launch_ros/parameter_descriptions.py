@@ -10,11 +10,8 @@ from typing import Any
 from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.frontend.parse_substitution import parse_substitution
 from launch.substitutions import SubstitutionFailure
-from launch.utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from launch.utilities import ensure_argument_type, perform_substitutions
+from launch.utilities import normalize_to_list_of_substitutions as normalize
 from launch.utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 
 
@@ -51,7 +48,7 @@ class Parameter:
         self, name: SomeSubstitutionsType, value: Any, *, value_type: Any = None
     ) -> None:
         ensure_argument_type(name, SomeSubstitutionsType_types_tuple, 'name')
-        self.name: Any = normalize_to_list_of_substitutions(name)
+        self.name: Any = normalize(name)
         self.__parameter_value = ParameterValue(value, value_type=value_type)
         self.__evaluated = False
 
@@ -89,7 +86,7 @@ class ParameterFile:
         ensure_argument_type(allow_substs, bool, 'allow_subst', 'ParameterFile()')
         # Bytes are iterable, but no substitutions.
         self.param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
-            normalize_to_list_of_substitutions(param_file))
+            normalize(param_file))
         self.allow_substs = allow_substs
 
     def evaluate(self, context: LaunchContext) -> Path:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import struct
 from typing import Any
 
+from rclpy._dds import Reader
 from rclpy.exceptions import InvalidHandle
 
 Work = tuple[Callable[..., Any], tuple[Any, ...], Callable[[Any], None] | None]
@@ -20,7 +21,7 @@ class Entity:
 
     callback_group: Any = None
     _destroyed = False
-    _reader: Any
+    _reader: Reader
     _logger_name: str
 
     def __init__(self, *ends: Any) -> None:

@@ -5,13 +5,7 @@ import re
 import string
 from typing import Literal
 
-from rclpy.exceptions import (
-    InvalidNamespaceException,
-    InvalidNodeNameException,
-    InvalidServiceNameException,
-    InvalidTopicNameException,
-    NameValidationException,
-)
+from rclpy import exceptions
 
 _ALPHANUMERIC = re.compile(r'[^A-Za-z0-9_/]')
 _LETTERS = f'{string.ascii_letters}{string.digits}_'
@@ -106,11 +100,17 @@ def topic_name_fault(name: str) -> Fault | None:
     return None
 
 
-def _checked(name: str, fault: Fault | None, error: type[NameValidationException],
+def _checked(name: str, fault: Fault | None, error: type[exceptions.NameValidationException],
              ) -> Literal[True]:
     if fault is not None:
         raise error(name, *fault)  # type: ignore[call-arg, arg-type]
     return True
+
+
+def _topic_error(is_service: bool) -> type[exceptions.NameValidationException]:
+    if is_service:
+        return exceptions.InvalidServiceNameException
+    return exceptions.InvalidTopicNameException
 
 
 def validate_node_name(node_name: str) -> Literal[True]:
@@ -119,7 +119,7 @@ def validate_node_name(node_name: str) -> Literal[True]:
 
     :raises InvalidNodeNameException: if it is invalid.
     """
-    return _checked(node_name, node_name_fault(node_name), InvalidNodeNameException)
+    return _checked(node_name, node_name_fault(node_name), exceptions.InvalidNodeNameException)
 
 
 def validate_namespace(namespace: str) -> Literal[True]:
@@ -128,7 +128,7 @@ def validate_namespace(namespace: str) -> Literal[True]:
 
     :raises InvalidNamespaceException: if it is invalid.
     """
-    return _checked(namespace, namespace_fault(namespace), InvalidNamespaceException)
+    return _checked(namespace, namespace_fault(namespace), exceptions.InvalidNamespaceException)
 
 
 def validate_topic_name(name: str, *, is_service: bool = False) -> Literal[True]:
@@ -137,8 +137,7 @@ def validate_topic_name(name: str, *, is_service: bool = False) -> Literal[True]
 
     :raises InvalidTopicNameException: if it is invalid; for a service its own exception.
     """
-    return _checked(name, topic_name_fault(name), InvalidServiceNameException if is_service
-                    else InvalidTopicNameException)
+    return _checked(name, topic_name_fault(name), _topic_error(is_service))
 
 
 def validate_full_topic_name(name: str, *, is_service: bool = False) -> Literal[True]:
@@ -147,8 +146,7 @@ def validate_full_topic_name(name: str, *, is_service: bool = False) -> Literal[
 
     :raises InvalidTopicNameException: if it is invalid; for a service its own exception.
     """
-    return _checked(name, full_topic_name_fault(name), InvalidServiceNameException if is_service
-                    else InvalidTopicNameException)
+    return _checked(name, full_topic_name_fault(name), _topic_error(is_service))
 
 
 def join(namespace: str, name: str) -> str:

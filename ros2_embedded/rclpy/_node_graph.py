@@ -4,16 +4,9 @@
 from collections.abc import Iterable
 from typing import Any
 
+from rclpy import _names
 from rclpy._dds import Endpoint
 from rclpy._graph import Graph, NodeInfo, user_data_value
-from rclpy._names import (
-    demangle_service,
-    demangle_topic,
-    expand,
-    join,
-    ros_type,
-    validate_full_topic_name,
-)
 from rclpy.exceptions import NodeNameNonExistentError
 from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
@@ -32,15 +25,15 @@ def _collect(pairs: Iterable[tuple[str, str]]) -> NamesAndTypes:
 def _topics(endpoints: Iterable[Endpoint], no_demangle: bool) -> NamesAndTypes:
     if no_demangle:
         return _collect((endpoint.topic, endpoint.type) for endpoint in endpoints)
-    return _collect((name, ros_type(endpoint.type)) for endpoint in endpoints
-                    if (name := demangle_topic(endpoint.topic)) is not None)
+    return _collect((name, _names.ros_type(endpoint.type)) for endpoint in endpoints
+                    if (name := _names.demangle_topic(endpoint.topic)) is not None)
 
 
 def _services(endpoints: Iterable[Endpoint], requests: bool | None = None) -> NamesAndTypes:
     """Services that endpoints are part of; of those of requests, of responses, or (None) both."""
-    return _collect((found[0], found[1]) for endpoint in endpoints
-                    if (found := demangle_service(endpoint.topic, endpoint.type)) is not None
-                    and requests in (None, found[2]))
+    demangled = (_names.demangle_service(one.topic, one.type) for one in endpoints)
+    return _collect(found[:2] for found in demangled
+                    if found is not None and requests in (None, found[2]))
 
 
 class NodeGraph:
@@ -66,7 +59,7 @@ class NodeGraph:
 
     def get_fully_qualified_node_names(self) -> list[str]:
         """List the nodes' names with their namespaces."""
-        return [join(node.namespace, node.name) for node in self._graph.nodes()]
+        return [_names.join(node.namespace, node.name) for node in self._graph.nodes()]
 
     def _of_node(self, name: str, namespace: str, writers: bool) -> list[Endpoint]:
         found = [node for node in self._graph.nodes()
@@ -129,8 +122,8 @@ class NodeGraph:
         return _services(self._all())
 
     def _full(self, name: str, is_service: bool = False) -> str:
-        full = expand(name, self._name, self._namespace)
-        validate_full_topic_name(full, is_service=is_service)
+        full = _names.expand(name, self._name, self._namespace)
+        _names.validate_full_topic_name(full, is_service=is_service)
         return full
 
     def _count(self, dds_topic: str, writers: bool) -> int:
@@ -163,7 +156,7 @@ class NodeGraph:
             TopicEndpointInfo(
                 node_name=nodes.get(one.guid, unknown).name,
                 node_namespace=nodes.get(one.guid, unknown).namespace,
-                topic_type=one.type if no_mangle else ros_type(one.type),
+                topic_type=one.type if no_mangle else _names.ros_type(one.type),
                 topic_type_hash=TypeHash._parse(user_data_value(one, 'typehash')),
                 endpoint_type=kind,
                 endpoint_gid=tuple(one.guid),

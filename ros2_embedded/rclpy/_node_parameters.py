@@ -6,21 +6,8 @@ import math
 from typing import Any
 import warnings
 
-from rcl_interfaces.msg import (
-    ListParametersResult,
-    ParameterDescriptor,
-    ParameterEvent,
-    ParameterValue,
-    SetParametersResult,
-)
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterAlreadyDeclaredException,
-    ParameterImmutableException,
-    ParameterNotDeclaredException,
-    ParameterUninitializedException,
-)
+from rcl_interfaces import msg
+from rclpy import exceptions
 from rclpy.parameter import Parameter, PARAMETER_SEPARATOR_STRING
 from rclpy.validate_parameter_name import validate_parameter_name
 
@@ -28,7 +15,7 @@ Callback = Callable[[list[Parameter]], Any]
 
 
 def _refused(reason: str) -> Any:
-    return SetParametersResult(successful=False, reason=reason)
+    return msg.SetParametersResult(successful=False, reason=reason)
 
 
 class NodeParameters:
@@ -67,7 +54,7 @@ class NodeParameters:
         """
         if value is None and descriptor is None:
             return self.declare_parameters('', [(name,)], ignore_override)[0]
-        described = ParameterDescriptor() if descriptor is None else descriptor
+        described = msg.ParameterDescriptor() if descriptor is None else descriptor
         return self.declare_parameters('', [(name, value, described)], ignore_override)[0]
 
     def declare_parameters(self, namespace: str, parameters: list[tuple[Any, ...]],
@@ -89,8 +76,8 @@ class NodeParameters:
                                 'is not a str.')
             name = f'{namespace}.{name}' if namespace else name
             validate_parameter_name(name)
-            descriptor = item[2] if len(item) > 2 else ParameterDescriptor()
-            if not isinstance(descriptor, ParameterDescriptor):
+            descriptor = item[2] if len(item) > 2 else msg.ParameterDescriptor()
+            if not isinstance(descriptor, msg.ParameterDescriptor):
                 raise TypeError(f'Third element {descriptor} at index {index} in parameters '
                                 'list is not a ParameterDescriptor.')
             if len(item) == 1:
@@ -110,14 +97,14 @@ class NodeParameters:
             descriptors[name] = descriptor
         already = [one.name for one in declared if one.name in self._parameters]
         if already:
-            raise ParameterAlreadyDeclaredException(already)
+            raise exceptions.ParameterAlreadyDeclaredException(already)
         for one in declared:
             result = self._set([one], descriptors, keep_unset=True)
             if not result.successful:
                 if result.reason.startswith('Wrong parameter type'):
-                    raise InvalidParameterTypeException(
+                    raise exceptions.InvalidParameterTypeException(
                         one, Parameter.Type(descriptors[one.name].type).name)
-                raise InvalidParameterValueException(one.name, one.value, result.reason)
+                raise exceptions.InvalidParameterValueException(one.name, one.value, result.reason)
         return [self._parameters[one.name] for one in declared]
 
     @staticmethod
@@ -134,7 +121,7 @@ class NodeParameters:
             descriptor.type = given.value
             return None
         if not descriptor.dynamic_typing:
-            descriptor.type = given.type if isinstance(given, ParameterValue) \
+            descriptor.type = given.type if isinstance(given, msg.ParameterValue) \
                 else Parameter.Type.from_parameter_value(given).value
             if descriptor.type == Parameter.Type.NOT_SET.value:
                 raise ValueError('Cannot declare a statically typed parameter with default value '
@@ -149,9 +136,9 @@ class NodeParameters:
         :raises ParameterImmutableException: if the parameter is read-only.
         """
         if name not in self._parameters:
-            raise ParameterNotDeclaredException(name)
+            raise exceptions.ParameterNotDeclaredException(name)
         if self._descriptors[name].read_only:
-            raise ParameterImmutableException(name)
+            raise exceptions.ParameterImmutableException(name)
         del self._parameters[name]
         del self._descriptors[name]
 
@@ -177,7 +164,7 @@ class NodeParameters:
             return self._parameters[name].type_.value
         if self._allow_undeclared_parameters:
             return Parameter.Type.NOT_SET
-        raise ParameterNotDeclaredException(name)
+        raise exceptions.ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
         """Give parameters; see :meth:`get_parameter`."""
@@ -196,11 +183,11 @@ class NodeParameters:
             parameter = self._parameters[name]
             if parameter.type_ is Parameter.Type.NOT_SET \
                     and not self._descriptors[name].dynamic_typing:
-                raise ParameterUninitializedException(name)
+                raise exceptions.ParameterUninitializedException(name)
             return parameter
         if self._allow_undeclared_parameters:
             return Parameter(name, Parameter.Type.NOT_SET, None)
-        raise ParameterNotDeclaredException(name)
+        raise exceptions.ParameterNotDeclaredException(name)
 
     def get_parameter_or(self, name: str,
                          alternative_value: Parameter | None = None) -> Parameter:
@@ -237,7 +224,7 @@ class NodeParameters:
         def shallow(name: str) -> bool:
             return depth == 0 or name.count(dot) < depth
 
-        result = ListParametersResult()
+        result = msg.ListParametersResult()
         for name in self._parameters:
             if prefixes:
                 wanted = any(name == prefix or name.startswith(prefix + dot)
@@ -284,7 +271,7 @@ class NodeParameters:
         undeclared = [parameter.name for parameter in parameter_list
                       if parameter.name not in self._parameters]
         if undeclared and not self._allow_undeclared_parameters:
-            raise ParameterNotDeclaredException(undeclared)
+            raise exceptions.ParameterNotDeclaredException(undeclared)
         return self._set(parameter_list, None, keep_unset=False)
 
     def _set(self, parameters: list[Parameter], descriptors: dict[str, Any] | None,
@@ -305,7 +292,7 @@ class NodeParameters:
             result = callback(parameters)
             if not result.successful:
                 return result
-        event = ParameterEvent()
+        event = msg.ParameterEvent()
         for parameter in parameters:
             message = parameter.to_parameter_msg()
             if parameter.type_ is Parameter.Type.NOT_SET and not keep_unset:
@@ -316,7 +303,7 @@ class NodeParameters:
             if descriptors is not None:
                 self._descriptors[parameter.name] = descriptors[parameter.name]
             elif parameter.name not in self._descriptors:
-                self._descriptors[parameter.name] = ParameterDescriptor(
+                self._descriptors[parameter.name] = msg.ParameterDescriptor(
                     name=parameter.name, dynamic_typing=True)
             before = self.get_parameter_or(parameter.name).type_
             (event.new_parameters if before is Parameter.Type.NOT_SET
@@ -325,7 +312,7 @@ class NodeParameters:
         self._publish_parameter_event(event)
         for callback in self._post_set_parameters_callbacks:
             callback(parameters)
-        return SetParametersResult(successful=True)
+        return msg.SetParametersResult(successful=True)
 
     def _check(self, parameter: Parameter, descriptor: Any, check_read_only: bool) -> Any:
         """Say whether a descriptor allows a value."""
@@ -344,7 +331,7 @@ class NodeParameters:
             return self._check_range(parameter, descriptor.integer_range[0])
         if parameter.type_ is Parameter.Type.DOUBLE and descriptor.floating_point_range:
             return self._check_range(parameter, descriptor.floating_point_range[0])
-        return SetParametersResult(successful=True)
+        return msg.SetParametersResult(successful=True)
 
     def _check_range(self, parameter: Parameter, limits: Any) -> Any:
         low = min(limits.from_value, limits.to_value)
@@ -356,7 +343,7 @@ class NodeParameters:
             return one == other if exact else math.isclose(one, other, rel_tol=self.PARAM_REL_TOL)
 
         if equal(value, low) or equal(value, high):
-            return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=True)
         about = f'in: {low}, Max: {high}, value: {value}'
         if not low < value < high:
             return _refused(f'Parameter {parameter.name} out of range{"." if exact else ""} '
@@ -365,7 +352,7 @@ class NodeParameters:
             close = 'a valid step' if exact else 'close enough to a valid step'
             return _refused(f'The parameter value for {parameter.name} is not {close}. Min: {low},'
                             f' max: {high}, value: {value}, step: {step}')
-        return SetParametersResult(successful=True)
+        return msg.SetParametersResult(successful=True)
 
     # --- descriptors ---
 
@@ -378,8 +365,8 @@ class NodeParameters:
         if name in self._descriptors:
             return self._descriptors[name]
         if self._allow_undeclared_parameters:
-            return ParameterDescriptor()
-        raise ParameterNotDeclaredException(name)
+            return msg.ParameterDescriptor()
+        raise exceptions.ParameterNotDeclaredException(name)
 
     def describe_parameters(self, names: list[str]) -> list[Any]:
         """Give parameters' descriptors."""

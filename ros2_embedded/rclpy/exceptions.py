@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rclpy raises."""
 
-from functools import partialmethod
 from typing import Any
 
 
@@ -55,25 +54,29 @@ class NameValidationException(Exception):
 class InvalidNamespaceException(NameValidationException):
     """A namespace is invalid."""
 
-    __init__ = partialmethod(NameValidationException.__init__, 'namespace')
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__('namespace', name, error_msg, invalid_index)
 
 
 class InvalidNodeNameException(NameValidationException):
     """A node's name is invalid."""
 
-    __init__ = partialmethod(NameValidationException.__init__, 'node name')
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__('node name', name, error_msg, invalid_index)
 
 
 class InvalidTopicNameException(NameValidationException):
     """A topic's name is invalid."""
 
-    __init__ = partialmethod(NameValidationException.__init__, 'topic name')
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__('topic name', name, error_msg, invalid_index)
 
 
 class InvalidServiceNameException(NameValidationException):
     """A service's name is invalid."""
 
-    __init__ = partialmethod(NameValidationException.__init__, 'service name')
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__('service name', name, error_msg, invalid_index)
 
 
 class ParameterException(Exception):
@@ -86,20 +89,22 @@ class ParameterException(Exception):
 class ParameterNotDeclaredException(ParameterException):
     """A parameter was used that nobody declared."""
 
-    __init__ = partialmethod(
-        ParameterException.__init__, 'Invalid access to undeclared parameter(s)')
+    def __init__(self, parameters: str | list[str]) -> None:
+        super().__init__('Invalid access to undeclared parameter(s)', parameters)
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
     """A parameter was declared twice."""
 
-    __init__ = partialmethod(ParameterException.__init__, 'Parameter(s) already declared')
+    def __init__(self, parameters: str | list[str]) -> None:
+        super().__init__('Parameter(s) already declared', parameters)
 
 
 class InvalidParameterException(ParameterException):
     """A parameter's name is invalid."""
 
-    __init__ = partialmethod(ParameterException.__init__, 'Invalid parameter name')
+    def __init__(self, parameter_name: str) -> None:
+        super().__init__('Invalid parameter name', parameter_name)
 
 
 class InvalidParameterTypeException(ParameterException):
@@ -123,8 +128,8 @@ class InvalidParameterValueException(ParameterException):
 class ParameterImmutableException(ParameterException):
     """A read-only parameter was to be changed."""
 
-    __init__ = partialmethod(
-        ParameterException.__init__, 'Attempted to modify read-only parameter')
+    def __init__(self, parameter_name: str) -> None:
+        super().__init__('Attempted to modify read-only parameter', parameter_name)
 
 
 class ParameterUninitializedException(ParameterException):

@@ -43,4 +43,4 @@ class _Finder:
             raise ImportError(str(NotEmbeddedError(name)), name=name)
 
 
-sys.meta_path.append(_Finder)  # type: ignore[arg-type]
+sys.meta_path.append(_Finder)

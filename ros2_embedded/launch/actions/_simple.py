@@ -8,15 +8,7 @@ from typing import Any, Callable, Iterable, List, TYPE_CHECKING
 
 import launch.logging
 
-from .._base import (
-    Action,
-    BaseEventHandler,
-    Conditional,
-    Entities,
-    Event,
-    ParsedAction,
-    SomeSubstitutionsType,
-)
+from .. import _base
 from ..events import Shutdown as ShutdownEvent
 from ..events.process import ProcessExited
 from ..frontend.expose import expose_action
@@ -53,11 +45,11 @@ def parse_pairs(
     return pairs
 
 
-class _Named(Action):
+class _Named(_base.Action):
 
     _texts = {'name': 'name'}
 
-    def __init__(self, name: SomeSubstitutionsType, **kwargs: Any) -> None:
+    def __init__(self, name: _base.SomeSubstitutionsType, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.name = normalize(name)
 
@@ -67,7 +59,7 @@ class _NamedValue(_Named):
     _texts = {'name': 'name', 'value': 'value'}
 
     def __init__(
-        self, name: SomeSubstitutionsType, value: SomeSubstitutionsType, **kwargs: Any
+        self, name: _base.SomeSubstitutionsType, value: _base.SomeSubstitutionsType, **kwargs: Any
     ) -> None:
         super().__init__(name, **kwargs)
         self.value = normalize(value)
@@ -95,9 +87,9 @@ class AppendEnvironmentVariable(_NamedValue):
     _typed = {'prepend': bool}
 
     def __init__(
-        self, name: SomeSubstitutionsType, value: SomeSubstitutionsType,
-        prepend: bool | SomeSubstitutionsType = False,
-        separator: SomeSubstitutionsType = os.pathsep, **kwargs: Any
+        self, name: _base.SomeSubstitutionsType, value: _base.SomeSubstitutionsType,
+        prepend: bool | _base.SomeSubstitutionsType = False,
+        separator: _base.SomeSubstitutionsType = os.pathsep, **kwargs: Any
     ) -> None:
         super().__init__(name, value, **kwargs)
         self.prepend = normalize_typed_substitution(prepend, bool)
@@ -112,20 +104,20 @@ class AppendEnvironmentVariable(_NamedValue):
         context.environment[name] = perform_substitutions(context, self.separator).join(parts)
 
 
-class PushEnvironment(Action):
+class PushEnvironment(_base.Action):
 
     def execute(self, context: LaunchContext) -> None:
         context._push_environment()
 
 
-class PopEnvironment(Action):
+class PopEnvironment(_base.Action):
 
     def execute(self, context: LaunchContext) -> None:
         context._pop_environment()
 
 
 @expose_action('reset_env')
-class ResetEnvironment(Action):
+class ResetEnvironment(_base.Action):
 
     def execute(self, context: LaunchContext) -> None:
         context._reset_environment()
@@ -145,20 +137,20 @@ class UnsetLaunchConfiguration(_Named):
         context.launch_configurations.pop(perform_substitutions(context, self.name), None)
 
 
-class PushLaunchConfigurations(Action):
+class PushLaunchConfigurations(_base.Action):
 
     def execute(self, context: LaunchContext) -> None:
         context._push_launch_configurations()
 
 
-class PopLaunchConfigurations(Action):
+class PopLaunchConfigurations(_base.Action):
 
     def execute(self, context: LaunchContext) -> None:
         context._pop_launch_configurations()
 
 
 @expose_action('reset')
-class ResetLaunchConfigurations(Action):
+class ResetLaunchConfigurations(_base.Action):
     """Removes all launch configurations and sets the given ones, evaluated before that."""
 
     def __init__(
@@ -168,13 +160,13 @@ class ResetLaunchConfigurations(Action):
         self.__launch_configurations = launch_configurations or {}
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['launch_configurations'] = parse_pairs(entity, parser, 'keep')
         return cls, kwargs
 
     def execute(self, context: LaunchContext) -> None:
-        def text(given: SomeSubstitutionsType) -> str:
+        def text(given: _base.SomeSubstitutionsType) -> str:
             return perform_substitutions(context, normalize(given))
 
         kept = {text(name): text(value) for name, value in self.__launch_configurations.items()}
@@ -183,7 +175,7 @@ class ResetLaunchConfigurations(Action):
 
 
 @expose_action('arg')
-class DeclareLaunchArgument(Action):
+class DeclareLaunchArgument(_base.Action):
     """
     Declares a launch configuration that can be given to the launch file.
 
@@ -195,7 +187,7 @@ class DeclareLaunchArgument(Action):
     _texts = {'default_value': 'default?'}
 
     def __init__(
-        self, name: str, *, default_value: SomeSubstitutionsType | None = None,
+        self, name: str, *, default_value: _base.SomeSubstitutionsType | None = None,
         description: str | None = None, choices: list[str] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
@@ -218,7 +210,7 @@ class DeclareLaunchArgument(Action):
         self._conditionally_included = False
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['name'] = parser.escape_characters(entity.get_attr('name'))
         description = entity.get_attr('description', optional=True)
@@ -249,15 +241,15 @@ class DeclareLaunchArgument(Action):
                           f'Valid options are: {self.choices}')
 
 
-class EmitEvent(Action):
+class EmitEvent(_base.Action):
 
-    def __init__(self, *, event: Event, **kwargs: Any) -> None:
+    def __init__(self, *, event: _base.Event, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        if not is_a_subclass(event, Event):
+        if not is_a_subclass(event, _base.Event):
             raise RuntimeError(f"EmitEvent() expected an event instance, got '{event}'.")
         self.event = event
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         context.emit_event_sync(self.event)
         return None
 
@@ -270,7 +262,7 @@ class Shutdown(EmitEvent):
     def __init__(self, *, reason: Any = 'reason not given', **kwargs: Any) -> None:
         super().__init__(event=ShutdownEvent(reason=reason), **kwargs)
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         event = context.get_locals_as_dict().get('event')
         if isinstance(event, ProcessExited):
             _logger.info(
@@ -279,11 +271,11 @@ class Shutdown(EmitEvent):
 
 
 @expose_action('log')
-class LogInfo(Action):
+class LogInfo(_base.Action):
 
     _texts = {'msg': 'message'}
 
-    def __init__(self, *, msg: SomeSubstitutionsType, **kwargs: Any) -> None:
+    def __init__(self, *, msg: _base.SomeSubstitutionsType, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.msg = normalize(msg)
         self.__logger = launch.logging.get_logger('launch.user')
@@ -292,21 +284,21 @@ class LogInfo(Action):
         self.__logger.info(perform_substitutions(context, self.msg))
 
 
-class RegisterEventHandler(Action):
+class RegisterEventHandler(_base.Action):
 
-    def __init__(self, event_handler: BaseEventHandler, **kwargs: Any) -> None:
+    def __init__(self, event_handler: _base.BaseEventHandler, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.event_handler = event_handler
 
     def execute(self, context: LaunchContext) -> None:
         context.register_event_handler(self.event_handler)
 
-    def describe_conditional_sub_entities(self) -> Conditional:
+    def describe_conditional_sub_entities(self) -> _base.Conditional:
         text, entities = self.event_handler.describe()
         return [(text, normalize_to_list_of_entities(entities))] if entities else []
 
 
-class OpaqueFunction(Action):
+class OpaqueFunction(_base.Action):
     """Calls ``function(context, *args, **kwargs)`` and visits the entities it returns."""
 
     def __init__(
@@ -321,6 +313,6 @@ class OpaqueFunction(Action):
         self.__args = args or ()
         self.__kwargs = kwargs or {}
 
-    def execute(self, context: LaunchContext) -> Entities | None:
-        entities: Entities | None = self.__function(context, *self.__args, **self.__kwargs)
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
+        entities: _base.Entities | None = self.__function(context, *self.__args, **self.__kwargs)
         return entities

@@ -10,26 +10,14 @@ import warnings
 
 import launch.logging
 
-from .._base import (
-    Action,
-    Conditional,
-    Entities,
-    EventHandler,
-    LaunchDescriptionEntity,
-    ParsedAction,
-    SomeEntitiesType,
-    SomeSubstitutionsType,
-)
+from .. import _base
 from ..event_handlers import OnShutdown
 from ..events import TimerEvent
 from ..frontend.expose import expose_action
 from ..launch_context import LaunchContext
 from ..launch_description import LaunchDescriptionSource
-from ..utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from ..utilities import ensure_argument_type, perform_substitutions
+from ..utilities import normalize_to_list_of_substitutions as normalize
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 from . import _simple as simple
 
@@ -40,7 +28,7 @@ __all__ = ['GroupAction', 'IncludeLaunchDescription', 'TimerAction']
 
 
 @expose_action('group')
-class GroupAction(Action):
+class GroupAction(_base.Action):
     """
     Actions that belong together.
 
@@ -53,7 +41,7 @@ class GroupAction(Action):
     _typed = {'scoped': bool, 'forwarding': bool}
 
     def __init__(
-        self, actions: Iterable[Action], *, scoped: bool = True, forwarding: bool = True,
+        self, actions: Iterable[_base.Action], *, scoped: bool = True, forwarding: bool = True,
         launch_configurations: dict[Any, Any] | None = None, **left_over_kwargs: Any
     ) -> None:
         super().__init__(**left_over_kwargs)
@@ -61,10 +49,10 @@ class GroupAction(Action):
         self.__scoped = scoped
         self.__forwarding = forwarding
         self.__launch_configurations = launch_configurations or {}
-        self.__actions_to_return: Entities | None = None
+        self.__actions_to_return: _base.Entities | None = None
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['launch_configurations'] = simple.parse_pairs(entity, parser, 'keep')
         kwargs['actions'] = [
@@ -72,11 +60,12 @@ class GroupAction(Action):
             if child.type_name != 'keep']
         return cls, kwargs
 
-    def get_sub_entities(self) -> Entities:
+    def get_sub_entities(self) -> _base.Entities:
         if self.__actions_to_return is None:
             kept = self.__launch_configurations
-            before: Entities = [simple.SetLaunchConfiguration(*pair) for pair in kept.items()]
-            after: Entities = []
+            before: _base.Entities = [
+                simple.SetLaunchConfiguration(*pair) for pair in kept.items()]
+            after: _base.Entities = []
             if self.__scoped:
                 if not self.__forwarding:
                     before = [simple.ResetEnvironment(),
@@ -87,19 +76,19 @@ class GroupAction(Action):
             self.__actions_to_return = [*before, *self.__actions, *after]
         return self.__actions_to_return
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         return self.get_sub_entities()
 
 
 @expose_action('include')
-class IncludeLaunchDescription(Action):
+class IncludeLaunchDescription(_base.Action):
     """Sets launch configurations, then visits a launch description from elsewhere."""
 
     _texts = {'launch_description_source': 'file'}
 
     def __init__(
         self,
-        launch_description_source: LaunchDescriptionSource | SomeSubstitutionsType, *,
+        launch_description_source: LaunchDescriptionSource | _base.SomeSubstitutionsType, *,
         launch_arguments: Iterable[tuple[Any, Any]] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
@@ -111,17 +100,17 @@ class IncludeLaunchDescription(Action):
         self.__logger = launch.logging.get_logger(__name__)
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['launch_arguments'] = (simple.parse_pairs(entity, parser, 'arg') or {}).items()
         return cls, kwargs
 
-    def get_sub_entities(self) -> Entities:
+    def get_sub_entities(self) -> _base.Entities:
         description = self.launch_description_source.try_get_launch_description_without_context()
         return [] if description is None else [description]
 
     def __argument_names(self, context: LaunchContext) -> list[str]:
-        return [perform_substitutions(context, normalize_to_list_of_substitutions(name))
+        return [perform_substitutions(context, normalize(name))
                 for name, _ in self.launch_arguments]
 
     def _argument_names_without_context(self) -> list[str]:
@@ -131,7 +120,7 @@ class IncludeLaunchDescription(Action):
             self.__logger.debug(f'No names of launch arguments without a context: {exc}')
         return []
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         source = self.launch_description_source
         description = source.get_launch_description(context)
         path = os.path.abspath(source.location)
@@ -155,15 +144,15 @@ class IncludeLaunchDescription(Action):
 
 
 @expose_action('timer')
-class TimerAction(Action):
+class TimerAction(_base.Action):
     """Visits actions when a period, in seconds, has passed."""
 
     _typed = {'period': float, 'cancel_on_shutdown': bool}
 
     def __init__(
-        self, *, period: float | SomeSubstitutionsType,
-        actions: Iterable[LaunchDescriptionEntity],
-        cancel_on_shutdown: bool | SomeSubstitutionsType = True, **kwargs: Any
+        self, *, period: float | _base.SomeSubstitutionsType,
+        actions: Iterable[_base.LaunchDescriptionEntity],
+        cancel_on_shutdown: bool | _base.SomeSubstitutionsType = True, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
         ensure_argument_type(actions, collections.abc.Iterable, 'actions', 'TimerAction')
@@ -181,12 +170,12 @@ class TimerAction(Action):
         self.__logger = launch.logging.get_logger(__name__)
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
         kwargs['actions'] = [parser.parse_action(child) for child in entity.children]
         return cls, kwargs
 
-    def describe_conditional_sub_entities(self) -> Conditional:
+    def describe_conditional_sub_entities(self) -> _base.Conditional:
         return [(f'{self.period} seconds pass without being canceled', self.actions)]
 
     async def _wait_to_fire_event(self, context: LaunchContext) -> None:
@@ -198,7 +187,7 @@ class TimerAction(Action):
             await context.emit_event(TimerEvent(timer_action=self))
         self._completed_future.set_result(None)
 
-    def handle(self, context: LaunchContext) -> SomeEntitiesType | None:
+    def handle(self, context: LaunchContext) -> _base.SomeEntitiesType | None:
         """Return what is to be visited, in the locals of when the timer was started."""
         context.extend_locals(self.__context_locals)
         return self.actions
@@ -209,7 +198,7 @@ class TimerAction(Action):
         if self._canceled_future is not None and not self._canceled_future.done():
             self._canceled_future.set_result(True)
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         self._completed_future = context.asyncio_loop.create_future()
         self._canceled_future = context.asyncio_loop.create_future()
         if self.__canceled:
@@ -219,7 +208,7 @@ class TimerAction(Action):
             return None
         if '_TimerAction__event_handler_has_been_installed' not in vars(context):
             # One handler does for all timers of a launch.
-            context.register_event_handler(EventHandler(
+            context.register_event_handler(_base.EventHandler(
                 matcher=lambda event: isinstance(event, TimerEvent),
                 entities=simple.OpaqueFunction(
                     function=lambda context: context.locals.event.timer_action.handle(context))))

@@ -13,28 +13,11 @@ from typing import Any, Callable, Iterator
 
 import launch.logging
 
-from .._base import (
-    Action,
-    BaseEventHandler,
-    Entities,
-    Event,
-    EventHandler,
-    SomeSubstitutionsType,
-    Substitution,
-)
+from .. import _base
 from ..conditions import evaluate_condition_expression
 from ..descriptions import Executable
 from ..event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown, SomeReaction
-from ..events import matches_action
-from ..events.process import (
-    ProcessExited,
-    ProcessIO,
-    ProcessStarted,
-    ProcessStderr,
-    ProcessStdout,
-    ShutdownProcess,
-    SignalProcess,
-)
+from ..events import matches_action, process
 from ..launch_context import LaunchContext
 from ..substitutions import LaunchConfiguration, PythonExpression
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
@@ -140,7 +123,7 @@ async def _start_process(
     return transport, protocol
 
 
-class ExecuteLocal(Action):
+class ExecuteLocal(_base.Action):
     """
     Executes something, and emits events for its start, output and end.
 
@@ -159,12 +142,12 @@ class ExecuteLocal(Action):
 
     def __init__(
         self, *, process_description: Executable, shell: bool = False,
-        sigterm_timeout: SomeSubstitutionsType = _SIGTERM_TIMEOUT,
-        sigkill_timeout: SomeSubstitutionsType = _SIGKILL_TIMEOUT,
+        sigterm_timeout: _base.SomeSubstitutionsType = _SIGTERM_TIMEOUT,
+        sigkill_timeout: _base.SomeSubstitutionsType = _SIGKILL_TIMEOUT,
         emulate_tty: bool = False, output: Any = 'log',
         output_format: str = '[{this.process_description.final_name}] {line}',
         cached_output: bool = False, log_cmd: bool = False, on_exit: SomeReaction = None,
-        respawn: bool | SomeSubstitutionsType = False, respawn_delay: float | None = None,
+        respawn: bool | _base.SomeSubstitutionsType = False, respawn_delay: float | None = None,
         respawn_max_retries: int = -1, **kwargs: Any
     ) -> None:
         super().__init__(**kwargs)
@@ -174,7 +157,7 @@ class ExecuteLocal(Action):
         self.sigkill_timeout = normalize_to_list_of_substitutions(sigkill_timeout)
         self.emulate_tty = emulate_tty
         output = os.environ.get('OVERRIDE_LAUNCH_PROCESS_OUTPUT', output)
-        self.output: dict[str, Any] | list[Substitution] = (
+        self.output: dict[str, Any] | list[_base.Substitution] = (
             output if isinstance(output, dict) else normalize_to_list_of_substitutions(output))
         self.__output_format = output_format
         self.__log_cmd = log_cmd
@@ -216,10 +199,12 @@ class ExecuteLocal(Action):
                                f"proc '{self.process_description.name}'")
         return output.text
 
-    def get_sub_entities(self) -> Entities:
+    def get_sub_entities(self) -> _base.Entities:
         return self.__on_exit if isinstance(self.__on_exit, list) else []
 
-    def _shutdown_process(self, context: LaunchContext, *, send_sigint: bool) -> Entities | None:
+    def _shutdown_process(
+        self, context: LaunchContext, *, send_sigint: bool
+    ) -> _base.Entities | None:
         if self.__shutdown_future is None or self.__shutdown_future.done():
             return None
         if self.__completed_future is None or self.__completed_future.done():
@@ -237,30 +222,32 @@ class ExecuteLocal(Action):
             'float(', *self.sigterm_timeout, ') + float(', *self.sigkill_timeout, ')'))
         self.__shutdown_timers = [self.__escalate(self.sigterm_timeout, 'SIGINT', 'SIGTERM'),
                                   self.__escalate([both], 'SIGTERM', 'SIGKILL')]
-        actions: Entities = [*self.__shutdown_timers]
+        actions: _base.Entities = [*self.__shutdown_timers]
         if send_sigint:
-            actions.append(EmitEvent(event=SignalProcess(
+            actions.append(EmitEvent(event=process.SignalProcess(
                 signal_number=signal.SIGINT, process_matcher=matches_action(self))))
         return actions
 
-    def __escalate(self, period: list[Substitution], received: str, name: str) -> TimerAction:
+    def __escalate(
+        self, period: list[_base.Substitution], received: str, name: str
+    ) -> TimerAction:
         def report(context: LaunchContext) -> None:
             seconds = perform_substitutions(context, period)
             self.__logger.error(
                 f"process[{context.locals.process_name}] failed to terminate '{seconds}' "
                 f"seconds after receiving '{received}', escalating to '{name}'")
 
-        event = SignalProcess(signal_number=name, process_matcher=matches_action(self))
+        event = process.SignalProcess(signal_number=name, process_matcher=matches_action(self))
         return TimerAction(
             period=period, cancel_on_shutdown=False,
             actions=[OpaqueFunction(function=report), EmitEvent(event=event)])
 
-    def __on_shutdown(self, event: Any, context: LaunchContext) -> Entities | None:
+    def __on_shutdown(self, event: Any, context: LaunchContext) -> _base.Entities | None:
         # A terminal sends SIGINT to the process too.
         interrupted = event.due_to_sigint and not context.noninteractive
         return self._shutdown_process(context, send_sigint=not interrupted)
 
-    def __on_shutdown_process_event(self, context: LaunchContext) -> Entities | None:
+    def __on_shutdown_process_event(self, context: LaunchContext) -> _base.Entities | None:
         if not context.locals.event.process_matcher(self):
             return None
         return self._shutdown_process(context, send_sigint=True)
@@ -287,14 +274,14 @@ class ExecuteLocal(Action):
             self.__logger.debug(
                 f"signal '{event.signal_name}' not sent to '{name}' because it has closed already")
 
-    def __on_process_stdin(self, event: ProcessIO) -> None:
+    def __on_process_stdin(self, event: process.ProcessIO) -> None:
         self.__logger.warning(f"in ExecuteProcess('{id(self)}').__on_process_stdin_event()")
 
     def __log(self, logger: logging.Logger, lines: Iterator[str]) -> None:
         for line in lines:
             logger.info(self.__output_format.format(line=line, this=self))
 
-    def __flush_buffers(self, event: Event, context: LaunchContext) -> None:
+    def __flush_buffers(self, event: _base.Event, context: LaunchContext) -> None:
         ended = self.__shutdown_future is None or self.__shutdown_future.done()
         self.__log(self.__stdout_logger, self.__stdout_buffer.rest(ended))
         self.__log(self.__stderr_logger, self.__stderr_buffer.rest(ended))
@@ -317,19 +304,22 @@ class ExecuteLocal(Action):
             self.__logger.info(f'process started with pid [{pid}]')
             details['pid'] = pid
 
+        def on_data(kind: type[process.ProcessIO], data: bytes) -> None:
+            context.emit_event_sync(kind(text=data, **details))
+
         try:
             transport, protocol = await _start_process(
                 lambda: Protocol(on_start, {
-                    1: lambda data: context.emit_event_sync(ProcessStdout(text=data, **details)),
-                    2: lambda data: context.emit_event_sync(ProcessStderr(text=data, **details)),
-                }), cmd=cmd, cwd=cwd, env=env, shell=self.shell, emulate_tty=emulate_tty)
+                    1: functools.partial(on_data, process.ProcessStdout),
+                    2: functools.partial(on_data, process.ProcessStderr)}),
+                cmd=cmd, cwd=cwd, env=env, shell=self.shell, emulate_tty=emulate_tty)
         except Exception:  # noqa: BLE001 - The launch goes on without this process.
             self.__logger.error(
                 f'exception occurred while executing process:\n{traceback.format_exc()}')
             self.__cleanup()
             return
         self._subprocess_transport, self._subprocess_protocol = transport, protocol
-        await context.emit_event(ProcessStarted(**details))
+        await context.emit_event(process.ProcessStarted(**details))
         returncode = await protocol.complete
         pid = transport.get_pid()
         if returncode == 0:
@@ -337,7 +327,7 @@ class ExecuteLocal(Action):
         else:
             self.__logger.error(
                 f"process has died [pid {pid}, exit code {returncode}, cmd '{words}'].")
-        await context.emit_event(ProcessExited(returncode=returncode, **details))
+        await context.emit_event(process.ProcessExited(returncode=returncode, **details))
         if await self.__wait_to_respawn(context):
             context.asyncio_loop.create_task(self.__execute_process(context))
         else:
@@ -371,7 +361,7 @@ class ExecuteLocal(Action):
             'cwd': description.final_cwd, 'env': description.final_env}
         self.__respawn = perform_typed_substitution(context, self.__respawn, bool)
 
-    def execute(self, context: LaunchContext) -> Entities | None:
+    def execute(self, context: LaunchContext) -> _base.Entities | None:
         """
         Start the process, in the background.
 
@@ -395,12 +385,12 @@ class ExecuteLocal(Action):
             perform_substitutions(context, self.output))
         self.__stdout_logger, self.__stderr_logger = (
             launch.logging.get_output_loggers(name, output))
-        handlers: list[BaseEventHandler] = [
-            EventHandler(
-                matcher=lambda event: isinstance(event, ShutdownProcess),
+        handlers: list[_base.BaseEventHandler] = [
+            _base.EventHandler(
+                matcher=lambda event: isinstance(event, process.ShutdownProcess),
                 entities=OpaqueFunction(function=self.__on_shutdown_process_event)),
-            EventHandler(
-                matcher=lambda event: isinstance(event, SignalProcess),
+            _base.EventHandler(
+                matcher=lambda event: isinstance(event, process.SignalProcess),
                 entities=OpaqueFunction(function=self.__on_signal_process_event)),
             OnProcessIO(
                 target_action=self, on_stdin=self.__on_process_stdin,

@@ -7,15 +7,7 @@ from typing import Any, Callable, TYPE_CHECKING
 
 from rosidl_embedded.lacking import lacking
 
-from .._base import (
-    Action,
-    BaseEventHandler,
-    Entities,
-    Event,
-    EventHandler,
-    LaunchDescriptionEntity,
-    SomeEntitiesType,
-)
+from .. import _base
 from ..events import IncludeLaunchDescription, Shutdown
 from ..events.process import ProcessExited, ProcessIO, ProcessStarted
 from ..utilities import is_a_subclass
@@ -25,17 +17,17 @@ if TYPE_CHECKING:
 
 __getattr__ = lacking(__name__, 'OnExecutionComplete')
 
-SomeTarget = Callable[[Any], bool] | Action | None
+SomeTarget = Callable[[Any], bool] | _base.Action | None
 #: Entities to be visited, or what returns some for an event and the context.
-SomeReaction = SomeEntitiesType | Callable[[Any, Any], SomeEntitiesType | None] | None
-OnOutput = Callable[[ProcessIO], SomeEntitiesType | None] | None
+SomeReaction = _base.SomeEntitiesType | Callable[[Any, Any], _base.SomeEntitiesType | None] | None
+OnOutput = Callable[[ProcessIO], _base.SomeEntitiesType | None] | None
 
 
-def event_named(name: str) -> Callable[[Event], bool]:
+def event_named(name: str) -> Callable[[_base.Event], bool]:
     return lambda event: event.name == name
 
 
-class OnActionEventBase(BaseEventHandler):
+class OnActionEventBase(_base.BaseEventHandler):
     """
     Answers events that concern an action.
 
@@ -46,38 +38,38 @@ class OnActionEventBase(BaseEventHandler):
     """
 
     def __init__(
-        self, *, action_matcher: SomeTarget, on_event: Any, target_event_cls: type[Event],
-        target_action_cls: type[Action], **kwargs: Any
+        self, *, action_matcher: SomeTarget, on_event: Any, target_event_cls: type[_base.Event],
+        target_action_cls: type[_base.Action], **kwargs: Any
     ) -> None:
         is_action = isinstance(action_matcher, target_action_cls)
         if not is_action and action_matcher is not None and not callable(action_matcher):
             raise TypeError(f"action_matcher must be an '{target_action_cls.__name__}' instance "
                             'or a callable')
 
-        def matches(event: Event) -> bool:
+        def matches(event: _base.Event) -> bool:
             if not isinstance(event, target_event_cls):
                 return False
-            action: Action = event.action  # type: ignore[attr-defined]
+            action: _base.Action = event.action  # type: ignore[attr-defined]
             if callable(action_matcher):
                 return bool(action_matcher(action))
             return action_matcher is None or action is action_matcher
 
         super().__init__(matcher=matches, **kwargs)
         self.__on_event = on_event if callable(on_event) else None
-        self.__entities: Entities = []
+        self.__entities: _base.Entities = []
         if isinstance(on_event, collections.abc.Iterable):
             self.__entities = list(on_event)
         elif self.__on_event is None and on_event is not None:
             self.__entities = [on_event]
         for entity in self.__entities:
-            if not isinstance(entity, LaunchDescriptionEntity):
+            if not isinstance(entity, _base.LaunchDescriptionEntity):
                 raise TypeError("expected all items in 'on_event' iterable to be of type "
                                 f"'LaunchDescriptionEntity' but got '{type(entity)}'")
 
-    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
+    def handle(self, event: _base.Event, context: LaunchContext) -> _base.SomeEntitiesType | None:
         super().handle(event, context)
         if self.__on_event is not None:
-            entities: SomeEntitiesType | None = self.__on_event(event, context)
+            entities: _base.SomeEntitiesType | None = self.__on_event(event, context)
             return entities
         return self.__entities
 
@@ -104,7 +96,7 @@ class OnProcessIO(OnActionEventBase):
     ) -> None:
         from ..actions import ExecuteLocal
 
-        def handle(event: ProcessIO, _: LaunchContext) -> SomeEntitiesType | None:
+        def handle(event: ProcessIO, _: LaunchContext) -> _base.SomeEntitiesType | None:
             handler = (
                 on_stdout if event.from_stdout else on_stderr if event.from_stderr else on_stdin)
             return None if handler is None else handler(event)
@@ -125,7 +117,7 @@ class OnProcessStart(OnActionEventBase):
             target_event_cls=ProcessStarted, target_action_cls=ExecuteProcess, **kwargs)
 
 
-class OnIncludeLaunchDescription(EventHandler):
+class OnIncludeLaunchDescription(_base.EventHandler):
     """Visits what IncludeLaunchDescription events carry."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -137,13 +129,13 @@ class OnIncludeLaunchDescription(EventHandler):
             **kwargs)
 
 
-class OnShutdown(BaseEventHandler):
+class OnShutdown(_base.BaseEventHandler):
 
     def __init__(self, *, on_shutdown: SomeReaction, **kwargs: Any) -> None:
         super().__init__(matcher=lambda event: is_a_subclass(event, Shutdown), **kwargs)
         self.__on_shutdown = on_shutdown
 
-    def handle(self, event: Event, context: LaunchContext) -> SomeEntitiesType | None:
+    def handle(self, event: _base.Event, context: LaunchContext) -> _base.SomeEntitiesType | None:
         super().handle(event, context)
         if callable(self.__on_shutdown):
             return self.__on_shutdown(event, context)

@@ -5,31 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, List
 
-from launch import (
-    Action,
-    LaunchContext,
-    LaunchDescriptionEntity,
-    SomeSubstitutionsType,
-    SomeSubstitutionsType_types_tuple,
-)
-from launch._base import ParsedAction
+import launch
+from launch import LaunchContext
+from launch._base import Entities, ParsedAction
 from launch.frontend import Entity, expose_action, Parser
 import launch.logging
-from launch.utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from launch.utilities import ensure_argument_type, perform_substitutions
+from launch.utilities import normalize_to_list_of_substitutions as normalize
 
 from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import call_service, get_ros_node
+from ..utilities import parameters as ros_parameters
 from ..utilities.names import count_node_name, make_namespace_absolute, prefix_namespace
-from ..utilities.parameters import (
-    evaluate_parameters,
-    normalize_parameter_dict,
-    to_parameters_list,
-)
 from .node import Node
 
 
@@ -43,7 +31,7 @@ class ComposableNodeContainer(Node):
     """Executes a container, and has it load composable nodes."""
 
     def __init__(
-        self, *, name: SomeSubstitutionsType, namespace: SomeSubstitutionsType,
+        self, *, name: launch.SomeSubstitutionsType, namespace: launch.SomeSubstitutionsType,
         composable_node_descriptions: list[ComposableNode] | None = None, **kwargs: Any
     ) -> None:
         super().__init__(name=name, namespace=namespace, **kwargs)
@@ -59,7 +47,7 @@ class ComposableNodeContainer(Node):
             kwargs['composable_node_descriptions'] = _parse_nodes(nodes, parser)
         return cls, kwargs
 
-    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
+    def execute(self, context: LaunchContext) -> Entities | None:
         nodes = [
             node for node in self.__composable_node_descriptions or ()
             if (condition := node.condition()) is None or condition.evaluate(context)]
@@ -71,7 +59,7 @@ class ComposableNodeContainer(Node):
 
 
 @expose_action('load_composable_node')
-class LoadComposableNodes(Action):
+class LoadComposableNodes(launch.Action):
     """
     Has a container load composable nodes, one after another.
 
@@ -80,10 +68,10 @@ class LoadComposableNodes(Action):
 
     def __init__(
         self, *, composable_node_descriptions: list[ComposableNode],
-        target_container: SomeSubstitutionsType | ComposableNodeContainer, **kwargs: Any
+        target_container: launch.SomeSubstitutionsType | ComposableNodeContainer, **kwargs: Any
     ) -> None:
         ensure_argument_type(
-            target_container, (*SomeSubstitutionsType_types_tuple, ComposableNodeContainer),
+            target_container, (*launch.SomeSubstitutionsType_types_tuple, ComposableNodeContainer),
             'target_container', 'LoadComposableNodes')
         super().__init__(**kwargs)
         self.__composable_node_descriptions = composable_node_descriptions
@@ -121,12 +109,12 @@ class LoadComposableNodes(Action):
         for request in load_node_requests:
             self._load_node(request, context)
 
-    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
+    def execute(self, context: LaunchContext) -> Entities | None:
         if isinstance(self.__target_container, ComposableNodeContainer):
             container = self.__target_container.node_name
         else:
             container = perform_substitutions(
-                context, normalize_to_list_of_substitutions(self.__target_container))
+                context, normalize(self.__target_container))
         self.__final_target_container_name = container
         from composition_interfaces.srv import LoadNode
         self.__rclpy_load_node_client = get_ros_node(context).create_client(
@@ -171,11 +159,12 @@ def get_composable_node_load_request(
         request.remap_rules = remappings
 
     def messages(parameters: list[Any]) -> list[Any]:
-        return [parameter.to_parameter_msg() for parameter in to_parameters_list(
-            context, request.node_name, namespace, evaluate_parameters(context, parameters))]
+        return [parameter.to_parameter_msg() for parameter in ros_parameters.to_parameters_list(
+            context, request.node_name, namespace,
+            ros_parameters.evaluate_parameters(context, parameters))]
 
     parameters: list[Any] = [
-        normalize_parameter_dict({given[0]: given[1]}) if isinstance(given, tuple)
+        ros_parameters.normalize_parameter_dict({given[0]: given[1]}) if isinstance(given, tuple)
         else ParameterFile(Path(given).resolve())
         for given in configurations.get('global_params', ())]
     parameters += node.parameters or ()

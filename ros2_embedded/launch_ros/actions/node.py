@@ -17,11 +17,8 @@ from launch.frontend.type_utils import get_data_type_from_identifier
 from launch.launch_context import LaunchContext
 import launch.logging
 from launch.substitutions import LocalSubstitution
-from launch.utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from launch.utilities import ensure_argument_type, perform_substitutions
+from launch.utilities import normalize_to_list_of_substitutions as normalize
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
 from ..substitutions import ExecutableInPackage
@@ -183,17 +180,17 @@ class Node(ExecuteProcess):
         return file.name
 
     def __extend_cmd(self, *words: SomeSubstitutionsType) -> None:
-        self.cmd.extend(normalize_to_list_of_substitutions(word) for word in words)
+        self.cmd.extend(normalize(word) for word in words)
 
     def __expand_name(self, context: LaunchContext) -> None:
         if self.__node_name is not None:
             self.__expanded_node_name = perform_substitutions(
-                context, normalize_to_list_of_substitutions(self.__node_name))
+                context, normalize(self.__node_name))
             names.check_node_name(self.__expanded_node_name)
         namespace: str | None = None
         if self.__node_namespace is not None:
             namespace = perform_substitutions(
-                context, normalize_to_list_of_substitutions(self.__node_namespace))
+                context, normalize(self.__node_namespace))
         namespace = names.prefix_namespace(
             context.launch_configurations.get('ros_namespace'), namespace)
         if namespace is not None:

@@ -14,11 +14,8 @@ from typing import Any, Iterator
 from launch import SomeSubstitutionsType_types_tuple, Substitution
 from launch.launch_context import LaunchContext
 from launch.substitutions import TextSubstitution
-from launch.utilities import (
-    ensure_argument_type,
-    normalize_to_list_of_substitutions,
-    perform_substitutions,
-)
+from launch.utilities import ensure_argument_type, perform_substitutions
+from launch.utilities import normalize_to_list_of_substitutions as normalize
 
 from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
 
@@ -48,9 +45,9 @@ def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(float(item) for item in value)
     if Substitution in kinds and kinds <= {str, Substitution}:
         # One text made of several pieces, not an array.
-        return tuple(normalize_to_list_of_substitutions(value))
+        return tuple(normalize(value))
     return tuple(
-        normalize_to_list_of_substitutions(
+        normalize(
             as_yaml(item) if isinstance(item, (float, int, bool, str)) else item)
         for item in value)
 
@@ -65,14 +62,14 @@ def normalize_parameter_dict(
     """
     normalized: dict[Any, Any] = {}
     for given_name, value in parameters.items():
-        parts = normalize_to_list_of_substitutions(given_name)
+        parts = normalize(given_name)
         if _prefix:
             parts = [*_prefix, TextSubstitution(text='.'), *parts]
         name = tuple(parts)
         if isinstance(value, Mapping):
             normalized.update(normalize_parameter_dict(value, _prefix=name))
         elif isinstance(value, str):
-            normalized[name] = tuple(normalize_to_list_of_substitutions(as_yaml(value)))
+            normalized[name] = tuple(normalize(as_yaml(value)))
         elif isinstance(value, Substitution):
             normalized[name] = (value,)
         elif isinstance(value, (ParameterValue, float, bool, int, bytes)):

@@ -5,14 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ros2cli.node.strategy import add_arguments, NodeStrategy
-from ros2cli.verb import VerbExtension
-from ros2cli.verb.topic import (
-    above,
-    add_qos_arguments,
-    get_msg_class,
-    message_class,
-    qos_from_arguments,
-)
+from ros2cli.verb import topic, VerbExtension
 
 
 class EchoVerb(VerbExtension):
@@ -23,11 +16,11 @@ class EchoVerb(VerbExtension):
         add = parser.add_argument
         add('topic_name', help="Name of the ROS topic to listen to (e.g. '/chatter')")
         add('message_type', nargs='?', help="Type of the message (e.g. 'std_msgs/msg/String')")
-        add_qos_arguments(parser, 'sensor_data')
+        topic.add_qos_arguments(parser, 'sensor_data')
         add('--field', help="Echo a selected field of a message, such as 'pose.pose.position'")
         add('--full-length', '-f', action='store_true',
             help='Output all elements of arrays, bytes and strings')
-        add('--truncate-length', '-l', type=above(-1), default=128,
+        add('--truncate-length', '-l', type=topic.above(-1), default=128,
             help='The length to truncate arrays, bytes, and string to (default: 128)')
         add('--no-arr', action='store_true', help="Don't print array fields of messages")
         add('--no-str', action='store_true', help="Don't print string fields of messages")
@@ -36,7 +29,7 @@ class EchoVerb(VerbExtension):
     def _profile(self, node: Any, args: Any) -> Any:
         """Make a profile that goes together with all publishers, unless options say another."""
         from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-        profile = qos_from_arguments(args)
+        profile = topic.qos_from_arguments(args)
         offered = [info.qos_profile for info in node.get_publishers_info_by_topic(
             args.topic_name)]
         if not offered or any(value is not None and name != 'qos_profile'
@@ -60,8 +53,8 @@ class EchoVerb(VerbExtension):
         with NodeStrategy(args) as strategy:
             node = strategy.node
             profile = self._profile(node, args)
-            kind = (message_class(args.message_type) if args.message_type
-                    else get_msg_class(node, args.topic_name))
+            kind = (topic.message_class(args.message_type) if args.message_type
+                    else topic.get_msg_class(node, args.topic_name))
             if kind is None:
                 raise RuntimeError('Could not determine the type for the passed topic')
             done = Future()
