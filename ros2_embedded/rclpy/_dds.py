@@ -496,7 +496,7 @@ class Builtin:
             _lib.dds_create_reader(participant, topic, None, None), 'read a built-in topic')
 
     def update(self, known: dict[bytes, Any]) -> None:
-        """Bring up to date what is alive: by guid, an endpoint, or a participant's USER_DATA."""
+        """Bring up to date what is alive, by guid: an endpoint, or None for a participant."""
         count = 256
         samples, infos = (ct.c_void_p * count)(), (_Info * count)()
         number = count
@@ -509,7 +509,7 @@ class Builtin:
                 if info.instance_state != ALIVE:
                     known.pop(key, None)
                 elif info.valid_data:
-                    known[key] = _user_data(one.qos) if self._participants else _endpoint(one)
+                    known[key] = None if self._participants else _endpoint(one)
             _lib.dds_return_loan(self.handle, samples, number)
 
 

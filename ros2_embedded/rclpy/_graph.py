@@ -35,7 +35,6 @@ class NodeInfo(NamedTuple):
 
     name: str
     namespace: str
-    enclave: str
     readers: list[bytes]
     writers: list[bytes]
 
@@ -46,15 +45,10 @@ def type_hash_data(type_name: str) -> bytes:
     return f'typehash={type_hash(type_name)};'.encode()
 
 
-def _keys(data: bytes) -> dict[str, str]:
-    """Read ``key=value;`` pairs."""
-    pairs = (item.partition('=') for item in data.decode(errors='replace').split(';'))
-    return {key: value for key, separator, value in pairs if separator}
-
-
 def user_data_value(endpoint: Endpoint, key: str) -> str | None:
-    """Find a value in an endpoint's USER_DATA."""
-    return _keys(endpoint.policies.user_data).get(key)
+    """Find a value in an endpoint's USER_DATA, which is ``key=value;`` pairs."""
+    pairs = endpoint.policies.user_data.decode(errors='replace').split(';')
+    return dict(pair.split('=', 1) for pair in pairs if '=' in pair).get(key)
 
 
 def _encode(guid: bytes, nodes: list[NodeRecord]) -> bytearray:
@@ -106,14 +100,14 @@ class Graph:
 
     def __init__(self, domain_id: int, enclave: str) -> None:
         _rmw.check_implementation()
-        self.domain_id, self.enclave = domain_id, enclave
+        self.domain_id = domain_id
         _dds.open_domain(domain_id, _rmw.configuration(domain_id))
         self._closed = False
         self._lock = threading.RLock()
         self._nodes: list[NodeRecord] = []
         self._others: dict[bytes, list[tuple[str, str, list[bytes], list[bytes]]]] = {}
         self._builtin: dict[int, _dds.Builtin] = {}
-        self._known: dict[int, dict[bytes, Endpoint | bytes]] = {}
+        self._known: dict[int, dict[bytes, Endpoint | None]] = {}
         self._held = 0
         self._next_id = 0
         try:
@@ -218,7 +212,7 @@ class Graph:
                         continue
                     self._others[guid] = nodes
 
-    def _alive(self, topic: int) -> dict[bytes, Endpoint | bytes]:
+    def _alive(self, topic: int) -> dict[bytes, Endpoint | None]:
         if topic not in self._builtin:
             self._builtin[topic] = _dds.Builtin(self.participant, topic)
             self._known[topic] = {}
@@ -231,15 +225,14 @@ class Graph:
             if self._closed:
                 return []
             topic = _dds.BUILTIN_PUBLICATION if writers else _dds.BUILTIN_SUBSCRIPTION
-            return [found for found in self._alive(topic).values()
-                    if isinstance(found, Endpoint)]
+            return [found for found in self._alive(topic).values() if found is not None]
 
     def nodes(self) -> list[NodeInfo]:
         """List the nodes."""
         with self._lock:
             self.update()
-            found = [NodeInfo(node.name, node.namespace, self.enclave, list(node.readers),
-                              list(node.writers)) for node in self._nodes]
+            found = [NodeInfo(node.name, node.namespace, list(node.readers), list(node.writers))
+                     for node in self._nodes]
             if self._closed:
                 return found
             alive = self._alive(_dds.BUILTIN_PARTICIPANT)
@@ -247,8 +240,6 @@ class Graph:
                 if guid not in alive:
                     del self._others[guid]
                     continue
-                data = alive[guid]
-                enclave = _keys(data).get('enclave', '') if isinstance(data, bytes) else ''
-                found += [NodeInfo(name, namespace, enclave, readers, writers)
+                found += [NodeInfo(name, namespace, readers, writers)
                           for namespace, name, readers, writers in nodes]
             return found

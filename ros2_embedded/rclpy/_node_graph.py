@@ -53,10 +53,6 @@ class NodeGraph:
         """List the nodes' names and namespaces."""
         return [(node.name, node.namespace) for node in self._graph.nodes()]
 
-    def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
-        """List the nodes' names, namespaces and enclaves."""
-        return [(node.name, node.namespace, node.enclave) for node in self._graph.nodes()]
-
     def get_fully_qualified_node_names(self) -> list[str]:
         """List the nodes' names with their namespaces."""
         return [_names.join(node.namespace, node.name) for node in self._graph.nodes()]
@@ -150,7 +146,7 @@ class NodeGraph:
         nodes: dict[bytes, NodeInfo] = {
             guid: node for node in self._graph.nodes()
             for guid in (node.writers if writers else node.readers)}
-        unknown = NodeInfo('_NODE_NAME_UNKNOWN_', '_NODE_NAMESPACE_UNKNOWN_', '', [], [])
+        unknown = NodeInfo('_NODE_NAME_UNKNOWN_', '_NODE_NAMESPACE_UNKNOWN_', [], [])
         kind = TopicEndpointTypeEnum.PUBLISHER if writers else TopicEndpointTypeEnum.SUBSCRIPTION
         return [
             TopicEndpointInfo(

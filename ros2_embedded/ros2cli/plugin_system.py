@@ -55,3 +55,13 @@ def satisfies_version(version: str, caret_range: str) -> None:
     if point >= ((major + 1, 0, 0) if major else (0, minor + 1, 0)):
         raise PluginException(f'Extension point is newer ({version}), than what the extension '
                               f"supports '{wanted}'")
+
+
+class Extension:
+    """What commands and verbs have alike."""
+
+    NAME: str | None = None
+    EXTENSION_POINT_VERSION = '0.1'
+
+    def __init__(self) -> None:
+        satisfies_version(PLUGIN_SYSTEM_VERSION, '^0.1')

@@ -97,14 +97,11 @@ class PythonLaunchDescriptionSource(_FileSource):
     _load = staticmethod(get_launch_description_from_python_launch_file)
 
 
-class FrontendLaunchDescriptionSource(LaunchDescriptionSource):
+class FrontendLaunchDescriptionSource(_FileSource):
+    """A launch file that a frontend reads, whichever it is."""
 
-    def __init__(
-        self, launch_file_path: SomeSubstitutionsType, *,
-        method: str = 'interpreted frontend launch file', parser: type[Parser] = Parser
-    ) -> None:
-        super().__init__(None, launch_file_path, method)
-        self._parser = parser
+    _method = 'interpreted frontend launch file'
+    _parser = Parser
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
         return get_launch_description_from_frontend_launch_file(location, parser=self._parser)

@@ -9,7 +9,7 @@ import os
 from typing import Any, Iterable, Iterator
 
 from ros2cli.entry_points import get_entry_points, get_first_line_doc
-from ros2cli.plugin_system import instantiate_extensions, PLUGIN_SYSTEM_VERSION, satisfies_version
+from ros2cli.plugin_system import Extension, instantiate_extensions
 
 #: Commands and verbs of ROS 2 that aren't here, by entry point group.
 _LACKING = {
@@ -23,7 +23,7 @@ _LACKING = {
 }
 
 
-class CommandExtension:
+class CommandExtension(Extension):
     """
     A command; entry point group ``ros2cli.command``.
 
@@ -31,12 +31,6 @@ class CommandExtension:
 
     :raises PluginException: if the extension is for another version.
     """
-
-    NAME: str | None = None
-    EXTENSION_POINT_VERSION = '0.1'
-
-    def __init__(self) -> None:
-        satisfies_version(PLUGIN_SYSTEM_VERSION, '^0.1')
 
     def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
         """Add the command's arguments."""

@@ -9,7 +9,7 @@ from ros2cli.node.direct import add_arguments, DirectNode
 from ros2cli.verb import VerbExtension
 from ros2cli.verb.topic import above, add_qos_arguments, message_class, qos_from_arguments
 
-_WAIT = 0.1  # seconds between looks for subscriptions
+_WAIT = 0.1  # seconds between looks for subscriptions, and before the end
 
 
 class PubVerb(VerbExtension):
@@ -23,8 +23,6 @@ class PubVerb(VerbExtension):
             help="Values to fill the message with in YAML format (e.g. 'data: Hello World')")
         add('-r', '--rate', metavar='N', type=above(0, float), default=1.0,
             help='Publishing rate in Hz (default: 1)')
-        add('-p', '--print', metavar='N', type=int, default=1,
-            help='Only print every N-th published message (default: 1)')
         group = parser.add_mutually_exclusive_group()
         group.add_argument('-1', '--once', action='store_const', dest='times', const=1,
                            help='Publish one message and exit')
@@ -32,8 +30,6 @@ class PubVerb(VerbExtension):
                            help='Publish this number of times and then exit')
         add('-w', '--wait-matching-subscriptions', type=above(-1), default=None,
             help='Wait for so many subscriptions; by default 1 with -1 or -t, otherwise 0')
-        add('--keep-alive', metavar='N', type=above(0, float), default=0.1,
-            help='Keep publishing node alive for N seconds after the last msg (default: 0.1)')
         add('-n', '--node-name', help='Name of the created publishing node')
         add_qos_arguments(parser, 'default')
         add_arguments(parser)
@@ -75,8 +71,7 @@ def _publish(node: Any, args: Any) -> str | None:
         for set_stamp in stamps:
             set_stamp(now)
         count += 1
-        if args.print and count % args.print == 0:
-            print(f'publishing #{count}: {message!r}\n')
+        print(f'publishing #{count}: {message!r}\n')
         publisher.publish(message)
 
     publish()
@@ -84,5 +79,5 @@ def _publish(node: Any, args: Any) -> str | None:
         node.create_timer(1.0 / args.rate, publish)
         while args.times == 0 or count < args.times:
             rclpy.spin_once(node)
-    time.sleep(args.keep_alive)  # what was written last is still on its way
+    time.sleep(_WAIT)  # what was written last is still on its way
     return None
