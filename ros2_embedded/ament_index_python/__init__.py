@@ -5,3 +5,6 @@ from ament_index_python.constants import RESOURCE_INDEX_SUBFOLDER as RESOURCE_IN
 from ament_index_python.packages import *  # noqa: F403
 from ament_index_python.resources import *  # noqa: F403
 from ament_index_python.search_paths import get_search_paths as get_search_paths
+from rosidl_embedded.lacking import lacking
+
+__getattr__ = lacking(__name__, 'get_resource_types')

@@ -2,14 +2,15 @@
 """Resources: files below a prefix, by type and name."""
 
 import os
+from pathlib import Path
 from typing import Literal
 
 from ament_index_python.constants import RESOURCE_INDEX_SUBFOLDER
 from ament_index_python.search_paths import get_search_paths
 
 __all__ = [
-    'get_resource', 'get_resource_types', 'get_resources', 'has_resource',
-    'InvalidResourceNameError', 'InvalidResourceTypeNameError']
+    'get_resource', 'get_resources', 'has_resource', 'InvalidResourceNameError',
+    'InvalidResourceTypeNameError']
 
 
 class InvalidResourceTypeNameError(ValueError):
@@ -51,29 +52,15 @@ def get_resource(resource_type: str, resource_name: str) -> tuple[str, str]:
                       f"'{resource_type}':\n{error}") from error
 
 
-def _visible(folder: str, folders: bool) -> list[str]:
-    """List what is in a folder: its folders, or its files; nothing that begins with a dot."""
-    if not os.path.isdir(folder):
-        return []
-    return [name for name in os.listdir(folder) if not name.startswith('.')
-            and os.path.isdir(os.path.join(folder, name)) == folders]
-
-
 def get_resources(resource_type: str) -> dict[str, str]:
     """Give the prefixes of all resources of a type, by their names."""
     _check(resource_type)
     found: dict[str, str] = {}
     for prefix in get_search_paths():
-        for name in _visible(os.path.join(prefix, RESOURCE_INDEX_SUBFOLDER, resource_type),
-                             False):
-            found.setdefault(name, prefix)
+        for path in Path(prefix, RESOURCE_INDEX_SUBFOLDER, resource_type).glob('[!.]*'):
+            if path.is_file():
+                found.setdefault(path.name, prefix)
     return found
-
-
-def get_resource_types() -> set[str]:
-    """List the types of resources."""
-    return {name for prefix in get_search_paths()
-            for name in _visible(os.path.join(prefix, RESOURCE_INDEX_SUBFOLDER), True)}
 
 
 def has_resource(resource_type: str, resource_name: str) -> str | Literal[False]:

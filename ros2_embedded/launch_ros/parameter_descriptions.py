@@ -13,6 +13,9 @@ from launch.substitutions import SubstitutionFailure
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
 from launch.utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
+from rosidl_embedded.lacking import lacking
+
+__getattr__ = lacking(__name__, 'Parameter')
 
 
 class ParameterValue:
@@ -39,30 +42,6 @@ class ParameterValue:
         """
         self.__value = perform_typed_substitution(context, self.__value, self.value_type)
         return self.__value
-
-
-class Parameter:
-    """A name with a value, see :class:`ParameterValue`."""
-
-    def __init__(
-        self, name: SomeSubstitutionsType, value: Any, *, value_type: Any = None
-    ) -> None:
-        ensure_argument_type(name, SomeSubstitutionsType_types_tuple, 'name')
-        self.name: Any = normalize(name)
-        self.__parameter_value = ParameterValue(value, value_type=value_type)
-        self.__evaluated = False
-
-    @property
-    def value(self) -> Any:
-        return self.__parameter_value.value
-
-    def evaluate(self, context: LaunchContext) -> tuple[str, Any]:
-        """Return name and value."""
-        if not self.__evaluated:
-            self.name = perform_substitutions(context, self.name)
-            self.__parameter_value.evaluate(context)
-            self.__evaluated = True
-        return self.name, self.value
 
 
 class ParameterFile:

@@ -163,7 +163,7 @@ class NodeParameters:
         if name in self._parameters:
             return self._parameters[name].type_.value
         if self._allow_undeclared_parameters:
-            return Parameter.Type.NOT_SET
+            return Parameter.Type.NOT_SET.value
         raise exceptions.ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:

@@ -129,8 +129,3 @@ class Client(Introspected):
                 return False
             time.sleep(0.005)
         return True
-
-    @property
-    def service_name(self) -> str:
-        """The expanded and remapped name."""
-        return '/' + self._writer.topic[len('rq/'):-len('Request')]

@@ -342,9 +342,6 @@ class Executor(AbstractContextManager['Executor']):
             task.exception()
             raise error
 
-    def __enter__(self) -> 'Executor':
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.shutdown()

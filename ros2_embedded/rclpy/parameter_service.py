@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services through which others read and set a node's parameters."""
 
+from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 import weakref
 
@@ -33,31 +34,24 @@ class ParameterService:
             raise ReferenceError('Expected valid node weak reference')
         return node
 
-    # what is unknown makes the whole answer empty, as in ROS 2
+    def _all(self, get: Callable[[str], Any], names: list[str]) -> list[Any]:
+        """Get something for each name; what is unknown makes the whole answer empty."""
+        try:
+            return [get(name) for name in names]
+        except (ParameterNotDeclaredException, ParameterUninitializedException):
+            return []
 
     def _describe(self, request: Any, response: Any) -> Any:
-        try:
-            response.descriptors = [
-                self._node().describe_parameter(name) for name in request.names]
-        except ParameterNotDeclaredException:
-            pass
+        response.descriptors = self._all(self._node().describe_parameter, request.names)
         return response
 
     def _get(self, request: Any, response: Any) -> Any:
-        try:
-            response.values = [self._node().get_parameter(name).get_parameter_value()
-                               for name in request.names]
-        except (ParameterNotDeclaredException, ParameterUninitializedException):
-            pass
+        found = self._all(self._node().get_parameter, request.names)
+        response.values = [parameter.get_parameter_value() for parameter in found]
         return response
 
     def _types(self, request: Any, response: Any) -> Any:
-        try:
-            kinds = [self._node().get_parameter_type(name) for name in request.names]
-            response.types = [kind.value if isinstance(kind, Parameter.Type) else kind
-                              for kind in kinds]
-        except ParameterNotDeclaredException:
-            pass
+        response.types = self._all(self._node().get_parameter_type, request.names)
         return response
 
     def _list(self, request: Any, response: Any) -> Any:

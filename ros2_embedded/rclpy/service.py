@@ -105,8 +105,3 @@ class Service(Introspected):
         if known:
             self._writer.write(data)
             self._tell(2, request.gid, request.sequence_number, response=response)
-
-    @property
-    def service_name(self) -> str:
-        """The expanded and remapped name."""
-        return '/' + self._reader.topic[len('rq/'):-len('Request')]

@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 from rclpy._dds import Writer
 from rclpy._entity import Entity
+from rclpy._names import REQUEST_PREFIX
 from rclpy.clock import Clock
 from rclpy.qos import QoSProfile
 from rosidl_embedded import cdr
@@ -32,6 +33,12 @@ class Introspected(Entity):
     _events: Writer | None = None
     _clock: Clock
     _state = ServiceIntrospectionState.OFF
+
+    @property
+    def service_name(self) -> str:
+        """The expanded and remapped name."""
+        prefix, _, name = self._reader.topic.partition('/')
+        return '/' + name.removesuffix('Request' if prefix == REQUEST_PREFIX else 'Reply')
 
     def configure_introspection(self, clock: Clock, service_event_qos_profile: QoSProfile,
                                 introspection_state: ServiceIntrospectionState) -> None:

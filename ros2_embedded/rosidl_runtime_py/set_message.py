@@ -1,27 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages from dictionaries."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from rosidl_embedded.message import message_class
 
 
-def set_message_fields(msg: Any, values: dict[str, Any], expand_header_auto: bool = False,
-                       expand_time_now: bool = False) -> list[Callable[[Any], None]]:
+def set_message_fields(msg: Any, values: dict[str, Any]) -> None:
     """
     Set fields of a message.
 
     :param values: by the fields' names.
-    :param expand_header_auto: a header that is 'auto' gets its time later.
-    :param expand_time_now: a time that is 'now' is set later.
-    :returns: functions that set these times.
     :raises AttributeError: if the message hasn't such a field.
     :raises TypeError: if a value isn't of the field's type.
     """
-    setters: list[Callable[[Any], None]] = []
-
     def fill(message: Any, given: Any) -> None:
         if not hasattr(given, 'items'):
             raise TypeError(f"Value '{given}' is expected to be a dictionary but is a "
@@ -33,13 +25,6 @@ def set_message_fields(msg: Any, values: dict[str, Any], expand_header_auto: boo
             if field.kind and field.nested:
                 value = [made(field.base, item) for item in value]
             elif field.nested:
-                if field.base == 'std_msgs/msg/Header' and value == 'auto' and expand_header_auto:
-                    setters.append(partial(setattr, current, 'stamp'))
-                    continue
-                if field.base == 'builtin_interfaces/msg/Time' and value == 'now' \
-                        and expand_time_now:
-                    setters.append(partial(setattr, message, name))
-                    continue
                 fill(current, value)
                 continue
             elif not field.kind and not isinstance(value, type(current)):
@@ -54,4 +39,3 @@ def set_message_fields(msg: Any, values: dict[str, Any], expand_header_auto: boo
         return message
 
     fill(msg, values)
-    return setters

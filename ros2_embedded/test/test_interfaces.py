@@ -235,10 +235,7 @@ def test_yaml_and_dictionaries():
 
 def test_fields_from_dictionaries():
     pose = PoseStamped()
-    setters = set_message_fields(
-        pose, {'header': 'auto', 'pose': {'position': {'x': 1.5}}}, expand_header_auto=True)
-    for set_stamp in setters:
-        set_stamp(Time(sec=9))
+    set_message_fields(pose, {'header': {'stamp': {'sec': 9}}, 'pose': {'position': {'x': 1.5}}})
     assert pose.header.stamp.sec == 9 and pose.pose.position.x == 1.5
     with pytest.raises(AttributeError):
         set_message_fields(pose, {'posture': 1})

@@ -6,7 +6,6 @@ import asyncio
 import collections.abc
 import os
 from typing import Any, Iterable, TYPE_CHECKING
-import warnings
 
 import launch.logging
 
@@ -156,10 +155,6 @@ class TimerAction(_base.Action):
     ) -> None:
         super().__init__(**kwargs)
         ensure_argument_type(actions, collections.abc.Iterable, 'actions', 'TimerAction')
-        if isinstance(period, str):
-            period = float(period)
-            warnings.warn("The parameter 'period' must be a float or substitution,"
-                          'passing a string literal was deprecated', stacklevel=2)
         self.period = normalize_typed_substitution(period, float)
         self.actions = actions
         self.__context_locals: dict[str, Any] = {}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import traceback
 from typing import Any, Iterable, TYPE_CHECKING
-import warnings
+
+from ros2cli.entry_points import load_entry_points
 
 from .._base import Action, InvalidLaunchFileError
 from .expose import instantiate_action
@@ -22,18 +22,6 @@ if TYPE_CHECKING:
 
 class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
     pass
-
-
-def _load_entry_points(group: str, kind: str) -> dict[str, Any]:
-    from ros2cli.entry_points import get_entry_points
-    loaded = {}
-    for name, entry_point in get_entry_points(group).items():
-        try:
-            loaded[name] = entry_point.load()
-        except Exception:  # noqa: BLE001 - Another's module must not end this launch.
-            warnings.warn(f'Failed to load the {kind} extension: {name}\n'
-                          f'{traceback.format_exc()}', stacklevel=2)
-    return loaded
 
 
 class Parser:
@@ -53,7 +41,7 @@ class Parser:
         if not Parser.extensions_loaded:
             Parser.extensions_loaded = True
             import launch_ros  # noqa: F401
-            _load_entry_points('launch.frontend.launch_extension', 'launch')
+            load_entry_points('launch.frontend.launch_extension')
 
     @classmethod
     def _parsers(cls) -> dict[str, type[Parser]]:
@@ -61,7 +49,7 @@ class Parser:
             import launch_xml
             import launch_yaml
             parsers = {'xml': launch_xml.Parser, 'yaml': launch_yaml.Parser}
-            parsers.update(_load_entry_points('launch.frontend.parser', 'parser'))
+            parsers.update(load_entry_points('launch.frontend.parser'))
             Parser.frontend_parsers = dict(sorted(parsers.items()))
         return Parser.frontend_parsers
 

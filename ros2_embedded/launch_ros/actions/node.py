@@ -20,10 +20,10 @@ from launch.substitutions import LocalSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
 
-from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from ..parameter_descriptions import ParameterFile, ParameterValue
 from ..substitutions import ExecutableInPackage
 from ..utilities import names
-from ..utilities.parameters import as_yaml, evaluate_parameters, normalize_parameters
+from ..utilities.parameters import evaluate_parameters, normalize_parameters
 
 
 @expose_action('node')
@@ -208,10 +208,7 @@ class Node(ExecuteProcess):
                 raise AssertionError(f'Parameter file path is not a file: {path}')
             self.__extend_cmd('--params-file', path)
         for parameter in evaluate_parameters(context, self.__parameters):
-            if isinstance(parameter, Parameter):
-                name, value = parameter.evaluate(context)
-                self.__extend_cmd('-p', f'{name}:={as_yaml(value)}')
-            elif isinstance(parameter, dict):
+            if isinstance(parameter, dict):
                 self.__extend_cmd('--params-file', self._create_params_file_from_dict(parameter))
             elif os.path.isfile(parameter):
                 self.__extend_cmd('--params-file', str(parameter))

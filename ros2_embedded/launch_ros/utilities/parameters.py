@@ -17,7 +17,7 @@ from launch.substitutions import TextSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
 
-from ..parameter_descriptions import Parameter, ParameterFile, ParameterValue
+from ..parameter_descriptions import ParameterFile, ParameterValue
 
 #: By tuples of substitutions.
 ParametersDict = dict[tuple[Any, ...], Any]
@@ -83,7 +83,7 @@ def normalize_parameter_dict(
 
 def normalize_parameters(parameters: Sequence[Any]) -> Sequence[Any]:
     """
-    Return the dictionaries normalized, and what is neither them nor a parameter as files.
+    Return the dictionaries normalized, and all else as files.
 
     :raises TypeError: for anything but a sequence.
     """
@@ -93,7 +93,7 @@ def normalize_parameters(parameters: Sequence[Any]) -> Sequence[Any]:
     for parameter in parameters:
         if isinstance(parameter, Mapping):
             normalized.append(normalize_parameter_dict(parameter))
-        elif isinstance(parameter, (Parameter, ParameterFile)):
+        elif isinstance(parameter, ParameterFile):
             normalized.append(parameter)
         else:
             normalized.append(ParameterFile(parameter))
@@ -157,16 +157,10 @@ def evaluate_parameter_dict(
 
 
 def evaluate_parameters(context: LaunchContext, parameters: Sequence[Any]) -> Sequence[Any]:
-    """Return dictionaries by value and files by path; single parameters stay as they are."""
-    evaluated: list[Any] = []
-    for parameter in parameters:
-        if isinstance(parameter, ParameterFile):
-            evaluated.append(parameter.evaluate(context))
-        elif isinstance(parameter, Parameter):
-            evaluated.append(parameter)
-        elif isinstance(parameter, dict):
-            evaluated.append(evaluate_parameter_dict(context, parameter))
-    return tuple(evaluated)
+    """Return dictionaries by value and files by path."""
+    return tuple(
+        parameter.evaluate(context) if isinstance(parameter, ParameterFile)
+        else evaluate_parameter_dict(context, parameter) for parameter in parameters)
 
 
 def _nodes_of(content: dict[str, Any], names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:

@@ -2,8 +2,6 @@
 """The commands ``ros2 node|param|pkg|service|topic``, all of whose work their verbs do."""
 from __future__ import annotations
 
-from typing import Any
-
 from ros2cli.command import VerbsCommand
 
 
@@ -30,18 +28,8 @@ class ServiceCommand(VerbsCommand):
 
     GROUP = 'ros2service.verb'
 
-    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
-        parser.add_argument('--include-hidden-services', action='store_true',
-                            help='Consider hidden services as well')
-        super().add_arguments(parser, cli_name, argv=argv)
-
 
 class TopicCommand(VerbsCommand):
     """Various topic related sub-commands."""
 
     GROUP = 'ros2topic.verb'
-
-    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
-        parser.add_argument('--include-hidden-topics', action='store_true',
-                            help='Consider hidden topics as well')
-        super().add_arguments(parser, cli_name, argv=argv)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from typing import Any
 
 from ros2cli.node.strategy import add_arguments, NodeStrategy
@@ -76,18 +75,13 @@ class GetVerb(VerbExtension):
         parser.add_argument('node_name', help='Name of the ROS node')
         parser.add_argument('--include-hidden-nodes', action='store_true',
                             help='Consider hidden nodes as well')
-        parser.add_argument('--timeout', metavar='N', type=int, default=1,
-                            help='Wait for N seconds until node becomes available')
         parser.add_argument('parameter_name', help='Name of the parameter')
 
     def main(self, *, args: Any) -> Any:
         name = f"/{args.node_name.removeprefix('/')}"
-        limit = time.monotonic() + args.timeout
         with NodeStrategy(args) as strategy:
-            while name not in get_node_names(strategy, args.include_hidden_nodes):
-                if time.monotonic() > limit:
-                    return 'Node not found'
-                time.sleep(0.02)
+            if name not in get_node_names(strategy, args.include_hidden_nodes):
+                return 'Node not found'
             return self.do(strategy.node, name, args)
 
     def do(self, node: Any, name: str, args: Any) -> Any:

@@ -58,8 +58,7 @@ def _publish(node: Any, args: Any) -> str | None:
         time.sleep(_WAIT)
     message = kind()
     try:
-        stamps = set_message_fields(
-            message, values, expand_header_auto=True, expand_time_now=True)
+        set_message_fields(message, values)
     except (AssertionError, AttributeError, TypeError, ValueError) as error:
         return f'Failed to populate field: {error}'
     print('publisher: beginning loop')
@@ -67,9 +66,6 @@ def _publish(node: Any, args: Any) -> str | None:
 
     def publish() -> None:
         nonlocal count
-        now = node.get_clock().now().to_msg()
-        for set_stamp in stamps:
-            set_stamp(now)
         count += 1
         print(f'publishing #{count}: {message!r}\n')
         publisher.publish(message)
