@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import re
 from typing import Any
 
-from rclpy._names import expand
+from rclpy._names import expand, topic_name_fault
 from rclpy.exceptions import RCLInvalidROSArgsError, UnknownROSArgsError
 from rclpy.impl.logging_severity import LoggingSeverity
 
@@ -38,10 +38,11 @@ class Arguments:
     unknown: list[str] = field(default_factory=list)
 
 
-def parse(argv: list[str]) -> Arguments:
+def parse(argv: list[str], failed: str = 'Failed to parse ROS arguments') -> Arguments:
     """
     Parse a command line.
 
+    :param failed: how the error begins.
     :raises RCLInvalidROSArgsError: if something between ``--ros-args`` and ``--`` is malformed.
     """
     found = Arguments()
@@ -57,7 +58,10 @@ def parse(argv: list[str]) -> Arguments:
         elif item == '--':
             inside = False
         elif item != '--ros-args':
-            _option(found, item, rest)
+            try:
+                _option(found, item, rest)
+            except ValueError as error:
+                raise RCLInvalidROSArgsError(f"{failed}: Couldn't parse {error}") from error
     return found
 
 
@@ -74,22 +78,18 @@ def check_known(found: Arguments) -> None:
 def _option(found: Arguments, item: str, rest: list[str]) -> None:
     def value(what: str) -> str:
         if not rest:
-            raise RCLInvalidROSArgsError(
-                "Failed to parse ROS arguments: Couldn't parse trailing "
-                f'{item} flag. No {what}')
+            raise ValueError(f'trailing {item} flag. No {what}')
         return rest.pop(0)
 
-    def refuse(what: str, text: str, why: str) -> RCLInvalidROSArgsError:
-        return RCLInvalidROSArgsError(
-            f"Failed to parse ROS arguments: Couldn't parse {what}: '{item} {text}'. "
-            f'Error: {why}')
+    def refuse(what: str, text: str, why: object) -> ValueError:
+        return ValueError(f"{what}: '{item} {text}'. Error: {why}")
 
     if item in ('-r', '--remap'):
         text = value('remap rule found.')
-        rule = parse_rule(text)
-        if rule is None:
-            raise refuse('remap rule', text, 'not of the form [node:]from:=to')
-        found.rules.append(rule)
+        try:
+            found.rules.append(parse_rule(text))
+        except ValueError as error:
+            raise refuse('remap rule', text, error) from error
     elif item in ('-p', '--param'):
         text = value('parameter override rule found.')
         name, separator, written = text.partition(':=')
@@ -99,13 +99,13 @@ def _option(found: Arguments, item: str, rest: list[str]) -> None:
         try:
             found.parameters.append((node or '/**', name, parse_value(written)))
         except ValueError as error:
-            raise refuse('parameter override rule', text, str(error)) from error
+            raise refuse('parameter override rule', text, error) from error
     elif item == '--params-file':
         path = value('file path provided.')
         try:
             found.parameters += read_parameters(path)
         except (OSError, ValueError) as error:
-            raise refuse('params file', path, str(error)) from error
+            raise refuse('params file', path, error) from error
     elif item == '--log-level':
         text = value('log level provided.')
         logger, separator, level = text.rpartition(':=')
@@ -123,10 +123,20 @@ def _option(found: Arguments, item: str, rest: list[str]) -> None:
         found.unknown.append(item)
 
 
-def parse_rule(text: str) -> Rule | None:
-    """Understand ``[node:]from:=to``; None if it isn't that."""
+def parse_rule(text: str) -> Rule:
+    """
+    Understand ``[node:]from:=to``.
+
+    :raises ValueError: if it isn't that, or what is to be a name is none.
+    """
     match = _RULE.match(text)
-    return Rule(match['node'], match['from'], match['to']) if match else None
+    if match is None:
+        raise ValueError('not of the form [node:]from:=to')
+    for name in (match['from'].rpartition('://')[2], match['to']):
+        fault = None if name == '/' else topic_name_fault(name)
+        if fault is not None:
+            raise ValueError(fault[0])
+    return Rule(match['node'], match['from'], match['to'])
 
 
 def parse_value(text: str) -> Any:
@@ -155,6 +165,8 @@ def _checked(value: Any, text: object) -> Any:
         return value
     if isinstance(value, (bool, int, float, str)):
         return value
+    if isinstance(value, dict):
+        raise ValueError('Unknown YAML event')
     return str(value)  # a date, in YAML's eyes
 
 

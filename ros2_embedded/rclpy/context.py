@@ -45,7 +45,8 @@ class Context(AbstractContextManager['Context']):
                 raise RuntimeError(f'Domain id ({domain_id}) should not be lower than zero.')
             if self._graph is not None:
                 raise RuntimeError('Context.init() must only be called once')
-            arguments = _arguments.parse(list(sys.argv if args is None else args))
+            arguments = _arguments.parse(
+                list(sys.argv if args is None else args), 'failed to initialize rcl')
             _arguments.check_known(arguments)
             self._domain_id = _rmw.domain_id(domain_id)
             if initialize_logging:

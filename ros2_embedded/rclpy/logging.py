@@ -11,13 +11,15 @@ from typing import Any, TextIO, TYPE_CHECKING
 
 from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.impl.rcutils_logger import RcutilsLogger
+from rosidl_embedded.lacking import lacking
 
 if TYPE_CHECKING:
     from rclpy._arguments import Arguments
 
-__all__ = ['LoggingSeverity', 'RcutilsLogger', 'clear_config', 'get_logger',
-           'get_logger_effective_level', 'get_logger_level', 'initialize', 'set_logger_level',
-           'shutdown']
+__all__ = ['LoggingSeverity', 'RcutilsLogger', 'get_logger', 'get_logger_effective_level',
+           'get_logger_level', 'set_logger_level']
+__getattr__ = lacking(__name__, 'clear_config get_logging_directory '
+                                'get_logging_severity_from_string initialize shutdown')
 
 _COLOURS = {LoggingSeverity.DEBUG: '\033[32m', LoggingSeverity.INFO: '\033[0m',
             LoggingSeverity.WARN: '\033[33m', LoggingSeverity.ERROR: '\033[31m',
@@ -41,16 +43,6 @@ def get_logger(name: str) -> RcutilsLogger:
     if not name:
         raise ValueError('Logger name must not be empty.')
     return RcutilsLogger(name)
-
-
-def initialize() -> None:
-    """Set levels to their defaults."""
-    global _default_level
-    _levels.clear()
-    _default_level = LoggingSeverity.INFO
-
-
-shutdown = clear_config = initialize
 
 
 def _configure(arguments: 'Arguments') -> None:

@@ -44,7 +44,7 @@ __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 HIDDEN_NODE_PREFIX = '_'
 _T = TypeVar('_T', bound=Entity)
 _lacking = lacking('rclpy.node.Node', 'create_guard_condition destroy_guard_condition guards '
-                   'set_descriptor', AttributeError)
+                   'handle set_descriptor', AttributeError)
 
 
 class Node(NodeParameters, NodeGraph):

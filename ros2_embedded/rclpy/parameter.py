@@ -152,27 +152,18 @@ def parameter_value_to_python(parameter_value: Any) -> Any:
 
 
 def parameter_dict_from_yaml_file(
-        parameter_file: str, use_wildcard: bool = False, target_nodes: list[str] | None = None,
-        namespace: str = '') -> dict[str, Any]:
+        parameter_file: str, use_wildcard: bool = False) -> dict[str, Any]:
     """
     Read ``rcl_interfaces.msg.Parameter`` messages from a parameter file, by their names.
 
     :param use_wildcard: take those of ``/**``, too.
-    :param target_nodes: take those of these nodes alone.
-    :param namespace: put this before all names.
-    :raises RuntimeError: if it is no parameter file, or has nothing of a target node.
+    :raises RuntimeError: if it is no parameter file, or has nothing to take.
     """
     import yaml
     with open(parameter_file, encoding='utf-8') as file:
         content = yaml.safe_load(file)
-    keys = ['/**'] if use_wildcard and '/**' in content else []
-    for node in target_nodes or []:
-        if node not in content:
-            raise RuntimeError(f'Param file does not contain parameters for {node},'
-                               f'only for nodes: {list(content)} ')
-        keys.append(node)
-    if not target_nodes:
-        keys += [key for key in content if key != '/**']
+    keys = sorted((key for key in content if use_wildcard or key != '/**'),
+                  key=lambda key: bool(key != '/**'))  # those for all nodes count least
     if not keys:
         raise RuntimeError('Param file does not contain selected parameters')
     values: dict[str, Any] = {}
@@ -181,4 +172,4 @@ def parameter_dict_from_yaml_file(
             raise RuntimeError(f'YAML file is not a valid ROS parameter file for node {key}')
         values.update(content[key]['ros__parameters'])
     return {name: ParameterMsg(name=name, value=get_parameter_value(str(value)))
-            for name, value in flatten(values, namespace)}
+            for name, value in flatten(values)}

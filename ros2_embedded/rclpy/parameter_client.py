@@ -102,6 +102,5 @@ class AsyncParameterClient:
     def load_parameter_file(self, parameter_file: str, use_wildcard: bool = False,
                             callback: Done | None = None) -> Future:
         """Set what a parameter file holds for the node."""
-        values = parameter_dict_from_yaml_file(
-            parameter_file, use_wildcard)
+        values = parameter_dict_from_yaml_file(parameter_file, use_wildcard)
         return self.set_parameters(list(values.values()), callback)

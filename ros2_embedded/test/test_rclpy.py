@@ -130,6 +130,8 @@ def test_domain_ids():
 @pytest.mark.parametrize('args', [
     ['--ros-args', '-r'], ['--ros-args', '-r', 'no_rule'], ['--ros-args', '-p', 'x'],
     ['--ros-args', '--log-level', 'loud'], ['--ros-args', '--params-file', '/no/such/file'],
+    ['--ros-args', '-r', 'a:=b c'], ['--ros-args', '-r', '1a:=b'], ['--ros-args', '-r', 'a:='],
+    ['--ros-args', '-p', 'x:={y: 1}'], ['--ros-args', '-p', 'x:=[1, y]'],
     ['--ros-args', '--what']])
 def test_bad_arguments_are_refused(args):
     with pytest.raises(RuntimeError):
