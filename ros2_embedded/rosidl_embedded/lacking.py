@@ -35,7 +35,7 @@ def lacking(where: str, names: str,
 
 
 class _Finder:
-    """Finds none of the modules that only ROS 2 has; it is asked when nobody else finds them."""
+    """Refuses modules that only ROS 2 has, also where an older version has left a folder."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> None:
@@ -43,4 +43,4 @@ class _Finder:
             raise ImportError(str(NotEmbeddedError(name)), name=name)
 
 
-sys.meta_path.append(_Finder)
+sys.meta_path.insert(0, _Finder)

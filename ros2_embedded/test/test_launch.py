@@ -361,7 +361,9 @@ def test_circular_includes(tmp_path, capsys, name, content):
 @pytest.mark.parametrize('module, name', [
     ('launch.actions', 'OpaqueCoroutine'), ('launch.conditions', 'LaunchConfigurationEquals'),
     ('launch.substitutions', 'AnonName'), ('launch_ros.actions', 'SetUseSimTime'),
-    ('launch_ros.substitutions', 'Parameter')])
+    ('launch_ros.substitutions', 'Parameter'), ('launch.event_handlers', 'OnExecutionComplete'),
+    ('launch_ros.parameter_descriptions', 'Parameter'), ('rclpy.clock', 'JumpThreshold'),
+    ('rclpy.logging', 'initialize'), ('rosidl_runtime_py', 'message_to_csv')])
 def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
     path = tmp_path / 'asks.launch.py'
     path.write_text(f'from {module} import {name}\n')
@@ -374,6 +376,14 @@ def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
         assert run(IncludeLaunchDescription(str(path))) == 1
         assert 'is not part of the embedded default; ROS 2 Jazzy has it' in (
             capsys.readouterr().out)
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
+@pytest.mark.parametrize('module', [
+    'rclpy.action', 'rclpy.guard_condition', 'rclpy.wait_for_message', 'rclpy.waitable'])
+def test_modules_that_are_lacking_are_named(module):
+    with pytest.raises(ImportError, match=f'{module} is not part of the embedded default'):
+        importlib.import_module(module)
 
 
 def test_declared_arguments_of_what_is_nested(tmp_path):
