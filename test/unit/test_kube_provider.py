@@ -95,7 +95,8 @@ def test_the_sample_role_has_what_is_looked_for():
             less[number]['verbs'] = [each for each in rule['verbs'] if each != verb]
             missing = hints.missing_rights(less)
             resource = rule['resources'][0]
-            if resource != 'jobs/finalizers':
+            # what some clusters, or launches with monitor_allow= alone, ask for
+            if (verb, resource) not in (('update', 'jobs/finalizers'), ('delete', 'services')):
                 assert [each.split('.')[0] for each in missing] == [f'{verb} {resource}']
 
 

@@ -99,4 +99,5 @@ def close(api: Api, where: MachineId, port: int) -> None:
         if error.status != 404:
             raise ProviderError(
                 f"port {port} of '{where.job}' can't be closed: {error.args[0]}",
-                f'kubectl delete service -n {where.namespace} {called(where, port)}') from error
+                hints.of_refusal(str(error.args[0]), where.namespace)
+                or f'kubectl delete service -n {where.namespace} {called(where, port)}') from error
