@@ -2,11 +2,15 @@
 """
 A headless Chromium, driven by a test over the DevTools protocol.
 
-https://chromedevtools.github.io/devtools-protocol/; needs ``websocket-client``.
+https://chromedevtools.github.io/devtools-protocol/; needs ``websocket-client``. By hand it takes a
+picture of a page::
+
+    python -m fogros2.testing.browser URL FILE.png --until EXPRESSION
 """
 
 from __future__ import annotations
 
+import argparse
 import base64
 import itertools
 import json
@@ -56,8 +60,10 @@ class Browser:
                 env={**os.environ, 'HOME': self._folder})
         try:
             at = Path(self._folder, 'profile', 'DevToolsActivePort')
-            port = wait_until(lambda: at.exists() and at.read_text().splitlines()[0],
-                              timeout=30.0, what='the browser', longest=0.1)
+            # its second line is the browser's own path: with that, the file is whole
+            wait_until(lambda: at.exists() and len(at.read_text().split()) == 2,
+                       timeout=30.0, what='the browser', longest=0.1)
+            port = at.read_text().split()[0]
             with urllib.request.urlopen(f'http://127.0.0.1:{port}/json/list') as answer:
                 pages = [page for page in json.load(answer) if page['type'] == 'page']
             self._link = websocket.create_connection(
@@ -173,3 +179,27 @@ class Browser:
         deadline = time.monotonic() + 5.0
         while Path(self._folder).exists() and time.monotonic() < deadline:
             shutil.rmtree(self._folder, ignore_errors=True)  # its children still end
+
+
+def main() -> int:
+    """Take a picture of a page."""
+    parser = argparse.ArgumentParser(description='Take a picture of a page')
+    parser.add_argument('url')
+    parser.add_argument('file', type=Path, help='to write, as PNG')
+    parser.add_argument('--until', default='true', metavar='EXPRESSION',
+                        help='of JavaScript, that is waited for')
+    parser.add_argument('--size', type=int, nargs=2, default=(1400, 1180), metavar=('W', 'H'))
+    parser.add_argument('--dark', action='store_true')
+    words = parser.parse_args()
+    browser = Browser(width=words.size[0], height=words.size[1], dark=words.dark)
+    try:
+        browser.open(words.url)
+        browser.until(words.until, timeout=120.0)
+        browser.screenshot(words.file)
+    finally:
+        browser.close()
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
