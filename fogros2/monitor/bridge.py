@@ -60,6 +60,7 @@ class _Topic:
             context=node.viewers)
         self._subscription: Optional[Subscription] = None
         self._latched = False
+        self._fits: tuple[Any, Any] = (None, None)
         self._requests: Optional[Publisher] = None
         if video:
             self._requests = node.create_publisher(Empty, f'{name}{_KEYFRAME}', 1)
@@ -87,6 +88,14 @@ class _Topic:
         if not self.viewers:
             self._unsubscribe()
 
+    def refit(self) -> None:
+        """Subscribe anew where publishers came that want it: a latched one tells all again."""
+        if self._subscription is not None and self._node.get_publishers_info_by_topic(self._name):
+            qos = fitting(self._node, self._name)
+            if (qos.durability, qos.reliability) != self._fits:
+                self._unsubscribe()
+                self._subscribe()
+
     def close(self) -> None:
         """Take it out of the viewers' lists."""
         self._unsubscribe()
@@ -97,6 +106,7 @@ class _Topic:
     def _subscribe(self) -> None:
         qos = fitting(self._node, self._name)
         self._latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self._fits = qos.durability, qos.reliability
         if self.video:
             self._subscription = self._node.create_subscription(
                 self._class, self._name, self._show_video, qos)
@@ -206,6 +216,7 @@ class BridgeNode(Node):
             known = self._topics.get(name)
             video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in found
             if known is not None and (known.kind, known.video) == (kind, video):
+                known.refit()
                 continue
             if kind in self._unknown:
                 continue

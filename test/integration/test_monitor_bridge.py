@@ -198,6 +198,15 @@ def test_who_comes_late_sees_what_is_latched(bench):
         assert viewer.message('/map') == {'data': 'here'}
 
 
+def test_who_came_early_sees_what_is_latched_later(bench):
+    bench.node.create_subscription(String, '/map', lambda _: None, 10)
+    viewer = bench.viewer()
+    viewer.look('/map')
+    bench.listeners('/map', 2)
+    bench.node.create_publisher(String, '/map', LATCHED).publish(String(data='here'))
+    assert viewer.message('/map') == {'data': 'here'}
+
+
 def test_viewers_publish(bench):
     heard: list[Any] = []
     bench.node.create_subscription(Twist, '/cmd_vel', heard.append, 10)

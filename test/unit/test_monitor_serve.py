@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which bridge runs on a machine, and what it is told."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+serve = pytest.importorskip(
+    'fogros2.monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
+
+
+def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
+    assert serve.regular_expression('/camera/*') == '/camera/.*'
+    assert serve.regular_expression('/a.b?[c]') == r'/a\.b.\[c\]'
+    assert serve.command(5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
+        '--ros-args', '-r', 'b:=c', '-p', 'address:=127.0.0.1', '-p', 'port:=5',
+        '-p', 'topic_whitelist:=["/a.*"]']
+    assert serve.command(5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2.monitor.bridge']
+
+
+def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
+    """It is on the loopback, the gate stands before it, and both end together."""
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    (index / 'foxglove_bridge').write_text('')
+    program = tmp_path / 'lib/foxglove_bridge/foxglove_bridge'
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\necho "theirs $*"\nexec sleep 60\n')
+    program.chmod(0o755)
+    with socket.create_server(('127.0.0.1', 0)) as probe:
+        port = probe.getsockname()[1]
+    prefixes = os.environ.get('AMENT_PREFIX_PATH', '')
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}',
+         '--topic', '/camera/*'], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, 'AMENT_PREFIX_PATH': f'{tmp_path}{os.pathsep}{prefixes}'})
+    try:
+        lines = sorted(process.stdout.readline().strip() for _ in range(2))
+        assert lines[0] == f'listening on 127.0.0.1:{port}'
+        assert lines[1].startswith('theirs --ros-args -p address:=127.0.0.1 -p port:=')
+        assert lines[1].endswith('-p topic_whitelist:=["/camera/.*"]')
+    finally:
+        process.send_signal(signal.SIGTERM)
+        # the gate has our pipe too: its end is what this waits for
+        assert process.communicate(timeout=20)[0] == ''
