@@ -203,8 +203,16 @@ def test_who_came_early_sees_what_is_latched_later(bench):
     viewer = bench.viewer()
     viewer.look('/map')
     bench.listeners('/map', 2)
-    bench.node.create_publisher(String, '/map', LATCHED).publish(String(data='here'))
-    assert viewer.message('/map') == {'data': 'here'}
+    # says it before anybody has heard of it
+    other = Context()
+    rclpy.init(context=other, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+    node = Node('maps', context=other)
+    try:
+        node.create_publisher(String, '/map', LATCHED).publish(String(data='here'))
+        assert viewer.message('/map') == {'data': 'here'}
+    finally:
+        node.destroy_node()
+        other.try_shutdown()
 
 
 def test_viewers_publish(bench):
