@@ -29,7 +29,10 @@ import subprocess
 import sys
 import termios
 import time
-from typing import Any, NoReturn
+
+TYPE_CHECKING = False  # each pod would wait for typing itself
+if TYPE_CHECKING:
+    from typing import Any, NoReturn
 
 HEADER = struct.Struct('>BII')
 # counted

@@ -28,7 +28,7 @@ from fogros2.provider.kubernetes.start import Start
 _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 #: Seconds for which an API server is waited for before anything has begun.
 _FIRST = 5.0
-#: Seconds for which rights that were there are not asked for again.
+#: Seconds for which rights that were there, and pods that were let in, are not tried again.
 _SURE = 30.0
 
 
@@ -45,6 +45,9 @@ class KubernetesProvider(Provider):
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._reviewing = threading.Lock()
+        self._trying = threading.Lock()
+        #: When pods of a kind were last let in, by where and what they ask for.
+        self._admitted: dict[str, float] = {}
         #: When it was found that this user has all rights, by context and namespace.
         self._reviewed: dict[tuple[str, str], float] = {}
         #: Contexts and namespaces that launch files have named.
@@ -102,8 +105,7 @@ class KubernetesProvider(Provider):
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
         existing = None
         try:
-            api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
-                        dryRun='All', cancel=request.cancel)
+            self._try_admission(api, namespace, spec, request, options)
         except ApiError as error:
             # the first attempt with this token may have used the quota up
             existing = self._existing(api, namespace, spec, request)
@@ -120,6 +122,19 @@ class KubernetesProvider(Provider):
         self._made[machine_id] = job
         self._services[machine_id] = service
         return machine_id
+
+    def _try_admission(
+        self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
+        options: Options,
+    ) -> None:
+        """Try whether the pod would be let in, once for those that differ by their names alone."""
+        kind = f'{api.context} {namespace} {request.dependencies} {options}'
+        with self._trying:
+            if time.monotonic() - self._admitted.get(kind, -_SURE) < _SURE:
+                return
+            api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
+                        dryRun='All', cancel=request.cancel)
+            self._admitted[kind] = time.monotonic()
 
     def _make_job(
         self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,

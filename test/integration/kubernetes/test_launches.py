@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
 import shutil
@@ -257,13 +258,38 @@ def test_a_kept_pod_is_a_warm_start(launch, namespace):
         assert clean(run), run.text
         pods += [pod['metadata']['uid'] for pod in namespace.all('pods')]
     assert len(pods) == 2 and len({*pods}) == 1, "the second launch took the first one's pod"
-    listed = ros2('fog', 'list')
-    assert 'warm' in listed.stdout and namespace.name in listed.stdout, listed
     status = ros2('fog', 'status', 'warm')
     assert status.returncode == 0 and 'kept for the next one' in status.stdout, status
     assert status.stderr == '', status
     deleted = ros2('fog', 'delete', 'warm', '--yes')
     assert deleted.returncode == 0, deleted
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_ros2_fog_knows_pods(launch, namespace, kubernetes, monkeypatch, tmp_path):
+    run = launch("talker(pod('known'))", 'listener()')
+    run.wait_for('I heard', timeout=PATIENCE)
+    with ThreadPoolExecutor() as pool:
+        listed, status, logs, connected, swept = pool.map(lambda words: ros2('fog', *words), (
+            ['list'], ['status', 'known'], ['logs', 'known'],
+            ['connect', 'known', '--', 'sh', '-c', 'hostname; id -un'], ['gc']))
+    # the robot's role lets it see its own namespace
+    assert 'known' in listed.stdout and namespace.name in listed.stdout, listed
+    assert status.returncode == 0 and 'talker' in status.stdout, status
+    assert 'Publishing: "Hello World from known ' in logs.stdout, logs
+    assert connected.stdout.split() == ['known', 'fog'], connected
+    assert swept.returncode == 0, swept
+    # one who may sees all of them, with nothing of this robot's at hand
+    with monkeypatch.context() as patch:
+        patch.setenv('KUBECONFIG', str(kubernetes.kubeconfig))
+        patch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'another'))
+        everywhere = ros2('fog', 'list')
+    assert 'known' in everywhere.stdout and namespace.name in everywhere.stdout, everywhere
+    before = run.text.count('I heard')
+    run.wait_for('I heard', times=before + 1, timeout=PATIENCE)  # gc has let it be
+    run.interrupt()
+    assert run.ended() == 0, run.text
     assert namespace.left() == []
 
 
