@@ -76,7 +76,7 @@ class Copy:
 
     def run(self, user: str, *words: str, data: bytes = b'', check: bool = False) -> Result:
         return process.run(Command(tuple(self.argv(user, *words)), sudo=True, input=data or b' '),
-                           timeout=30.0, check=check)
+                           timeout=90.0, check=check)
 
     def ask(self, user: str, verb: str, *more: str, **request: Any) -> Result:
         """Ask the helper for something, as the product does."""
@@ -249,7 +249,8 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
 def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     pid = copy.launch('fogada')
     assert copy.ask('fogada', 'keys', name='fog000010', pid=pid).returncode == 0
-    copy.run('root', 'sh', '-ec', 'cd /run/fogros2-vpn; for n in 1 2 3 4 5 6 7 8 9 a b c d e f; do '
+    copy.run('root', 'sh', '-ec', 'cd /run/fogros2-vpn; '
+             'for n in 1 2 3 4 5 6 7 8 9 a b c d e f; do '
              'cp -r fog000010 fog00000$n; sed -i s/fog000010/fog00000$n/ fog00000$n/record; done',
              check=True)
     said = copy.ask('fogada', 'keys', name='fog000000', pid=pid)
@@ -302,6 +303,58 @@ def test_a_launch_takes_it_by_itself(copy: Copy) -> None:
         timer.cancel()
         child.kill()
         child.communicate()
+
+LAUNCH = """\
+from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = SSHInstance(name='fogm', host='192.0.2.2', user='fogeve')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
+        Node(package='fogros2_examples', executable='listener', output='screen')])
+"""
+#: The machine: a network of its own, where another user may do all.
+MACHINE = """\
+mkdir -p /run/sshd
+echo 'fogeve ALL=(ALL) NOPASSWD: ALL' >/etc/sudoers.d/eve
+setpriv --reuid=fogada --regid=fogada --init-groups env HOME=/home/fogada sh -ec '
+umask 077; mkdir -p ~/.ssh; ssh-keygen -q -t ed25519 -N "" -f ~/.ssh/id_ed25519'
+ssh-keygen -q -t ed25519 -N '' -f /run/sshd/key
+install -d -m 700 -o fogeve -g fogeve /home/fogeve/.ssh
+cd /home/fogada/.ssh
+install -m 600 -o fogeve -g fogeve id_ed25519.pub /home/fogeve/.ssh/authorized_keys
+echo "192.0.2.2 $(cat /run/sshd/key.pub)" >known_hosts
+chown fogada: known_hosts
+usermod -p '*' fogeve
+ip netns add machine
+ip link add e0 type veth peer name e1 netns machine
+ip address add 192.0.2.1/30 dev e0
+ip link set e0 up
+ip -n machine address add 192.0.2.2/30 dev e1
+ip -n machine link set e1 up
+ip -n machine link set lo up
+ip netns exec machine /usr/sbin/sshd -h /run/sshd/key -o PidFile=none
+"""
+
+
+def test_a_whole_launch_of_a_user_without_rights(copy: Copy) -> None:
+    """A talker on a machine and a listener here; ``ros2 launch`` runs as one of the group."""
+    if without_product(copy, 'fogada'):
+        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
+    copy.run('root', 'sh', '-ec', MACHINE, check=True)
+    copy.run('fogada', 'sh', '-c', 'cat >~/first.launch.py', data=LAUNCH.encode(), check=True)
+    ros2 = str(Path(sys.executable).parent)
+    script = (f'cd; export PATH={ros2}:$PATH ROS_DOMAIN_ID=31; sudo -n true && exit 99; '
+              # a shell without a terminal has what it starts beside it ignore Ctrl-C
+              'env --default-signal=INT ros2 launch ./first.launch.py >said 2>&1 </dev/null & '
+              'for n in $(seq 60); do grep -q "I heard" said && break; sleep 1; done; '
+              'kill -INT $!; wait $!; echo status $?; cat said')
+    said = copy.run('fogada', 'sh', '-c', script).stdout
+    assert 'I heard: [Hello World from' in said and 'status 0' in said, said
+    assert not {link for link in copy.links() if link.startswith('fog')}
+
 
 
 def test_without_it_the_question_comes_first(copy: Copy) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 import re
 import runpy
@@ -16,6 +17,7 @@ from launch.frontend import Parser
 import pytest
 
 from fogros2 import plugin_system
+from fogros2.actions import override
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
@@ -79,9 +81,24 @@ def test_commands(line, monkeypatch):
         parser = argparse.ArgumentParser()
         verb.add_arguments(parser, 'ros2 fog')
         parser.parse_args(words[3:])
+    elif words[:2] == ['ros2', 'launch']:
+        for option, value in zip(words, words[1:]):
+            if option == '--machine':
+                override.parse(value)
     elif words[0] == 'make':
         targets = re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.MULTILINE)
         assert words[1] in targets
+    elif words[:2] == ['pip', 'install']:
+        extras = {name for word in words[2:] for name in re.findall(r'[a-z_]+', word[1:])
+                  if word.startswith('.[')}
+        assert extras <= set(re.findall(r"^        '([a-z]+)': ", (ROOT / 'setup.py').read_text(),
+                                        re.MULTILINE))
+    elif words[0] == 'sudo' and words[1].startswith('./'):
+        assert os.access(ROOT / words[1], os.X_OK)
+    else:
+        # other people's programs, which take an account, a network or a workspace
+        assert words[0] in ('.', 'aws', 'colcon', 'echo', 'git', 'kubectl', 'npm', 'rosdep',
+                            'source', 'ssh', 'sudo', 'FOGROS2_ROSDEP=yes', 'python'), line
 
 
 def _refuse(self: argparse.ArgumentParser, message: str) -> None:

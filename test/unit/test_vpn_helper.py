@@ -207,7 +207,8 @@ def test_what_is_asked_of_it_is_what_it_takes() -> None:
 
 def test_all_other_interfaces_are_root_s_commands() -> None:
     plugin, plain = helped.HelpedWireGuard(), WireGuard()
-    for other in (interface('/home/eve/.ros/vpn.key'), interface('/run/fogros2-vpn/fogffffff/key')):
+    for path in ('/home/eve/.ros/vpn.key', helped.key_file('fogffffff')):
+        other = interface(path)
         assert plugin.keys(other) == plain.keys(other)
         assert plugin.status(other) == plain.status(other)
         assert [*plugin.down(other)] == [*plain.down(other)]
