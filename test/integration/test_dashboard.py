@@ -18,6 +18,7 @@ import pytest
 pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed')
 pytest.importorskip('cv2', reason='the extra "video" is not installed')
 
+from fogros2.store import Store
 from fogros2.testing.browser import Browser, program
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
@@ -95,6 +96,15 @@ def browser() -> Iterator[Browser]:
         made.close()
 
 
+@pytest.fixture
+def name(engine: str, nothing_left: None) -> Iterator[str]:
+    """Return a machine's name; one that is left under it is ended."""
+    made = f'dash-{secrets.token_hex(2)}'
+    yield made
+    if Store().machine(made).exists():
+        ros2('fog', 'delete', made, '--yes', '--force')
+
+
 def article(name: str) -> str:
     return f'document.querySelector(\'article[data-key="{name}"]\')'
 
@@ -129,10 +139,9 @@ def test_nothing_goes_on(dashboard: Dashboard, browser: Browser) -> None:
 
 
 def test_a_launch_from_its_begin_to_its_end(
-    engine: str, dashboard: Dashboard, browser: Browser, tmp_path: Path,
+    dashboard: Dashboard, browser: Browser, tmp_path: Path, name: str,
     watched: Callable[[str], Path],
 ) -> None:
-    name = f'dash-{secrets.token_hex(2)}'
     watching = watched(name)
     file = tmp_path / 'dash.launch.py'
     file.write_text(LAUNCH_FILE.format(name=name, markup=MARKUP))
@@ -146,6 +155,7 @@ def test_a_launch_from_its_begin_to_its_end(
         ).observe(document.body, {subtree: true, childList: true, attributes: true});""")
     with launching() as launch:
         launched = launch(str(file))
+        launched.wait_for('process started')
         browser.until(f'{article(name)} && {article(name)}.dataset.phase === "running"',
                       timeout=60)
         assert {'coming', 'running', 'done'} <= set(browser.ask('[...seen]'))
