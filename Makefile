@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video test test-kubernetes test-minimum lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning test test-kubernetes test-minimum lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -13,6 +13,11 @@ demo:
 demo-video:
 	@tools/setup.sh bench
 	@tools/run.sh best -- python benchmarks/streaming.py --short
+
+## demo-slam demo-grasp demo-planning   an application on a container machine, and its picture
+demo-slam demo-grasp demo-planning: demo-%:
+	@tools/setup.sh bench
+	@tools/run.sh best -- ros2 launch fogros2_examples $*.launch.py picture:=$(CURDIR)/.cache/$*.png
 
 ## test   all tests, on the embedded default and, where it is installed, on ROS 2
 test:

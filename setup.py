@@ -15,7 +15,7 @@ VERSION = '0.1.0'
 EXECUTABLES = {
     'fogros2_examples': [
         'talker', 'listener', 'camera', 'image_processor', 'motion_planner', 'planning_client',
-        'slam', 'slam_camera'],
+        'grasp_planner', 'grasp_camera', 'slam', 'slam_camera'],
     'image_transport_h264': ['encoder', 'decoder'],
 }
 

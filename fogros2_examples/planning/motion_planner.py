@@ -95,8 +95,11 @@ class MotionPlanner(Node):
     def tell(self, level: bytes, name: str, message: str,
              figures: dict[str, object] | None = None) -> None:
         """Say what happened, here and to others."""
-        log = self.get_logger()
-        (log.info if level == DiagnosticStatus.OK else log.error)(message)
+        # a line of its own for each: rclpy holds one to one severity
+        if level == DiagnosticStatus.OK:
+            self.get_logger().info(message)
+        else:
+            self.get_logger().error(message)
         self.status.publish(DiagnosticStatus(
             level=level, name=name, message=message, hardware_id=self.scene,
             values=[KeyValue(key=key, value=str(value))

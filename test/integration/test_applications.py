@@ -5,9 +5,14 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+import re
 import shutil
+import signal
+import subprocess
+import sys
+import time
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
 import pytest
 
 from fogros2.testing.launched import launching
@@ -29,6 +34,13 @@ def surroundings(tmp_path, monkeypatch):
 def launch():
     with launching() as start:
         yield start
+
+
+def started(executable, *words):
+    """Return a node as a process; it ends with SIGINT."""
+    path = Path(get_package_prefix('fogros2_examples'), 'lib/fogros2_examples', executable)
+    return subprocess.Popen([sys.executable, path, '--ros-args', *words], text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
 def launch_file(name):
@@ -68,7 +80,7 @@ def twin(source):
         'FogROSLaunchDescription', 'LaunchDescription').replace('CloudNode', 'Node')
 
 
-@pytest.mark.parametrize('name', ['planning'])
+@pytest.mark.parametrize('name', ['grasp', 'planning'])
 def test_a_launch_file_is_ten_lines_longer_than_its_twin_at_most(name, launch, tmp_path):
     source = launch_file(name).read_text()
     here = twin(source)
@@ -92,6 +104,143 @@ def test_motion_planning(machine, launch, tmp_path):
     assert 'path of ' in run.text
     assert ('[planner.motion_planner-1]' in run.text) == (machine == 'container')
     assert drawn.read_bytes().startswith(b'\x89PNG')
+
+
+def test_grasp_planning(launch, tmp_path):
+    drawn = tmp_path / 'grasp.png'
+    run = launch('fogros2_examples', 'grasp.launch.py', 'trials:=3', f'picture:={drawn}')
+    assert run.ended() == 0, run.text
+    assert run.errors == [] and 'WARNING' not in run.text, run.text
+    # depth crosses without loss
+    assert '/depth comes' in run.text or 'depth_h264_decoder' in run.text
+    for number in range(3):
+        assert re.search(rf'bin {number}: [1-9][0-9]* grasps, q 0[.]', run.text), run.text
+    assert drawn.read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_planner_of_grasps_outlives_bad_images(launch):
+    """Images that are none, then one that is."""
+    from geometry_msgs.msg import PoseArray
+    import numpy
+    import rclpy
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_msgs.msg import Header
+
+    from fogros2.waiting import wait_until
+    from fogros2_examples.grasp.bins import camera, depth_image, thrown
+    from fogros2_examples.grasp.messages import depth_message, info_message
+
+    planner = started('grasp_planner')
+    rclpy.init()
+    node = rclpy.create_node('camera')
+    answers = {}
+    images = node.create_publisher(Image, 'depth', 2)
+    infos = node.create_publisher(CameraInfo, 'camera_info', 10)
+    node.create_subscription(
+        PoseArray, 'grasps', lambda poses: answers.update({poses.header.frame_id: poses}), 10)
+    eye = camera(320, 240)
+    depth = depth_image(thrown(0), eye, 0)
+
+    def answered(image):
+        name = image.header.frame_id = f'image {len(answers)}'
+
+        def there():
+            # the first ones may come before the planner is there
+            infos.publish(info_message(320, 240, eye.focal, Header()))
+            images.publish(image)
+            deadline = time.monotonic() + 2
+            while time.monotonic() < deadline and name not in answers:
+                rclpy.spin_once(node, timeout_sec=0.1)
+            return name in answers
+        wait_until(there, timeout=30.0, what='an answer')
+        return len(answers[name].poses)
+
+    try:
+        good = depth_message(depth, '32FC1', Header())
+        colour = depth_message(depth, '32FC1', Header())
+        colour.encoding = 'bgr8'
+        assert answered(colour) == 0
+        assert answered(depth_message(0 * depth, '16UC1', Header())) == 0
+        assert answered(depth_message(numpy.nan * depth, '32FC1', Header())) == 0
+        assert answered(Image(encoding='32FC1', width=320, height=240, step=1280)) == 0
+        assert answered(depth_message(depth[:100], '32FC1', Header())) == 0
+        assert answered(good) > 0
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+        planner.send_signal(signal.SIGINT)
+        said = planner.communicate(timeout=20)[0]
+    assert planner.returncode == 0, said
+    for words in ("'bgr8' is no encoding of depth", '0 of 76800 pixels have a depth',
+                  '0 bytes are no image', 'camera_info is of 320x240 pixels'):
+        assert words in said, said
+
+
+def test_a_planner_of_motions_outlives_bad_questions(launch):
+    """A scene that is none, poses that are none or touch, a goal out of reach; then a good one."""
+    from diagnostic_msgs.msg import DiagnosticStatus
+    from geometry_msgs.msg import PoseStamped
+    from nav_msgs.srv import GetPlan
+    import numpy
+    import rclpy
+    from visualization_msgs.msg import MarkerArray
+
+    from fogros2.waiting import wait_until
+    from fogros2_examples.meshes import box, joined
+    from fogros2_examples.planning.messages import pose_message, scene_message
+    from fogros2_examples.planning.motion_planner import LATCHED
+    from fogros2_examples.planning.scene import pose, Scene
+
+    planner = started('motion_planner', '-p', 'time:=1.0')
+    rclpy.init()
+    node = rclpy.create_node('asker')
+    told = []
+    scenes = node.create_publisher(MarkerArray, 'environment', LATCHED)
+    node.create_subscription(DiagnosticStatus, 'planning_status', told.append, LATCHED)
+    client = node.create_client(GetPlan, 'plan')
+
+    def until(true):
+        def spun():
+            rclpy.spin_once(node, timeout_sec=0.1)
+            return true()
+        wait_until(spun, timeout=30.0, what='an answer')
+
+    def planned(start, goal, frame='cell'):
+        request = GetPlan.Request()
+        request.start, request.goal = (PoseStamped(pose=pose_message(p)) for p in (start, goal))
+        request.start.header.frame_id = frame
+        before, future = len(told), client.call_async(request)
+        until(lambda: future.done() and len(told) > before)
+        return len(future.result().plan.poses), told[-1].message
+
+    # the far half is behind a wall
+    scene = Scene('cell', box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1)),
+                  box((1.4, -1, -1), (1.5, 2, 2)), joined([]), numpy.zeros(3),
+                  numpy.array([3.0, 1.0, 1.0]), pose(0.2, 0.2, 0.2), pose(1.2, 0.8, 0.8))
+    here, there, beyond = scene.start, scene.goal, pose(2.5, 0.5, 0.5)
+    try:
+        until(client.service_is_ready)
+        assert planned(here, there) == (
+            0, "no plan: the start is in the frame 'cell', the environment is not there yet")
+        scenes.publish(MarkerArray())
+        until(lambda: told[-1].message == "no environment: no marker 'body'")
+        scenes.publish(scene_message(scene))
+        until(lambda: told[-1].hardware_id == 'cell')
+        for start, goal, why in [
+                (pose(1.45, 0.5, 0.5), there, 'the start touches something'),
+                (here, pose(9, 0.5, 0.5), 'the goal touches something, or is out of bounds'),
+                (here, beyond, 'no way was found in 1 s'),
+                (here, numpy.zeros(7), 'is no pose'), (numpy.nan * here, there, 'is no pose')]:
+            count, message = planned(start, goal)
+            assert count == 0 and why in message
+        assert 'the environment is' in planned(here, there, 'hall')[1]
+        assert planned(here, there)[0] >= 2
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+        planner.send_signal(signal.SIGINT)
+        said = planner.communicate(timeout=20)[0]
+    assert planner.returncode == 0, said
 
 
 def test_a_launch_says_what_can_not_be_planned(launch, tmp_path):

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic bins of objects: what is in them, and what a depth camera over them sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import math
+
+import fcl
+import numpy
+from numpy.typing import NDArray
+
+from fogros2_examples.meshes import box, cylinder, Floats, joined, lathe, Mesh, sphere, turned
+from fogros2_examples.rendering import Camera, drawn
+
+#: Side of the bin's floor, m; its walls are out of the camera's sight.
+SIZE = (0.46, 0.34)
+#: How high the camera is above the floor, m, and its focal length for each pixel of its width.
+HEIGHT, FOCAL = 0.7, 1.6
+#: Standard deviation of the sensor's noise, m, and the angle from which on it sees no surface.
+NOISE, STEEPEST = 0.0005, math.radians(84)
+
+
+def _dumbbell(scale: float) -> Mesh:
+    ball = sphere(0.021 * scale)
+    bar = cylinder(0.009 * scale, 0.07 * scale, 16)
+    return joined([ball.moved(numpy.eye(3), (0, 0, -0.04 * scale)), bar,
+                   ball.moved(numpy.eye(3), (0, 0, 0.04 * scale))])
+
+
+def _bracket(scale: float) -> Mesh:
+    return joined([box((-0.04 * scale, -0.016 * scale, 0), (0.04 * scale, 0.016 * scale, 0.014)),
+                   box((0.024 * scale, -0.016 * scale, 0), (0.04 * scale, 0.016 * scale,
+                                                            0.05 * scale))])
+
+
+def _bottle(scale: float) -> Mesh:
+    return lathe([(r * scale, z * scale) for r, z in (
+        (0.018, -0.055), (0.024, -0.05), (0.024, 0.015), (0.011, 0.035), (0.011, 0.05),
+        (0.013, 0.051), (0.013, 0.06))])
+
+
+def _brick(scale: float) -> Mesh:
+    return box((-0.045 * scale, -0.02 * scale, -0.015 * scale),
+               (0.045 * scale, 0.02 * scale, 0.015 * scale))
+
+
+def _can(scale: float) -> Mesh:
+    return cylinder(0.026 * scale, 0.075 * scale, 32)
+
+
+#: What is thrown into a bin.
+KINDS: tuple[Callable[[float], Mesh], ...] = (
+    _brick, _can, _bottle, _dumbbell, _bracket, lambda scale: sphere(0.026 * scale))
+
+
+@dataclasses.dataclass(frozen=True)
+class Bin:
+    """
+    A bin; z is up, its floor is at 0, its middle in the origin.
+
+    :param objects: where they lie.
+    """
+
+    objects: tuple[Mesh, ...]
+    floor: Mesh
+
+    @property
+    def corners(self) -> Floats:
+        """The corners of all triangles, those of the floor last, array (n, 3, 3)."""
+        return joined([*self.objects, self.floor]).corners
+
+
+def thrown(seed: int, count: int = 9) -> Bin:
+    """Return a bin with objects; each has come down straight onto what lay below it."""
+    random = numpy.random.default_rng(seed)
+    floor = box((-SIZE[0] / 2, -SIZE[1] / 2, -0.01), (SIZE[0] / 2, SIZE[1] / 2, 0))
+    objects: list[Mesh] = []
+    lying = [_solid(floor)]
+    for _ in range(count):
+        mesh = KINDS[int(random.integers(len(KINDS)))](float(random.uniform(0.85, 1.2)))
+        # things come to lie on a face more often than on an edge
+        tilt = math.pi / 2 * int(random.integers(2)) + float(random.normal(0, 0.12))
+        turn = turned((0, 0, 1), float(random.uniform(0, 2 * math.pi))) @ turned((1, 0, 0), tilt)
+        x, y = random.uniform(-0.5, 0.5, 2) * (numpy.array(SIZE) - 0.14)
+        mesh = mesh.moved(turn, (x, y, 0))
+        mesh = mesh.moved(numpy.eye(3), (0, 0, -mesh.vertices[:, 2].min()))
+        height = _resting(mesh, lying)
+        mesh = mesh.moved(numpy.eye(3), (0, 0, height))
+        objects.append(mesh)
+        lying.append(_solid(mesh))
+    return Bin(tuple(objects), floor)
+
+
+def _solid(mesh: Mesh) -> fcl.CollisionObject:
+    model = fcl.BVHModel()
+    model.beginModel(len(mesh.triangles), len(mesh.vertices))
+    model.addSubModel(mesh.vertices, mesh.triangles)
+    model.endModel()
+    return fcl.CollisionObject(model, fcl.Transform())
+
+
+def _resting(mesh: Mesh, lying: list[fcl.CollisionObject]) -> float:
+    """Return how far above the floor a mesh stops when it comes down."""
+    falling = _solid(mesh)
+
+    def touches(height: float) -> bool:
+        falling.setTransform(fcl.Transform(numpy.array([0.0, 0.0, height])))
+        return any(fcl.collide(falling, other, fcl.CollisionRequest(), fcl.CollisionResult())
+                   for other in lying)
+
+    height = 0.3
+    while height > 0.001 and not touches(height - 0.004):
+        height -= 0.004
+    return max(height, 0.0005)
+
+
+def camera(width: int = 640, height: int = 480) -> Camera:
+    """Return the camera over a bin; it looks straight down."""
+    return Camera(width, height, FOCAL * width,
+                  numpy.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), numpy.array([0, 0, HEIGHT]))
+
+
+def depth_image(contents: Bin, eye: Camera, seed: int) -> NDArray[numpy.float32]:
+    """
+    Return what a depth camera measures: m, 0 where it sees nothing.
+
+    It has noise, and is blind for surfaces that it sees nearly from their side.
+    """
+    corners = contents.corners
+    depth, index = drawn(eye, corners)
+    normals = numpy.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    middle = corners.mean(axis=1) - eye.centre
+    slant = numpy.abs((normals * middle).sum(axis=1)) / (
+        numpy.linalg.norm(normals, axis=1) * numpy.linalg.norm(middle, axis=1) + 1e-12)
+    seen = (index >= 0) & (slant[index] > math.cos(STEEPEST))
+    noise = numpy.random.default_rng(seed).normal(0, NOISE, depth.shape)
+    return numpy.where(seen, depth + noise, 0).astype(numpy.float32)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Grasp planning: the planner where ``machine:=`` says, a depth camera over ten bins here."""
+
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    """Describe the two; ``trials:=`` and ``picture:=`` say how many bins, and what is shown."""
+    return FogROSLaunchDescription([
+        DeclareLaunchArgument('machine', default_value='container',
+                              choices=['robot', 'container', 'aws', 'kubernetes'],
+                              description='where the planner runs'),
+        DeclareLaunchArgument('transport', default_value='h264',
+                              description='how depth crosses: raw, or h264 (lossless)'),
+        DeclareLaunchArgument('foxglove', default_value='false',
+                              description='show the topics in a browser: ros2 fog monitor'),
+        DeclareLaunchArgument('trials', default_value='10', description='how many bins'),
+        DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
+        FogMachine(LaunchConfiguration('machine'), {
+            'name': 'grasping', 'launch_foxglove': LaunchConfiguration('foxglove')}),
+        CloudNode(machine='grasping', package='fogros2_examples', executable='grasp_planner',
+                  output='screen', stream_topics=[('/depth', LaunchConfiguration('transport'))]),
+        Node(package='fogros2_examples', executable='grasp_camera', output='screen',
+             parameters=[{'trials': LaunchConfiguration('trials'),
+                          'picture': LaunchConfiguration('picture')}], on_exit=Shutdown()),
+    ])
