@@ -11,6 +11,7 @@ made by those.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import functools
 import json
 import os
 from pathlib import Path
@@ -29,8 +30,9 @@ PROTOCOL = '1'
 KEYS = '/run/fogros2-vpn'
 
 
+@functools.cache
 def permitted() -> bool:
-    """Return whether this user, who isn't root, may use the helper now without a question."""
+    """Return whether this user, who isn't root, may use the helper without a question."""
     if os.geteuid() == 0 or not Path(HELPER).exists() or process.which('sudo') is None:
         return False
     try:

@@ -421,7 +421,8 @@ def down(request: Mapping[str, Any], uid: int) -> None:
 
 
 def tidy() -> None:
-    """Take away the interfaces of launches that are gone."""
+    """Take away the interfaces of launches that are gone, each though another stays."""
+    failed = False
     for record in records():
         try:
             alive = begun(record.pid) == record.started
@@ -429,7 +430,13 @@ def tidy() -> None:
             alive = False
         if not alive:
             print(f'{record.name}: its launch, process {record.pid}, is gone', flush=True)
-            down({'name': record.name}, 0)
+            try:
+                down({'name': record.name}, 0)
+            except (Refused, SystemExit) as error:
+                print(f'{record.name} stays: {error}', file=sys.stderr)
+                failed = True
+    if failed:
+        sys.exit(1)
 
 
 VERBS: dict[str, Callable[[Mapping[str, Any], int], None]] = {

@@ -18,10 +18,11 @@ import pytest
 
 from fogros2 import process
 from fogros2.deploy import robot
-from fogros2.errors import PrerequisiteError
-from fogros2.model import Peer, Result, VpnInterface
+from fogros2.errors import CommandError, PrerequisiteError
+from fogros2.model import Command, Peer, Result, VpnInterface
 from fogros2.vpn import helped
 from fogros2.vpn.wireguard import WireGuard
+from ros2fog_cli.api import doctor
 
 FOLDER = Path(__file__).resolve().parents[2] / 'packaging' / 'vpn_helper'
 KEY = 'Sg3Q0Y1Y0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHo='
@@ -225,13 +226,34 @@ def test_it_is_used_where_it_is_permitted(
     monkeypatch.setattr(helped, 'HELPER', sys.executable)
     monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
     monkeypatch.setattr(process, 'run', lambda command, **more: answer)
+    asked = helped.permitted.__wrapped__  # the answer is kept for as long as the process lives
     monkeypatch.setattr(os, 'geteuid', lambda: 1000)
-    assert helped.permitted() is expected
+    assert asked() is expected
     monkeypatch.setattr(os, 'geteuid', lambda: 0)
-    assert not helped.permitted()
+    assert not asked()
     monkeypatch.setattr(os, 'geteuid', lambda: 1000)
     monkeypatch.setattr(helped, 'HELPER', '/nowhere/vpn')
-    assert not helped.permitted()
+    assert not asked()
+
+
+def test_doctor_asks_root_for_nothing_where_the_helper_is_enough(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
+    refused = Result(1, '', 'sudo: a password is required')
+
+    def run(command: Command, *, check: bool = True, **more: object) -> Result:
+        if check:
+            raise CommandError(command, refused, 'here')
+        return refused
+
+    monkeypatch.setattr(process, 'run', run)
+    for permitted, verdicts in ((True, ['ok', 'warning', 'warning']),
+                                (False, ['failed', 'failed', 'warning'])):
+        monkeypatch.setattr(helped, 'permitted', lambda permitted=permitted: permitted)
+        found = [doctor.root(), doctor.firewall_program(), doctor.firewall()]
+        assert [check.verdict for check in found] == verdicts
 
 
 def test_who_is_not_in_the_group_is_told_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
