@@ -173,8 +173,11 @@ def rows(here: Robot, runs: int) -> Iterator[Row]:
     yield Row('1 pod: until it is heard', one, 's', runs=runs)
     yield Row(f'{MANY} pods: until all are heard', many, 's', runs=runs)
     yield Row(f'{MANY} pods', many / one, 'times one', 4.0, runs=runs)
+    bare = statistics.median(here.bare(1) for _ in range(runs))
     floor = statistics.median(here.bare(MANY) for _ in range(runs))
-    yield Row(f'{MANY} bare pods, with nothing of FogROS2: until they run', floor, 's', runs=runs)
+    yield Row('1 bare pod, with nothing of FogROS2: until it runs', bare, 's', runs=runs)
+    yield Row(f'{MANY} bare pods: until they run', floor, 's', runs=runs)
+    yield Row(f'{MANY} bare pods', floor / bare, 'times one', runs=runs)
     yield Row(f'{MANY} pods, without what the cluster takes for bare ones', (many - floor) / MANY,
               's each', runs=runs)
 
