@@ -58,7 +58,7 @@ if [ -n "$rmw" ]; then
                 -e DEBIAN_FRONTEND=noninteractive "$image" sh -ec \\
                 'apt-get update -q; apt-get install -q -y --no-install-recommends "$0"' \\
                 "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
-            $as_root $engine commit -q $adding "$with" >/dev/null
+            $as_root $engine commit $adding "$with" >/dev/null
             image=$with
         fi
     fi

@@ -161,11 +161,15 @@ def node_container(image: str, options: Sequence[str]) -> Container:
     :param options: of ``docker run``, such as '--gpus=all'.
     :raises ConfigurationError: they are none.
     """
-    container = parse(shlex.join(['docker', 'run', *options, image]))
+    wrong = ConfigurationError(
+        f"image_options={list(options)} are no options of 'docker run' alone",
+        "such as ['--gpus=all', '-v', '/data:/data:ro']")
+    try:
+        container = parse(shlex.join(['docker', 'run', *options, image]))
+    except ConfigurationError as error:
+        raise wrong from error
     if container.image != image or container.command:
-        raise ConfigurationError(
-            f"image_options={list(options)} are no options of 'docker run' alone",
-            "such as ['--gpus=all', '-v', '/data:/data:ro']")
+        raise wrong
     return container
 
 

@@ -394,7 +394,8 @@ class Coordinator:
             await asyncio.gather(*(session.choose() for session in sessions))
             await self._in_thread(
                 self.launch.prepare, [session.spec for session in sessions],
-                {session.spec.name: session.programs for session in sessions})
+                {session.spec.name: session.programs for session in sessions},
+                {session.spec.name: session.images for session in sessions})
         except FogError as error:
             self._fail(error)
             return

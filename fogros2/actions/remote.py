@@ -64,9 +64,8 @@ class RemoteProcess(ExecuteLocal):
         self._fogros2_node = node_spec.from_action(
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self._fogros2_image, self._fogros2_image_options)
-        if self._fogros2_image:
-            coordinator.launch.provider(session.spec.provider).check_containers(session.spec)
-        elif session.spec.on_interrupt == 'robot' and not isinstance(self, carriers.Carrier):
+        if session.spec.on_interrupt == 'robot' and not (
+                self._fogros2_image or isinstance(self, carriers.Carrier)):
             self._fogros2_command = node_spec.robot_command(self, context)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:

@@ -132,6 +132,11 @@ class Session:
             (run.node.package, run.node.executable) for run in self._waiting
             if run.node.package and not run.node.image})
 
+    @property
+    def images(self) -> Sequence[str]:
+        """The container images that what waits for the machine runs in."""
+        return sorted({run.node.image for run in self._waiting if run.node.image})
+
     def add(self, instance: CloudInstance) -> None:
         """Have an instance stand for this machine."""
         if instance not in self.instances:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import threading
 
 from fogros2 import container_scripts, containers
@@ -31,7 +31,9 @@ class Containers:
 
     def start(self) -> None:
         """
-        Start a machine's containers, before its nodes; an engine is installed where there is none.
+        Start a machine's containers, before its nodes, and get the images that those run in.
+
+        An engine is installed where there is none.
 
         :raises CommandError: a container doesn't start.
         :raises PrerequisiteError: the machine can't have an engine, or an image.
@@ -39,9 +41,12 @@ class Containers:
         job = self._job
         # here, as nodes in images come later and are to be stopped before
         job.undoing('containers', self._remove)
-        if not job.spec.containers:
-            return
-        launch = job.launch.id
+        if job.spec.containers:
+            self._start_containers()
+        self._get(job.launch.images(job.name))
+
+    def _start_containers(self) -> None:
+        job, launch = self._job, self._job.launch.id
         with self._lock, job.step('containers') as detail:
             self._shell.put(
                 container_scripts.FOLLOW.encode(), f'{self._directory}/{containers.FOLLOWER}',
@@ -58,16 +63,25 @@ class Containers:
         Return nodes as they are to be started: those with an image run in it, there by then.
 
         :raises PrerequisiteError: the machine can't have an engine, or an image.
+        :raises Unsupported: no engine can run there.
         """
+        images = self._get(node.image for node in nodes if node.image)
+        return [node if not node.image else containers.inside(
+            node, images[node.image], self._job.launch.id,
+            self._job.spec.workspace or '', self._job.spec.environment) for node in nodes]
+
+    def _get(self, images: Iterable[str]) -> dict[str, str]:
+        """Return what the engine knows images as that nodes run in."""
         rmw = self._job.launch.dds().rmw
+        found = {}
         with self._lock:
-            for image in dict.fromkeys(node.image for node in nodes if node.image):
+            for image in dict.fromkeys(images):
                 if (image, rmw) not in self._images:
+                    self._job.provider.check_containers(self._job.spec)
                     with self._job.step(f'image {image}'):
                         self._image(image, rmw)
-        return [node if not node.image else containers.inside(
-            node, self._images[node.image, rmw], self._job.launch.id,
-            self._job.spec.workspace or '', self._job.spec.environment) for node in nodes]
+                found[image] = self._images[image, rmw]
+        return found
 
     def _image(self, image: str, rmw: str = '') -> str:
         """Return what the engine knows an image as, downloaded if it wasn't there."""

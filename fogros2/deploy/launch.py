@@ -68,6 +68,7 @@ class Launch:
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
         self._programs: dict[str, Sequence[tuple[str, str]]] = {}
+        self._images: dict[str, Sequence[str]] = {}
         self.choices = Choices(self.provider, self.report)
         self._robot: Optional[RobotVpn] = None
         self._rmw = ''
@@ -79,16 +80,19 @@ class Launch:
     def prepare(
         self, specs: Sequence[MachineSpec],
         programs: Mapping[str, Sequence[tuple[str, str]]] = {},
+        images: Mapping[str, Sequence[str]] = {},
     ) -> None:
         """
         Check everything that can be checked at no cost.
 
         :param programs: per machine name the (package, executable) pairs that will run there.
+        :param images: likewise the container images that nodes there will run in.
         :raises FogError: the first thing that is wrong, with its remedy.
         """
         self.dds()
         check_robot()
         self._programs.update(programs)
+        self._images.update(images)
         names = [spec.name for spec in specs]
         for name in names:
             check_name(name)
@@ -107,6 +111,7 @@ class Launch:
                     "use on_exit='delete' to leave nothing there, or 'keep'")
             for line in spec.containers:
                 containers.parse(line)
+            if spec.containers or images.get(spec.name):
                 machines.check_containers(spec)
             if spec.workspace is not None:
                 workspace.inspect(Path(spec.workspace))
@@ -132,6 +137,10 @@ class Launch:
     def programs(self, name: str) -> Sequence[tuple[str, str]]:
         """Return the (package, executable) pairs that are known to run on a machine."""
         return self._programs.get(name, ())
+
+    def images(self, name: str) -> Sequence[str]:
+        """Return the container images that nodes on a machine are known to run in."""
+        return self._images.get(name, ())
 
     def provider(self, name: str) -> Provider:
         """

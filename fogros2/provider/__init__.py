@@ -95,7 +95,8 @@ class Provider(abc.ABC):
             raise Unsupported(
                 f"'{spec.name}' can't run containers: a machine of the provider '{self.name}' "
                 "hasn't the rights that an engine takes",
-                'run them on an EC2 instance or a computer that is reached by SSH')
+                'run them on an EC2 instance, a computer that is reached by SSH or in a '
+                'container machine')
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """

@@ -54,7 +54,7 @@ if [ "$user" != root ] && ! grep -q "^$user .*NOPASSWD: ALL" /etc/sudoers; then
     grep -qs "^$user " $rights || echo "$user ALL=(ALL:ALL) NOPASSWD: ALL" >> $rights
     chmod 440 $rights
 fi
-mkdir -p /run/sshd /etc/ssh /{agent_directory}
+{nested}mkdir -p /run/sshd /etc/ssh /{agent_directory}
 chown "$user" /{agent_directory} && chmod 700 /{agent_directory}
 grep -qw "$(hostname)" /etc/hosts 2>/dev/null \\
     || printf '127.0.0.1 localhost\\n127.0.1.1 %s\\n' "$(hostname)" >> /etc/hosts
@@ -82,8 +82,10 @@ done
 """
 
 # What an engine inside sets for the networks of its containers is this machine's network alone;
-# the rest of the kernel's settings stays read-only.
+# the rest of the kernel's settings stays read-only. What the engine takes for this boot's is
+# another's on a machine that was stopped.
 _NESTED = """\
+rm -rf /run/containers /run/libpod /run/netns/netns-*
 mount --bind /proc/sys/net /proc/sys/net && mount -o remount,bind,rw /proc/sys/net
 [ -e /etc/containers/policy.json ] || {
     mkdir -p /etc/containers
@@ -157,11 +159,11 @@ def add(
     }
     guard = _IDLE if agent is None else _GUARD.format(**names) + _IDLE
     if nested:
-        guard = _NESTED + guard
         archive.file(_NESTED_CONFIG, _NESTED_SETTINGS.format(
             limits=', '.join(f'"{word}"' for word in container_engine.limits()[1::2])).encode())
     archive.folder(FOLDER)
-    archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(guard=guard, **names).encode(), 0o755)
+    archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(
+        guard=guard, nested=_NESTED if nested else '', **names).encode(), 0o755)
     variables = {
         'LANG': 'C.UTF-8',
         'PATH': '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin',

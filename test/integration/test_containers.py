@@ -21,9 +21,10 @@ import pytest
 from fogros2 import container_scripts, containers
 from fogros2.containers import Container
 from fogros2.errors import CommandError
-from fogros2.model import Command, Endpoint, NodeSpec
+from fogros2.model import Command, CreateRequest, Endpoint, MachineSpec, NodeSpec
 from fogros2.process import run, which
 from fogros2.provider import container_engine, container_root
+from fogros2.provider.container import ContainerProvider
 from fogros2.shell.local import LocalShell
 from fogros2.testing.cluster import images as cluster_images
 from fogros2.testing.launched import launching, ros2
@@ -332,3 +333,31 @@ def test_a_container_machine_runs_containers_and_nodes_in_images(
         assert len(launched.errors) == 1, launched.text
     # what it downloaded went with it
     assert volumes() <= before
+
+
+def test_a_machine_that_was_stopped_runs_containers_again(images, crun, cloud_network):
+    name = f'boxes-{secrets.token_hex(3)}'
+    machines = ContainerProvider()
+    machine = machines.create(
+        MachineSpec(name, 'container', {'network': cloud_network, 'containers': True,
+                                        'mounts': [str(images), *crun]}, on_exit='stop'),
+        CreateRequest(secrets.token_hex(8), 'ssh-ed25519 AAAA', {}, 51820))
+
+    def said(script: str, check: bool = True) -> str:
+        return run(Command(('podman', 'exec', f'fogros2-{name}', 'sh', '-ec', script), sudo=True),
+                   timeout=60, check=check).stdout
+
+    def up() -> None:
+        wait_until(lambda: said('pgrep -x sshd', check=False), timeout=20, what='the machine')
+
+    try:
+        up()
+        said(f'podman run -q -d --name one oci-archive:{images}/box.tar busybox sleep 1000')
+        machines.stop(machine)
+        machines.start(machine)
+        up()
+        # the one from before doesn't run, and its image is there
+        assert said('podman ps -q; podman rm -f one >/dev/null; '
+                    'podman run --rm $(podman images -q) sh -c "echo again"') == 'again\n'
+    finally:
+        machines.destroy(machine)

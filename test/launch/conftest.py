@@ -111,8 +111,8 @@ class FakeLaunch:
     def robot_environment(self):
         return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
-    def prepare(self, specs, programs):
-        self.note('prepare', [spec.name for spec in specs], programs)
+    def prepare(self, specs, programs, images):
+        self.note('prepare', [spec.name for spec in specs], programs, images)
         if self.prepare_error is not None:
             raise self.prepare_error
 

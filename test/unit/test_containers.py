@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import subprocess
@@ -23,7 +24,7 @@ from fogros2.errors import ConfigurationError, PrerequisiteError, Unsupported
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider.container import ContainerProvider
 from fogros2.report import step
-from fogros2.testing.fakes import FakeShell
+from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2.waiting import Timeouts
 
 
@@ -235,7 +236,7 @@ def test_an_image_without_the_middleware_gets_it_once(engine):
     assert run.endswith(' ros-rolling-rmw-cyclonedds-cpp')
     assert ' --user 0:0 ' in run and ' ros:rolling sh -ec apt-get update' in run
     adding = run.split()[3]
-    assert told[-2:] == [f'{engine} commit -q {adding} {made}', f'{engine} rm -f {adding}']
+    assert told[-2:] == [f'{engine} commit {adding} {made}', f'{engine} rm -f {adding}']
     name, told = done(fetch, THERE=f'ros:rolling {made}', DISTRO='rolling', HAS=set_up)
     assert name == made and not any(' run ' in line for line in told)
 
@@ -253,12 +254,16 @@ def here(command: Command) -> Result:
     return Result(said.returncode, said.stdout, said.stderr)
 
 
-def beside(shell: object, *lines: str) -> Containers:
+def beside(
+        shell: object, *lines: str, images: Sequence[str] = (), provider: object = FakeProvider(),
+) -> Containers:
     job = SimpleNamespace(
         name='m', spec=MachineSpec('m', 'fake', containers=lines), timeouts=Timeouts(),
+        provider=provider,
         cancel=threading.Event(), step=lambda name: step(lambda event: None, 'm', name),
         undoing=lambda name, undo: None, survives=True, launch=SimpleNamespace(
-            id='abc', dds=lambda: SimpleNamespace(rmw='rmw_cyclonedds_cpp')))
+            id='abc', images=lambda name: images,
+            dds=lambda: SimpleNamespace(rmw='rmw_cyclonedds_cpp')))
     return Containers(job, shell, '/run/fogros2')
 
 
@@ -270,6 +275,26 @@ def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
     assert str(error.value) == (
         "'m' can't get the image 'no-such:1': Error: docker.io/library/no-such:1: manifest "
         'unknown (is its name right, and may anybody download it?)')
+
+
+def test_images_that_nodes_will_run_in_are_fetched_before_and_once(engine, monkeypatch):
+    monkeypatch.setenv('THERE', 'localhost/a:1')
+    shell = FakeShell(handlers={'sh': here})
+    containers_there = beside(shell, images=['localhost/a:1'])
+    containers_there.start()
+    asked = len(shell.commands)
+    (node,) = containers_there.inside([NodeSpec('1', 'n', 'p', 'e', image='localhost/a:1')])
+    assert 'localhost/a:1' in node.arguments and len(shell.commands) == asked
+
+
+def test_a_node_that_comes_late_has_to_fit_its_machine_too():
+    shell = FakeShell()
+    there = beside(shell, provider=ContainerProvider())
+    assert there.inside([NodeSpec('1', 'n', 'p', 'e')]) == [NodeSpec('1', 'n', 'p', 'e')]
+    there._job.spec = MachineSpec('m', 'container')
+    with pytest.raises(Unsupported, match='containers=True'):
+        there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
+    assert shell.commands == []
 
 
 def test_a_machine_without_an_engine_and_without_apt_says_so():

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that run in an image on their machine."""
+
+from __future__ import annotations
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+import pytest
+
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2.actions.override import OverrideMachines, Overrides
+
+
+def ends(machine, node):
+    machine.say('exited', node, returncode=0, respawns=False)
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='')
+
+
+def test_what_is_in_an_image_is_not_looked_for_here(run, fake, planner):
+    fake.on_start = ends
+    assert run(FogROSLaunchDescription([
+        DeclareLaunchArgument('image', default_value='ros:jazzy'),
+        CloudNode(machine=planner, package='elsewhere', executable='eyes', name='eyes',
+                  parameters=[{'rate': 5}], image=LaunchConfiguration('image'),
+                  image_options=['--gpus', LaunchConfiguration('gpus', default='all')]),
+        CloudNode(machine=planner, package='demo', executable='talker')])) == 0
+    (prepared,) = (note[1:] for note in fake.notes if note[0] == 'prepare')
+    assert prepared == (['planner'], {'planner': [('demo', 'talker')]},
+                        {'planner': ['ros:jazzy']})
+    eyes, talker = fake.machines['planner'].all
+    assert (eyes.package, eyes.executable, eyes.image) == ('elsewhere', 'eyes', 'ros:jazzy')
+    assert eyes.image_options == ('--gpus', 'all')
+    assert any('rate: 5' in text for text in eyes.files.values())
+    assert (talker.image, talker.image_options) == ('', ())
+
+
+@pytest.mark.parametrize(('overrides', 'more', 'why'), [
+    (['*=robot'], {}, 'the robot runs this node itself'),
+    ([], {'shell': True}, 'in a shell of the machine'),
+    ([], {'image_options': ['-v']}, "image_options=['-v']"),
+])
+def test_what_an_image_can_not_be_is_said(run, fake, planner, caplog, overrides, more, why):
+    node = CloudNode(
+        machine=planner, package='demo', executable='talker', image='ros:jazzy', **more)
+    assert run(LaunchDescription(
+        [OverrideMachines(Overrides(overrides), [node])] if overrides else [node])) == 1
+    assert why in caplog.text
+    assert fake.machines == {}
