@@ -20,8 +20,8 @@ from ros2fog_cli.api import reach
 
 #: The program; a process of its own, as a launch has a DDS configuration of its own.
 _PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
-#: Seconds after which one that ended is started anew.
-AGAIN = 10.0
+#: Seconds after which one that ended is started anew, and that one may take to end.
+AGAIN, PATIENCE = 10.0, 5.0
 
 
 class Graph:
@@ -73,7 +73,7 @@ class Graph:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         try:
-            self._process.wait(5.0)
+            self._process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -94,6 +94,8 @@ class Graph:
         for line in self._process.stdout:
             with contextlib.suppress(ValueError, KeyError, TypeError):
                 told = json.loads(line)
+                if not isinstance(told, dict):
+                    continue  # what a library prints
                 if 'streams' in told:
                     self.streams, self.topics = told['streams'], told['topics']
                 elif 'data' in told:

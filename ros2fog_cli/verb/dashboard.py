@@ -40,7 +40,7 @@ class DashboardVerb(VerbExtension):
               'Whoever has this address may look, and delete machines.', flush=True)
         if not args.no_browser:
             import webbrowser
-            webbrowser.open(dashboard.url)
+            webbrowser.open(dashboard.url_with_ticket())
         try:
             dashboard.serve()
         except KeyboardInterrupt:

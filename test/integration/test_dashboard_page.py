@@ -239,7 +239,9 @@ def test_a_dashboard_that_ends_and_another_at_its_place(story: Story, browser: B
     dashboard = Dashboard(story)
     thread = threading.Thread(target=dashboard.serve, daemon=True)
     thread.start()
-    browser.open(dashboard.url)
+    browser.open(dashboard.url_with_ticket())
+    browser.until('document.getElementById("link").textContent === "live"')
+    browser.reload()  # the ticket is used, the token kept
     browser.until('document.getElementById("link").textContent === "live"')
     # nobody but the page may ask, not even from the same browser
     other = browser.ask(

@@ -9,12 +9,13 @@ import json
 import re
 import socket
 import threading
+import time
 from typing import Any, Optional
 
 import pytest
 
 from fogros2.errors import NameTaken
-from fogros2.monitor.dashboard.server import content_policy, Dashboard, PAGE, TOKEN
+from fogros2.monitor.dashboard.server import content_policy, Dashboard, HEADER, PAGE
 
 
 class Canned:
@@ -54,7 +55,7 @@ def ask(
     **headers: Optional[str],
 ) -> tuple[int, bytes, dict[str, str]]:
     link = http.client.HTTPConnection('127.0.0.1', dashboard.port, timeout=10)
-    told = {TOKEN: dashboard.token, **{
+    told = {HEADER: dashboard.token, **{
         key.replace('_', '-'): value for key, value in headers.items()}}
     if body is not None:
         told.setdefault('Content-Type', 'application/json')
@@ -80,7 +81,7 @@ def test_what_is_there(dashboard: Dashboard) -> None:
     status, data, headers = ask(dashboard, '/api/picture?of=/camera')
     assert (status, data, headers['Content-Type']) == (200, b'\xff\xd8picture', 'image/jpeg')
     assert ask(dashboard, '/api/picture?of=/other')[0] == 404
-    status, data, headers = ask(dashboard, '/', **{TOKEN: None})
+    status, data, headers = ask(dashboard, '/', **{HEADER: None})
     assert status == 200 and data == PAGE.read_bytes()
     assert dashboard.token.encode() not in data
     assert headers['X-Content-Type-Options'] == 'nosniff'
@@ -97,10 +98,10 @@ def test_a_machine_is_deleted(dashboard: Dashboard) -> None:
 
 
 @pytest.mark.parametrize(('headers', 'status'), [
-    ({TOKEN: None}, 401),
-    ({TOKEN: 'x' * 32}, 401),
-    ({TOKEN: ''}, 401),
-    ({TOKEN: '\xe4'}, 401),
+    ({HEADER: None}, 401),
+    ({HEADER: 'x' * 32}, 401),
+    ({HEADER: ''}, 401),
+    ({HEADER: '\xe4'}, 401),
     ({'Host': 'evil.example'}, 421),
     ({'Host': 'evil.example:{port}'}, 421),
     ({'Host': '127.0.0.1'}, 421),
@@ -155,6 +156,28 @@ def test_nothing_else_is_there(dashboard: Dashboard, path: str) -> None:
 def test_numbers_that_are_none(dashboard: Dashboard) -> None:
     assert ask(dashboard, '/api/state?after=x')[0] == 400
     assert ask(dashboard, '/api/log?machine=a&after=')[0] == 200
+
+
+def test_a_ticket_is_for_once_and_for_a_minute(
+    dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def enter(ticket: Any, **headers: Optional[str]) -> tuple[int, Any]:
+        status, data, _ = ask(dashboard, '/api/enter', method='POST',
+                              body=json.dumps({'ticket': ticket}), **{HEADER: None, **headers})
+        return status, json.loads(data).get('token')
+
+    ticket = dashboard.url_with_ticket().partition('#')[2]
+    assert dashboard.token not in ticket
+    assert enter(ticket, Origin='http://evil.example')[0] == 403
+    assert enter(ticket, Host='evil.example')[0] == 421
+    assert ask(dashboard, '/api/state', **{HEADER: ticket})[0] == 401
+    assert enter(ticket) == (200, dashboard.token)
+    assert enter(ticket) == (401, None)
+    assert enter('ticket-other') == (401, None) and enter(1)[0] == 400
+    late = dashboard.url_with_ticket().partition('#')[2]
+    clock = time.monotonic() + 61
+    monkeypatch.setattr('fogros2.monitor.dashboard.server.time.monotonic', lambda: clock)
+    assert enter(late) == (401, None)
 
 
 def test_only_the_loopback_hears(dashboard: Dashboard) -> None:

@@ -5,7 +5,8 @@ Serves the page and its data on the loopback, to whoever has the token.
 The token stands in the fragment of the page's address, which no browser sends: the page puts it
 into a header of each request, which no other site's page can. ``Host`` has to be the loopback's
 (a name that somebody has lead there is another site), and ``Origin``, where a browser says it, the
-page's own.
+page's own. A browser that we start gets a ticket instead, which is exchanged for the token once:
+other users of this computer see its command line.
 """
 
 from __future__ import annotations
@@ -20,15 +21,21 @@ from pathlib import Path
 import re
 import secrets
 import socket
+import threading
+import time
 from typing import Any, Optional, Protocol
 import urllib.parse
 
 from fogros2.errors import FogError
 
 #: The header with the token.
-TOKEN = 'X-Fogros2-Token'  # noqa: S105 (its name)
+HEADER = 'X-Fogros2-Token'
 #: Seconds that a question for news may wait, that a client may say nothing, and bytes of a wish.
 PATIENCE, SILENCE, MOST = 15.0, 60.0, 10_000
+#: Seconds for which a ticket can be exchanged, and what it begins with.
+VALID, TICKET = 60.0, 'ticket-'
+_REFUSAL = ('the token is missing or wrong: open the address that `ros2 fog dashboard` has '
+            'printed')
 PAGE = Path(__file__).with_name('page.html')
 
 
@@ -63,6 +70,8 @@ class Dashboard:
     def __init__(self, source: Source, *, port: int = 0) -> None:
         self.source = source
         self.token = secrets.token_urlsafe(24)
+        self._tickets: dict[str, float] = {}
+        self._lock = threading.Lock()
         self.page = PAGE.read_bytes()
         self.policy = content_policy(self.page.decode())
         self._server = _Server(('127.0.0.1', port), self)
@@ -73,6 +82,19 @@ class Dashboard:
     def url(self) -> str:
         """Where a browser finds it; whoever knows it may look and delete."""
         return f'http://{self.hosts[0]}/#{self.token}'
+
+    def url_with_ticket(self) -> str:
+        """Return an address that lets in once, within a minute."""
+        ticket = TICKET + secrets.token_urlsafe(24)
+        with self._lock:
+            self._tickets[ticket] = time.monotonic() + VALID
+        return f'http://{self.hosts[0]}/#{ticket}'
+
+    def exchange(self, ticket: str) -> Optional[str]:
+        """Return the token for a ticket, None for one that has been used, or is too old."""
+        with self._lock:
+            valid = self._tickets.pop(ticket, 0.0)
+        return self.token if time.monotonic() < valid else None
 
     def serve(self) -> None:
         """Answer until closed from another thread, or interrupted."""
@@ -133,12 +155,10 @@ class _Handler(BaseHTTPRequestHandler):
             check_host(self.headers.get('Host'), self.headers.get('Origin'),
                        self.headers.get('Sec-Fetch-Site'), self.server.dashboard.hosts)
             path, _, query = self.path.partition('?')
-            if path.startswith('/api/') and not hmac.compare_digest(
-                    self.headers.get(TOKEN, '').encode(),
+            if path.startswith('/api/') and path != '/api/enter' and not hmac.compare_digest(
+                    self.headers.get(HEADER, '').encode(),
                     self.server.dashboard.token.encode()):
-                raise _Refused(HTTPStatus.UNAUTHORIZED,
-                               'the token is missing or wrong: open the address that '
-                               '`ros2 fog dashboard` has printed')
+                raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
             do(path, dict(urllib.parse.parse_qsl(query)))
         except _Refused as error:
             self.close_connection = True  # what it sent may not have been read
@@ -163,8 +183,24 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.NOT_FOUND, 'there is nothing of that name')
 
     def _post(self, path: str, query: dict[str, str]) -> None:
-        if path != '/api/delete':
+        dashboard = self.server.dashboard
+        if path == '/api/enter':
+            token = dashboard.exchange(self._wish('ticket')['ticket'])
+            if token is None:
+                raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
+            self._json({'token': token})
+        elif path == '/api/delete':
+            wish = self._wish('name')
+            force = wish.get('force', False)
+            if not isinstance(force, bool):
+                raise _Refused(HTTPStatus.BAD_REQUEST, "'force' is no wish: true or false")
+            dashboard.source.delete(wish['name'], force)
+            self._json({})
+        else:
             raise _Refused(HTTPStatus.NOT_FOUND, 'there is nothing of that name')
+
+    def _wish(self, key: str) -> dict[str, Any]:
+        """Return the JSON object that came, with a text for ``key``."""
         length = self.headers.get('Content-Length', '')
         if not length.isdigit() or int(length) > MOST:
             raise _Refused(HTTPStatus.BAD_REQUEST, 'a wish has a length, and a small one')
@@ -172,13 +208,11 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, 'a wish is JSON')
         try:
             wish = json.loads(self.rfile.read(int(length)))
-            name, force = wish['name'], wish.get('force', False)
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            name, force = None, None
-        if not isinstance(name, str) or not isinstance(force, bool):
-            raise _Refused(HTTPStatus.BAD_REQUEST, 'a wish names a machine')
-        self.server.dashboard.source.delete(name, force)
-        self._json({})
+        except (ValueError, RecursionError):
+            wish = None
+        if not isinstance(wish, dict) or not isinstance(wish.get(key), str):
+            raise _Refused(HTTPStatus.BAD_REQUEST, f"a wish is an object with '{key}'")
+        return wish
 
     def _json(self, data: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(json.dumps(data, separators=(',', ':')).encode(), 'application/json', status)
