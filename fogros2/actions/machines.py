@@ -209,9 +209,10 @@ class CloudInstance:
         if isinstance(cmd, str):
             containers.parse(cmd)
         self._containers.append(cmd)
+        self.takes_containers()
 
     def takes_containers(self) -> None:
-        """Take it that containers will run on the machine, besides those it knows of."""
+        """Take it that containers will run on the machine."""
 
     def is_up(self, running: RunningMachine) -> None:
         """Take it that the machine is up; for the launch to call."""
@@ -310,7 +311,7 @@ class ContainerInstance(CloudInstance):
         }, **common)
 
     def takes_containers(self) -> None:
-        """Have the machine made with the rights that an engine takes, unless it may not."""
+        """Have the machine made with the rights that an engine takes, if nothing else is said."""
         self._options.setdefault('containers', words.Truth(True))
 
 

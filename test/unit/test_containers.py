@@ -145,7 +145,8 @@ def test_a_container_machine_has_the_rights_when_they_are_asked_for():
     told.add_docker_container('docker run image')
     CloudNode(machine=asked, package='p', executable='e', image='image')
     assert 'containers' not in options(plain)
-    assert options(asked)['containers'] is True
+    # among its options, so that one which an earlier launch kept without isn't taken for it
+    assert options(asked)['containers'] is options(told)['containers'] is True
     provider = ContainerProvider()
     for machine in (told, asked):
         provider.check_containers(machine.spec(LaunchContext()))
@@ -184,6 +185,7 @@ case $1-$2 in
     pull-*) [ "$3" != "$WRONG" ] || { echo "Error: $3: manifest unknown" >&2; exit 125; }
         echo "$3" ;;
     create-*) echo looking ;;
+    inspect-*) echo 0 ;;
     cp-*) for last in $HAS; do [ "$2" != "looking:$last" ] || exit 0; done; exit 1 ;;
     run-*) echo 'what apt says' ;;
 esac
@@ -198,7 +200,7 @@ def engine(request, tmp_path, monkeypatch):
     for name, text in ((request.param, ENGINE), ('sudo', '#!/bin/sh\nshift\nexec "$@"\n')):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
-    for name in ('cat', 'id', 'sed', 'sh', 'tail', 'tr', 'printf'):
+    for name in ('cat', 'id', 'mktemp', 'rm', 'sed', 'sh', 'tail', 'tr', 'printf'):
         (folder / name).symlink_to(f'/bin/{name}' if Path(f'/bin/{name}').exists()
                                    else f'/usr/bin/{name}')
     monkeypatch.setenv('NOTES', str(tmp_path / 'notes'))
@@ -239,6 +241,25 @@ def test_an_image_without_the_middleware_gets_it_once(engine):
     assert told[-2:] == [f'{engine} commit {adding} {made}', f'{engine} rm -f {adding}']
     name, told = done(fetch, THERE=f'ros:rolling {made}', DISTRO='rolling', HAS=set_up)
     assert name == made and not any(' run ' in line for line in told)
+
+
+def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path):
+    node = NodeSpec('1', 'eyes', 'demo', 'talker', image='demo:1', image_options=('--gpus=1',))
+    made = containers.inside(node, 'demo:1', 'abc', str(tmp_path))
+    for key, script in made.files.items():
+        (tmp_path / key).write_text(str(script))
+    words = [word if isinstance(word, str) else str(tmp_path / word[0]['file'])
+             for word in made.arguments]
+    told = done(Command(tuple(words)), FOGROS2_AGENT_DIRECTORY=str(tmp_path),
+                ROS_DOMAIN_ID='7')[1]
+    gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
+    (create,) = (line for line in told if ' create ' in line)
+    assert f' {gpus} ' in create and f' -v {tmp_path}:{tmp_path}:ro ' in create
+    for option in ('--pull never', '--network host', '--ipc host', f'--user {os.getuid()}:'):
+        assert f' {option}' in create
+    assert create.endswith(f' demo:1 sh {tmp_path}/in-container {tmp_path} demo talker ')
+    assert f'{engine} start -a fogros2-abc-eyes' in told
+    assert told[-1] == f'{engine} rm -f fogros2-abc-eyes'
 
 
 def test_gpus_are_told_in_the_engine_s_words(engine):
