@@ -135,7 +135,7 @@ def test_an_agent_s_word_ends_the_pod(place):
 
 def test_the_way_is_the_one_that_was_asked_for(place):
     def asked(expose):
-        provider, machine_id, machine = run(f'asked-{expose[:4]}', expose=expose)
+        provider, machine_id, machine = run(f"by-{expose.replace('_', '-')}", expose=expose)
         provider.destroy(machine_id)
         return machine
 

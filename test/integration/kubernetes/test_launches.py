@@ -277,7 +277,7 @@ def test_ros2_fog_knows_pods(launch, namespace, kubernetes, monkeypatch, tmp_pat
     # the robot's role lets it see its own namespace
     assert 'known' in listed.stdout and namespace.name in listed.stdout, listed
     assert status.returncode == 0 and 'talker' in status.stdout, status
-    assert 'Publishing: "Hello World from known ' in logs.stdout, logs
+    assert 'Publishing: "Hello World from known ' in logs.stderr, logs  # where ROS 2 logs
     assert connected.stdout.split() == ['known', 'fog'], connected
     assert swept.returncode == 0, swept
     # one who may sees all of them, with nothing of this robot's at hand
