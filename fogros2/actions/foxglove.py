@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 import logging
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -16,7 +17,7 @@ from fogros2.actions import networks, words
 from fogros2.actions.carriers import Carrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.remote import send
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, Unsupported
 from fogros2.model import NodeSpec
 from fogros2.monitor import credentials, urls
 
@@ -81,7 +82,8 @@ class Foxglove(Action):
                 f"Foxglove: {urls.app(urls.bridge('localhost', port))}"))]
         session = coordinator.session(self.machine)
         options = ['--vpn', str(port)]
-        if coordinator.launch.provider(session.spec.provider).runs_containers:
+        with contextlib.suppress(Unsupported):
+            coordinator.launch.provider(session.spec.provider).check_containers(session.spec)
             options += ['--image', words.resolve(context, self._image)]
         if allow:
             folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)

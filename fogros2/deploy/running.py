@@ -60,6 +60,7 @@ class RunningMachine:
         self._lock = threading.Lock()
         self._callbacks: list[Callable[[dict[str, Any]], None]] = []
         self._lost = ''
+        self._published: dict[int, tuple[str, int]] = {}
         self._watch: Optional[Watch] = None
         if job.provider.owned:
             self._watch = Watch(job, agent, heartbeat, gone=self._gone, found=found)
@@ -113,10 +114,11 @@ class RunningMachine:
             if job.survives or job.spec.on_exit == 'stop':
                 job.provider.publish(self.machine, port, ())
 
-        self.undo.callback(job.undone, 'port of the monitor', close)
-        host, outside = job.provider.publish(self.machine, port, sources)
-        job.save(monitor_open=urls.place(host, outside))
-        return host, outside
+        if port not in self._published:  # what listens there may have been started again
+            self.undo.callback(job.undone, 'port of the monitor', close)
+            self._published[port] = job.provider.publish(self.machine, port, sources)
+            job.save(monitor_open=urls.place(*self._published[port]))
+        return self._published[port]
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """

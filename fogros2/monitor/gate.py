@@ -202,7 +202,12 @@ async def _pass(
 
 async def _head(reader: asyncio.StreamReader) -> bytes:
     try:
-        return await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), HEAD_TIME)
+        first = await asyncio.wait_for(reader.read(1), HEAD_TIME)
+    except asyncio.TimeoutError:
+        # browsers open connections that they may need later
+        raise ConnectionAbortedError from None
+    try:
+        return first + await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), HEAD_TIME)
     except asyncio.LimitOverrunError:
         raise Refused('431 Request Header Fields Too Large', 'too long a request') from None
     except asyncio.TimeoutError:

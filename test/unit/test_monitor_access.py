@@ -83,6 +83,9 @@ def test_a_port_is_open_until_the_launch_ends_unless_it_goes_with_the_machine(
     assert running.publish(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.allowed == {('fake-1', 8766): list(SOURCES)}
     assert job.folder.load().monitor_open == '198.51.100.9:8766'
+    # the bridge was started again: nothing is opened twice
+    assert running.publish(8766, SOURCES) == ('198.51.100.9', 8766)
+    assert provider.calls.count('allow') == 1
     running.close()
     assert provider.allowed == {('fake-1', 8766): [] if closed else list(SOURCES)}
 
