@@ -287,7 +287,11 @@ def images(engine: str, busybox: Path, tmp_path_factory: pytest.TempPathFactory,
     for name, text in ROS.items():
         archive.file(name, text.encode(), 0o755)
     ros.write_bytes(archive.data())
-    here = [f'PATH={sys.prefix}/bin:/usr/bin:/bin', f'AMENT_PREFIX_PATH={sys.prefix}']
+    # as an entry point would set up what is mounted: the robot's ROS 2, or the embedded default
+    here = [f'PATH={sys.prefix}/bin:/usr/bin:/bin', 'AMENT_PREFIX_PATH=' + ':'.join(
+        [*filter(None, [os.environ.get('AMENT_PREFIX_PATH')]), sys.prefix])]
+    here += [f'{name}={os.environ[name]}' for name in ('LD_LIBRARY_PATH', 'PYTHONPATH')
+             if name in os.environ]
     for name, layers, variables in (
             ('system', (system, top), here), ('ros', (busybox, ros), ['PATH=/usr/bin:/bin']),
             ('box', (busybox,), ['PATH=/bin'])):
