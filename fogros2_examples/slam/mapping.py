@@ -29,6 +29,8 @@ TELLING, VOTES = 250, 20
 AGREEING = 40
 #: Keyframes that are too near in time to be a place that one comes back to.
 RECENT = 8
+#: Measurements whose mean a point is at the most, so that it can still give way.
+MOST = 20
 #: Keyframes whose points are looked for at a time.
 LOCAL = 12
 
@@ -40,6 +42,7 @@ class Keyframe:
 
     :param points: (N, 3), of its features, in its camera's frame; nan without a depth.
     :param own: (N,), those that no keyframe before had.
+    :param weights: (N,), of the measurements that the points are the means of.
     :param telling: indices of the features by which it is recognised.
     """
 
@@ -49,6 +52,7 @@ class Keyframe:
     features: Features
     points: Array
     own: NDArray[numpy.bool_]
+    weights: Array
     telling: NDArray[numpy.int64]
     links: set[int] = dataclasses.field(default_factory=set)
 
@@ -60,12 +64,13 @@ class Points:
 
     :param places: (M, 3), of the world.
     :param descriptors: (M, 32).
-    :param keyframes: (M,), the number of that which they belong to.
+    :param keyframes: (M,), the number of that which they belong to; ``rows`` (M,), which of its.
     """
 
     places: Array
     descriptors: NDArray[numpy.uint8]
     keyframes: NDArray[numpy.int64]
+    rows: NDArray[numpy.int64]
 
 
 class Map:
@@ -93,7 +98,7 @@ class Map:
         deep = numpy.flatnonzero(features.deep)
         keyframe = Keyframe(
             len(self.keyframes), stamp, pose, features, points, features.deep & ~known,
-            deep[::max(1, len(deep) // TELLING)][:TELLING])
+            weight(features.depths), deep[::max(1, len(deep) // TELLING)][:TELLING])
         self.keyframes.append(keyframe)
         if reference is None:
             self._factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(pose), self._noise))
@@ -123,7 +128,25 @@ class Map:
         return Points(
             numpy.concatenate([moved(k.pose, k.points[k.own]) for k in keyframes]),
             numpy.concatenate([k.features.descriptors[k.own] for k in keyframes]),
-            numpy.concatenate([numpy.full(k.own.sum(), k.number) for k in keyframes]))
+            numpy.concatenate([numpy.full(k.own.sum(), k.number) for k in keyframes]),
+            numpy.concatenate([numpy.flatnonzero(k.own) for k in keyframes]))
+
+    def refine(self, points: Points, which: NDArray[numpy.int64], places: Array,
+               depths: Array) -> None:
+        """
+        Take a frame's measurements of points into their means.
+
+        :param which: (K,), indices of points that were seen; ``places`` (K, 3), of the world.
+        :param depths: (K,), at which they were seen.
+        """
+        for number in numpy.unique(points.keyframes[which]):
+            keyframe = self.keyframes[number]
+            here = points.keyframes[which] == number
+            rows = points.rows[which[here]]
+            old, new = keyframe.weights[rows], weight(depths[here])
+            seen = moved(inverse(keyframe.pose), places[here])
+            keyframe.points[rows] += (seen - keyframe.points[rows]) * (new / (old + new))[:, None]
+            keyframe.weights[rows] = numpy.minimum(old + new, MOST * new)
 
     def similar(self, features: Features, besides: set[int], most: int) -> list[Keyframe]:
         """Return keyframes that look like an image, the most similar first."""
@@ -166,6 +189,11 @@ class Map:
         best = gtsam.LevenbergMarquardtOptimizer(self._factors, values).optimize()
         for keyframe in self.keyframes:
             keyframe.pose = best.atPose3(keyframe.number).matrix()
+
+
+def weight(depths: Array) -> Array:
+    """Return what measurements at depths weigh: their error grows with the square of it."""
+    return numpy.asarray(depths ** -4.0)
 
 
 def apart(one: Array, two: Array) -> float:

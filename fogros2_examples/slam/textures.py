@@ -26,6 +26,11 @@ def grain(random: Random, height: int, width: int, strength: float) -> NDArray[n
     return numpy.asarray(strength * total[:, :, None] / max(1e-6, float(total.std())))
 
 
+def tint(random: Random) -> NDArray[numpy.float64]:
+    """Return a colour as printed or painted things have them: hardly one is a pure red."""
+    return numpy.clip(random.uniform(20, 235) + random.normal(0, 22, 3), 5, 250)
+
+
 def plaster(random: Random, height: int, width: int, colour: tuple[int, int, int]) -> Pixels:
     """Return a painted wall: nearly plain."""
     return _made(numpy.array(colour, float) + grain(random, height, width, 5.0))
@@ -56,7 +61,7 @@ def books(random: Random, height: int, width: int, shelf: int) -> Pixels:
         while left < width:
             right = left + int(random.integers(max(3, shelf // 12), max(5, shelf // 4)))
             top = bottom - int(random.uniform(0.6, 0.92) * shelf)
-            colour = random.uniform(30, 230, 3)
+            colour = tint(random)
             cv2.rectangle(image, (left, top), (right - 2, bottom - 5), colour.tolist(), -1)
             label = top + int(random.uniform(0.1, 0.6) * (bottom - top))
             cv2.rectangle(image, (left + 1, label), (right - 3, label + shelf // 12),
@@ -71,7 +76,7 @@ def poster(random: Random, height: int, width: int) -> Pixels:
     image = numpy.full((height, width, 3), 200, numpy.uint8)
     for radius in sorted(0.4 * width / random.uniform(1, 40, 90), reverse=True):
         centre = (int(random.uniform(0, width)), int(random.uniform(0, height)))
-        colour = random.uniform(10, 245, 3).tolist()
+        colour = tint(random).tolist()
         if random.uniform() < 0.5:
             cv2.circle(image, centre, int(radius) + 1, colour, -1, cv2.LINE_AA)
         else:

@@ -177,6 +177,10 @@ class Slam:
             return None
         known = numpy.zeros(len(found), bool)
         known[two[solution.inliers]] = True
+        right = solution.inliers & found.deep[two]
+        depths = found.depths[two[right]]
+        self.map.refine(points, ahead[one[right]], moved(solution.pose, self.camera.lift(
+            found.pixels[two[right]], depths)), depths)
         self._reference = min(around, key=lambda k: apart(k.pose, solution.pose))
         self._last = inverse(self._reference.pose) @ solution.pose
         self.state = State.TRACKING
