@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 import yaml
 
-from fogros2.errors import ConfigurationError, MachineNotFound
+from fogros2 import kubernetes_api
+from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.kubernetes_api import ApiError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.kubernetes import (
@@ -210,6 +212,38 @@ def test_an_id_carries_its_place():
 def test_options_that_make_no_sense_are_named(options, word):
     error = raised(ConfigurationError, lambda: Options.parse(options))
     assert word in str(error)
+
+
+def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
+    asked = []
+
+    class Cluster:
+        context, namespace, server = 'here', 'robots', 'https://198.51.100.1'
+
+        def request(self, method, target, body=None, *, dryRun='', **more):
+            what = target.rpartition('/')[2]
+            asked.append(f'{what} {dryRun}'.strip())
+            if method == 'GET':
+                raise ApiError('no such Job', status=404)
+            if asked == ['pods All']:
+                raise ApiError('exceeded quota', status=403)
+            return {'metadata': {'name': 'it', 'uid': 'its-uid'}}
+
+    cluster = Cluster()
+    monkeypatch.setattr(kubernetes_api, 'connect', lambda context='': cluster)
+    provider = KubernetesProvider()
+
+    def create(name, **options):
+        spec = MachineSpec(name, 'kubernetes', {'expose': 'pod_dials_robot', **options})
+        provider.create(spec, REQUEST)
+
+    raised(ProviderError, lambda: create('one'))
+    assert asked == ['pods All', 'fogros2-one']
+    asked[1:] = []
+    for name in ('one', 'another'):
+        create(name)
+    create('larger', mb=64)
+    assert asked[1:] == ['pods All', 'jobs', 'jobs', 'pods All', 'jobs']
 
 
 def test_a_pod_can_not_be_asked_to_stop():
