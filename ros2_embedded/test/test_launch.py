@@ -386,6 +386,15 @@ def test_modules_that_are_lacking_are_named(module):
         importlib.import_module(module)
 
 
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
+def test_what_nodes_lack_is_named():
+    from rclpy.node import Node
+    node = Node.__new__(Node)
+    with pytest.raises(AttributeError, match='create_guard_condition is not part of the embedded'):
+        node.create_guard_condition(print)
+    assert not hasattr(node, 'never_heard_of')
+
+
 def test_declared_arguments_of_what_is_nested(tmp_path):
     path = tmp_path / 'inner.launch.py'
     path.write_text(PYTHON_FILE)
