@@ -148,12 +148,6 @@ class NodeParameters:
 
     # --- reading ---
 
-    def get_parameter_types(self, names: list[str]) -> list[Any]:
-        """Give parameters' types; see :meth:`get_parameter_type`."""
-        if not all(isinstance(name, str) for name in names):
-            raise TypeError('All names must be instances of type str')
-        return [self.get_parameter_type(name) for name in names]
-
     def get_parameter_type(self, name: str) -> Any:
         """
         Give the number of a parameter's type (of ``rcl_interfaces.msg.ParameterType``).
@@ -367,10 +361,6 @@ class NodeParameters:
         if self._allow_undeclared_parameters:
             return msg.ParameterDescriptor()
         raise exceptions.ParameterNotDeclaredException(name)
-
-    def describe_parameters(self, names: list[str]) -> list[Any]:
-        """Give parameters' descriptors."""
-        return [self.describe_parameter(name) for name in names]
 
     # --- callbacks ---
 

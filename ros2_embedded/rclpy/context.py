@@ -99,10 +99,6 @@ class Context(AbstractContextManager['Context']):
             elif self._graph is not None:
                 self._graph.close()  # a signal made it invalid, its entities are still there
 
-    def destroy(self) -> None:
-        """Free what it holds."""
-        self.try_shutdown()
-
     def on_shutdown(self, callback: Callable[[], None]) -> None:
         """Call this on shutdown, or now if that is over."""
         if not callable(callback):

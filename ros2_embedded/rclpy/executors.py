@@ -2,7 +2,7 @@
 """Executors wait for work and do it."""
 
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 import inspect
 import os
@@ -25,14 +25,6 @@ if TYPE_CHECKING:
 
 _FOREVER = 2 ** 62
 _YIELDED = 5_000_000  # ns until a coroutine that gave way without a future goes on
-
-
-async def await_or_execute(callback: Callable[..., Any] | Coroutine[Any, Any, Any],
-                           *args: Any) -> Any:
-    """Await a coroutine function, or call a function."""
-    if inspect.iscoroutinefunction(callback):
-        return await callback(*args)
-    return callback(*args)  # type: ignore[operator]
 
 
 class TimeoutException(Exception):

@@ -44,7 +44,7 @@ __all__ = ['HIDDEN_NODE_PREFIX', 'Node', 'NodeNameNonExistentError']
 HIDDEN_NODE_PREFIX = '_'
 _T = TypeVar('_T', bound=Entity)
 _lacking = lacking('rclpy.node.Node', 'create_guard_condition destroy_guard_condition guards '
-                   'handle set_descriptor', AttributeError)
+                   'describe_parameters get_parameter_types handle set_descriptor', AttributeError)
 
 
 class Node(NodeParameters, NodeGraph):
@@ -148,8 +148,7 @@ class Node(NodeParameters, NodeGraph):
             self.declare_parameters(
                 '', [(one.name, one.value, ParameterDescriptor())
                      for one in self._parameter_overrides.values()], ignore_override=True)
-        self._time_source = TimeSource(node=self)
-        self._time_source.attach_clock(self._clock)
+        self._time_source = TimeSource(self, self._clock)
 
     def _publish_parameter_event(self, event: Any) -> None:
         if self._parameter_event_publisher is not None:

@@ -37,8 +37,8 @@ class InvalidQoSProfileException(Exception):
         super().__init__('Invalid QoSProfile', *args)
 
 
-class QoSPolicyEnum(IntEnum):
-    """The base of the policies' values."""
+class _ShortKeys(Enum):
+    """Values with names as one types them."""
 
     @classmethod
     def short_keys(cls) -> list[str]:
@@ -46,9 +46,13 @@ class QoSPolicyEnum(IntEnum):
         return [key.lower() for key in cls.__members__]
 
     @classmethod
-    def get_from_short_key(cls, name: str) -> int:
+    def get_from_short_key(cls, name: str) -> Any:
         """Find the value of a name, in upper or lower case."""
         return cls[name.upper()].value
+
+
+class QoSPolicyEnum(IntEnum, _ShortKeys):
+    """The base of the policies' values."""
 
     @property
     def short_key(self) -> str:
@@ -228,7 +232,7 @@ qos_profile_rosout_default = QoSProfile(
     depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10))
 
 
-class QoSPresetProfiles(Enum):
+class QoSPresetProfiles(_ShortKeys):
     """The profiles by name."""
 
     UNKNOWN = qos_profile_unknown
@@ -240,16 +244,6 @@ class QoSPresetProfiles(Enum):
     PARAMETER_EVENTS = qos_profile_parameter_events
     ACTION_STATUS_DEFAULT = qos_profile_action_status_default
     BEST_AVAILABLE = qos_profile_best_available
-
-    @classmethod
-    def short_keys(cls) -> list[str]:
-        """List the profiles' names as one types them."""
-        return [key.lower() for key in cls.__members__]
-
-    @classmethod
-    def get_from_short_key(cls, name: str) -> QoSProfile:
-        """Find the profile of a name, in upper or lower case."""
-        return cls[name.upper()].value
 
 
 class QoSCompatibility(IntEnum):

@@ -114,28 +114,25 @@ class Rate:
 
     def __init__(self, timer: Timer, *, context: Context) -> None:
         self._timer = timer
-        self._is_shutdown = False
         self._is_destroyed = False
         self._condition = threading.Condition()
         self._ticks = 0
         self._timer.callback = self._tick
         self._context = context
-        context._wakers.add(self._on_shutdown)
+        context._wakers.add(self._wake)
 
     def _tick(self) -> None:
-        with self._condition:
-            self._ticks += 1
-            self._condition.notify_all()
+        self._ticks += 1
+        self._wake()
 
-    def _on_shutdown(self) -> None:
-        self._is_shutdown = True
-        self.destroy()
+    def _wake(self) -> None:
+        with self._condition:
+            self._condition.notify_all()
 
     def destroy(self) -> None:
         """End all sleeps."""
         self._is_destroyed = True
-        with self._condition:
-            self._condition.notify_all()
+        self._wake()
 
     def sleep(self) -> None:
         """
@@ -143,15 +140,13 @@ class Rate:
 
         :raises ROSInterruptException: if the context is shut down.
         """
-        if self._is_shutdown:
-            raise ROSInterruptException()
         if self._is_destroyed:
             raise RuntimeError('Rate cannot sleep because it has been destroyed')
         if self._timer._destroyed:
             raise InvalidHandle('Rate cannot sleep because the timer has been destroyed')
+        seen = self._ticks
         with self._condition:
-            seen = self._ticks
-            while self._ticks == seen and not self._is_destroyed:
-                self._condition.wait()
-        if self._is_shutdown:
+            self._condition.wait_for(lambda: self._ticks != seen or self._is_destroyed
+                                     or not self._context.ok())
+        if not self._context.ok():
             raise ROSInterruptException()

@@ -24,6 +24,3 @@ def check_is_valid_srv_type(srv_type: Any) -> None:
     """
     if not isinstance(srv_type, type) or not hasattr(srv_type, '_service'):
         raise NoTypeSupportImportedException()
-
-
-check_for_type_support = check_is_valid_msg_type

@@ -42,27 +42,29 @@ def worker():
         process.terminate()
 
 
-def ros2(*command, status=0, timeout=40, end=None):
-    """Run a command; after ``end`` seconds send it SIGINT."""
+def ros2(*command, status=0, timeout=40, until=None):
+    """Run a command; once it has said ``until``, send it SIGINT."""
     if command[1] in ('list', 'info', 'get', 'set', 'echo'):
         command = (*command[:2], '--no-daemon', *command[2:])  # which would outlive the test
     process = subprocess.Popen(
         ['ros2', *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'PYTHONUNBUFFERED': '1'},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    said = ''
     try:
-        if end is not None:
-            try:
-                process.wait(end)
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGINT)
+        while until is not None and until not in said:
+            line = process.stdout.readline()
+            assert line, said
+            said += line
+        if until is not None:
+            process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=timeout)
     finally:
         process.kill()
         process.wait()
     if status is not None:
         assert process.returncode == status, errors
-    return out + errors
+    return said + out + errors
 
 
 def test_topics(worker):
@@ -103,11 +105,10 @@ def test_pub(worker):
 
 
 def test_rates(worker):
-    rate = ros2('topic', 'hz', '/cell/chatter', end=3, status=None)
-    assert 'average rate: ' in rate
+    rate = ros2('topic', 'hz', '/cell/chatter', until='window: ', status=None)
     assert 15 < float(rate.split('average rate: ')[1].split()[0]) < 25
-    width = ros2('topic', 'bw', '/cell/chatter', end=3, status=None)
-    assert 'Subscribed to [/cell/chatter]' in width and 'Message size mean: ' in width
+    width = ros2('topic', 'bw', '/cell/chatter', until='Message size mean: ', status=None)
+    assert 'Subscribed to [/cell/chatter]' in width
 
 
 def test_nodes(worker):

@@ -40,14 +40,7 @@ def get_msg_class(node: Any, topic: str, blocking: bool = False) -> Any:
     :raises RuntimeError: if it has several types, or an unknown one, or its name is invalid.
     """
     import rclpy
-    from rclpy.exceptions import InvalidTopicNameException
-    from rclpy.expand_topic_name import expand_topic_name
-    from rclpy.validate_full_topic_name import validate_full_topic_name
-    try:
-        full = expand_topic_name(topic, node.get_name(), node.get_namespace())
-        validate_full_topic_name(full)
-    except (ValueError, InvalidTopicNameException) as error:
-        raise RuntimeError(str(error)) from error
+    full = node.resolve_topic_name(topic)
     types = dict(node.get_topic_names_and_types()).get(full)
     if types is None:
         print(f'WARNING: topic [{topic}] does not appear to be published yet')
