@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import threading
@@ -25,6 +25,8 @@ from ros2fog_cli.api.machines import Entry
 LINES, WIDTH = 500, 2000
 #: Seconds from one attempt to connect to the next, growing.
 RETRY, LONGEST_RETRY = 2.0, 15.0
+#: Seconds from one look at the VPN to the next: where sudo is needed, it logs each of them.
+VPN_INTERVAL = 2.0
 #: Bytes of a process's command line that are looked at.
 _WORDS = 32_768
 
@@ -60,6 +62,7 @@ class Follower:
         self._lock = threading.Lock()
         self._lines: deque[LogLine] = deque(maxlen=LINES)
         self._number = self._seq = 0
+        self._vpn_at = -1e9
         self._pids: tuple[int, ...] = ()
         self.vpn: Optional[dict[str, Any]] = None
         self.agent: Optional[dict[str, Any]] = None
@@ -140,10 +143,9 @@ class Follower:
         return client, shell
 
     def _ask(self, client: AgentClient, shell: Shell) -> None:
-        reply = client.request('status', timeout=15.0)
-        agent = {key: value for key, value in reply.items() if key not in ('id', 'ok')}
+        agent = agent_state(client.request('status', timeout=15.0))
         self.problems.pop('agent', None)
-        pids = tuple(sorted(node['pid'] for node in agent.get('nodes', []) if node.get('pid')))
+        pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid']))
         if pids != self._pids:
             self.names = graph_names(shell, pids)
             self._pids = pids
@@ -152,6 +154,9 @@ class Follower:
         self._changed()
 
     def _look_at_vpn(self) -> None:
+        if time.monotonic() - self._vpn_at < VPN_INTERVAL:
+            return
+        self._vpn_at = time.monotonic()
         try:
             link = reach.link(self._record, pings=1)
         except FogError as error:
@@ -165,17 +170,45 @@ class Follower:
         self.problems[part] = text
 
     def _take(self, event: dict[str, Any]) -> None:
-        self._seq = int(event.get('seq') or self._seq)
+        self._seq = int(_number(event.get('seq')) or self._seq)
         text = describe(event)
         if text is None:
             return
-        node, at = str(event.get('name') or ''), float(event.get('time') or time.time())
+        node, at = str(event.get('name') or ''), _number(event.get('time')) or time.time()
         with self._lock:
             for line in text.splitlines():
                 self._number += 1
                 self._lines.append(LogLine(
                     self._number, at, node, event.get('stream') == 'stderr', line[:WIDTH]))
         self._changed()
+
+
+def agent_state(reply: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return what an agent says of itself and its nodes, held to the types that it should have.
+
+    ``since`` in seconds since the epoch, ``rss`` in bytes, ``heartbeat_age`` in seconds, each None
+    where unknown; ``nodes`` with name, state and error as text, pid, returncode and restarts.
+    """
+    rss, nodes = _number(reply.get('rss_kb')), reply.get('nodes')
+    return {
+        'since': _number(reply.get('since')), 'rss': None if rss is None else int(1000 * rss),
+        'heartbeat_age': _number(reply.get('heartbeat_age')),
+        'nodes': [{
+            'name': str(node.get('name') or ''), 'state': str(node.get('state') or ''),
+            'pid': int(_number(node.get('pid')) or 0),
+            'returncode': None if (code := _number(node.get('returncode'))) is None
+            else int(code),
+            'restarts': int(_number(node.get('restarts')) or 0),
+            'error': str(node.get('error') or '')}
+            for node in (nodes if isinstance(nodes, list) else []) if isinstance(node, dict)]}
+
+
+def _number(value: Any) -> Optional[float]:
+    """Return a number that is one, None for anything else."""
+    usable = isinstance(value, (int, float)) and not isinstance(value, bool) \
+        and abs(value) < 1e15  # and so neither infinite nor none at all
+    return value if usable else None
 
 
 def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dict[str, Any]:

@@ -106,6 +106,7 @@ class Live:
         self._version, self._last = 0, ''
         self._state: dict[str, Any] = {'version': 0}
         self._looked = -1e9
+        self._deleting: list[threading.Thread] = []
         self._threads = [
             threading.Thread(target=self._keep, name='fog-live', daemon=True),
             threading.Thread(target=self._keep_asking, name='fog-live-ask', daemon=True)]
@@ -117,7 +118,9 @@ class Live:
             thread.start()
 
     def close(self) -> None:
-        """End it, and the connections."""
+        """End it, and the connections; what is being deleted is, before that."""
+        for thread in self._deleting:
+            thread.join()
         self._stopped.set()
         self._wake.set()
         with self._lock:
@@ -177,8 +180,10 @@ class Live:
                 return
             endings.check_free(shown.entry, force=force)
             shown.deleting, shown.trouble = True, ''
-        threading.Thread(target=self._delete, args=(shown, force), name='fog-live-delete',
-                         daemon=True).start()
+        thread = threading.Thread(target=self._delete, args=(shown, force),
+                                  name='fog-live-delete', daemon=True)
+        self._deleting.append(thread)
+        thread.start()
 
     def _delete(self, shown: _Shown, force: bool) -> None:
         try:
@@ -343,11 +348,8 @@ def machine_json(shown: _Shown) -> dict[str, Any]:
         'steps': steps,
         'vpn': _vpn(follower.vpn) if follower is not None else None,
         'agent': None if agent is None else {
-            'since': agent.get('since'), 'rss': 1000 * int(agent.get('rss_kb') or 0),
-            'heartbeat_age': agent.get('heartbeat_age')},
-        'nodes': [{key: node.get(key) for key in (
-            'name', 'state', 'pid', 'returncode', 'restarts', 'error')}
-            for node in (agent or {}).get('nodes') or []],
+            key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
+        'nodes': [] if agent is None else agent['nodes'],
         'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
         if follower is not None else [],
         'log': follower.last if follower is not None else 0,

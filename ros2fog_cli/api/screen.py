@@ -13,8 +13,9 @@ from typing import Any, TextIO
 from ros2fog_cli.api.follower import LogLine
 from ros2fog_cli.api.table import cost, duration, size, table
 
-#: Into the alternate screen and out of it, with the cursor hidden meanwhile.
-_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l', '\x1b[?25h\x1b[?1049l'
+#: Into the alternate screen and out of it; meanwhile the cursor is hidden, and what is too long
+#: (characters may be two columns wide) is cut.
+_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l\x1b[?7l', '\x1b[?7h\x1b[?25h\x1b[?1049l'
 _HOME, _REST, _LINE = '\x1b[H', '\x1b[J', '\x1b[K'
 #: Select graphic rendition: bold, dim, and what states are shown in.
 _STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'bad': '31'}
@@ -117,8 +118,8 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
             f"sent {size(vpn['sent'])}{_rate(vpn['sending'])}")
     if agent is not None:
         beat = agent['heartbeat_age']
-        yield 'agent', (f"since {duration(max(0.0, now - float(agent['since'] or now)))}, "
-                        f"{size(agent['rss'])}, heartbeat "
+        yield 'agent', (f"since {duration(max(0.0, now - (agent['since'] or now)))}, "
+                        f"{size(agent['rss'] or 0)}, heartbeat "
                         + ('-' if beat is None else f'{duration(beat)} ago'))
 
 

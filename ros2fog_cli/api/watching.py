@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import json
+import os
+import select
 import sys
 import time
 from typing import Any, Optional
 
 from fogros2.store import check_name
-from ros2fog_cli.api import screen
-from ros2fog_cli.api.live import Live
+from ros2fog_cli.api import reach, screen
+from ros2fog_cli.api.live import Live, PRESENT
 
 _WAITING = 'no such machine yet'
 
@@ -28,12 +30,14 @@ def watch(
     live = Live(name=check_name(name), regions=regions, interval=max(0.5, interval))
     live.start()
     try:
-        if as_json or not sys.stdout.isatty():
+        if as_json or not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
             _lines(live, name, interval, as_json)
         else:
             _screen(live, name, interval)
     except KeyboardInterrupt:
         pass  # the way out
+    except BrokenPipeError:
+        reach.hush()
     finally:
         live.close()
     return 0
@@ -47,7 +51,8 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
     said: Optional[str] = None
     version = -1
     while True:
-        state = live.state(version, 3600.0)
+        # often enough to count as somebody who looks
+        state = live.state(version, PRESENT / 20)
         version = state['version']
         machine = _machine(state, name)
         if as_json:
@@ -57,7 +62,16 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
         if text != said and version > 0:
             said = text
             print(text if as_json else f'{time.strftime("%H:%M:%S")} {text}', flush=True)
+        if _unheard():
+            raise BrokenPipeError
         time.sleep(interval)
+
+
+def _unheard() -> bool:
+    """Return whether the reader of a pipe has gone: what changes seldom is written seldom."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
 
 
 def _screen(live: Live, name: str, interval: float) -> None:

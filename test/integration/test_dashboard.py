@@ -176,7 +176,7 @@ def test_a_launch_from_its_begin_to_its_end(
         assert 'handshake' in screen and 'round trip' in screen and '\x1b[32m' in screen
 
         # what a node prints is text
-        browser.until(f'{article(name)}.querySelector(".log").textContent.includes('
+        browser.until(f'{article(name)}.querySelector(".log")?.textContent.includes('
                       '"<img src=x onerror=")')
         assert browser.ask('document.querySelector("img[src=x]") === null')
         assert browser.ask('document.title') == 'FogROS2'

@@ -13,6 +13,7 @@ import time
 from typing import Any, Optional
 
 import pytest
+from ros2cli.cli import main
 
 from fogros2.errors import NameTaken
 from fogros2.monitor.dashboard.server import content_policy, Dashboard, HEADER, PAGE
@@ -214,3 +215,12 @@ def test_the_policy_names_the_pages_own_script() -> None:
     policy = content_policy('<style>a</style><script>b</script>')
     assert "script-src 'sha256-PiPoFgA5WUoziU9lZOGxNIu9egCI1CxKy3PurtWcAJ0='" in policy
     assert "default-src 'none'" in policy and 'unsafe' not in policy
+
+
+def test_a_port_that_is_taken_or_none() -> None:
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+        assert 'another --port' in str(main(argv=[
+            'fog', 'dashboard', '--no-browser', '--port', str(port)]))
+    for none in ('-1', '70000'):
+        assert 'is no port' in str(main(argv=['fog', 'dashboard', '--port', none]))

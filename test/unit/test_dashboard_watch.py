@@ -7,6 +7,8 @@ import dataclasses
 import json
 from pathlib import Path
 import re
+import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -26,7 +28,7 @@ from fogros2.report import (
     StepStarted,
 )
 from ros2fog_cli.api import live, screen
-from ros2fog_cli.api.follower import LogLine, node_name, rates
+from ros2fog_cli.api.follower import agent_state, LogLine, node_name, rates
 from ros2fog_cli.api.reach import Link
 
 
@@ -120,6 +122,32 @@ def test_the_name_of_a_process_in_the_graph(words: list[str], expected: str) -> 
     assert node_name(words) == expected
 
 
+@pytest.mark.parametrize('odd', [None, 'x', [], {}, True, 1e300, float('inf'), float('nan')])
+def test_an_agent_that_says_odd_things(odd: Any) -> None:
+    keys = ('name', 'state', 'pid', 'returncode', 'restarts', 'error')
+    state = agent_state({
+        'since': odd, 'rss_kb': odd, 'heartbeat_age': odd,
+        'nodes': [dict.fromkeys(keys, odd), odd]})
+    assert (state['since'], state['rss'], state['heartbeat_age']) == (None, None, None)
+    node = state['nodes'][0]
+    assert (node['pid'], node['returncode'], node['restarts']) == (0, None, 0)
+    assert isinstance(node['name'], str) and isinstance(node['state'], str)
+    assert agent_state({'nodes': odd})['nodes'] == [] == agent_state({})['nodes']
+    shown = screen.frame(machine(agent=state, nodes=state['nodes']), [], 1100.0)
+    assert any('heartbeat -' in line for line in shown)
+    assert json.loads(json.dumps(state)) == state
+
+
+def test_what_an_agent_says() -> None:
+    assert agent_state({
+        'id': 1, 'ok': True, 'since': 5.5, 'rss_kb': 16, 'heartbeat_age': 0.5, 'nodes': [
+            {'id': 'a/b', 'name': 'b', 'state': 'exited', 'pid': None, 'returncode': -9,
+             'restarts': 1}]}) == {
+        'since': 5.5, 'rss': 16000, 'heartbeat_age': 0.5, 'nodes': [
+            {'name': 'b', 'state': 'exited', 'pid': 0, 'returncode': -9, 'restarts': 1,
+             'error': ''}]}
+
+
 def test_rates_between_two_looks() -> None:
     first = Link('198.18.0.2', 'fog1', received=1000.0, sent=50.0)
     before = {**rates(None, first, 10.0), **dataclasses.asdict(first)}
@@ -195,3 +223,14 @@ def test_a_step_as_json_when_all_is_over() -> None:
     assert live.as_json(running)['state'] == 'running'
     assert live.as_json(running, ended=True)['state'] == 'done'
     json.dumps(live.as_json(running))
+
+
+def test_a_reader_of_lines_that_goes_away(tmp_path: Path) -> None:
+    # as behind `| head -n 1`
+    program = tmp_path / 'program.py'
+    program.write_text('import sys\nfrom ros2cli.cli import main\n'
+                       'sys.exit(main(argv=sys.argv[1:]))\n')
+    words = f'{sys.executable} {program} fog status a --watch --json --interval 0.1'
+    done = subprocess.run(['sh', '-c', f'{words} | head -n 1'], capture_output=True, text=True,
+                          timeout=30)
+    assert done.stdout == 'null\n' and done.stderr == ''
