@@ -45,7 +45,7 @@ lint:
 ## bench  every benchmark; figures go to benchmarks/results
 bench:
 	@tools/setup.sh bench
-	@set -e; for script in $(filter-out benchmarks/theora.py,$(wildcard benchmarks/*.py)); do \
+	@set -e; for script in $(filter-out benchmarks/theora.py benchmarks/applications_%,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
 
 ## docs   the documentation, as pages for a browser

@@ -31,7 +31,7 @@ class MotionPlanner(Node):
 
     Parameters: ``time`` in s, after which a plan is given up; ``workers``, how many searches run
     at once, 0 for one on each core; ``planners``, OMPL's, which the searches take in turn;
-    ``seed`` of the first search.
+    ``seed`` of the first search, the others count on.
     """
 
     def __init__(self) -> None:
@@ -77,6 +77,8 @@ class MotionPlanner(Node):
             return response
         try:
             outcome = self.racer.plan(start, goal, seconds=self.seconds, seed=self.seed)
+            # who asks again wants another try
+            self.seed += self.racer.workers
         except RuntimeError as error:
             self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
             return response

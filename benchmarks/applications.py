@@ -1,0 +1,451 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The paper's Tables II, III and IV: applications on the robot alone, and with the cloud's help.
+
+The cloud is a container machine on this computer, over WireGuard and a relay that limits the link
+to 10 Mbit/s both ways. The robot is this computer too: the node that computes is held, by the
+kernel's CPU controller, to so small a share of what the cloud may use that it takes as much longer
+there as it took the paper's robot: the ratio of the paper's own times of computing. So a row's
+speed-up can come near that ratio, and what it lacks is the network's.
+
+``--short`` takes few trials and is done in three minutes. With an account at AWS, the lines that
+are printed last run the same applications there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import dataclasses
+import functools
+import importlib
+import json
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from typing import Any, Optional
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+FOLDER = '/tmp/fogros2-bench'
+sys.path[:0] = [str(ROOT), str(HERE)]
+#: One core for what has one thread: libraries must not take another.
+ONE_THREAD = dict.fromkeys(
+    ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM'), '1')
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """
+    What a table has rows of.
+
+    :param table: the paper's, such as 'III'.
+    :param module: of the node that computes, ``client`` of the one that asks it; ``parameters``
+        and ``asks`` are theirs.
+    :param paper: the paper's seconds: robot alone, computing in the cloud, all with the cloud.
+    :param cores: that the computing node uses in the cloud.
+    :param count: the client's parameter for the number of trials.
+    :param ready: what the computing node says when it is about to be asked.
+    :param image: a topic of images for the computing node, '' for none.
+    :param codecs: how the images cross.
+    """
+
+    name: str
+    table: str
+    module: str
+    client: str
+    paper: tuple[float, float, float]
+    parameters: tuple[str, ...] = ()
+    asks: tuple[str, ...] = ()
+    cores: int = 1
+    count: str = 'count'
+    ready: str = ''
+    image: str = ''
+    codecs: tuple[str, ...] = ('',)
+    trials: int = 10
+    held_trials: int = 3
+
+    @property
+    def ratio(self) -> float:
+        """Of what the cloud may compute to what the robot may."""
+        return self.paper[0] / self.paper[1]
+
+
+SCENARIOS = [
+    Scenario('grasp planning', 'III', 'fogros2_examples.grasp.grasp_planner',
+             'fogros2_examples.grasp.grasp_camera', (14.0, 0.6, 1.2), count='trials',
+             ready=' grasps, ', image='/depth', codecs=('raw', 'png', 'h264')),
+    Scenario('motion planning: Apartment', 'IV', 'fogros2_examples.planning.motion_planner',
+             'fogros2_examples.planning.planning_client', (157.6, 3.45, 3.5),
+             ('seed:=3', 'workers:=2', 'time:=900.0'), ('environment:=apartment',), 2,
+             ready="environment '", trials=3, held_trials=2),
+    Scenario('motion planning: Cubicles', 'IV', 'fogros2_examples.planning.motion_planner',
+             'fogros2_examples.planning.planning_client', (157.6, 3.45, 3.5),
+             ('seed:=3', 'workers:=2', 'time:=900.0'), ('environment:=cubicles',), 2,
+             ready="environment '", trials=5, held_trials=3),
+]
+#: Bytes of an answer with grasps, and what headers of WireGuard, UDP and DDS add to each byte.
+ANSWER, PACKETS = 4000, 1.08
+#: What the codecs are called in the paper.
+NAMES = {'': '', 'raw': 'raw', 'png': 'compressed (PNG)', 'h264': 'H.264 (depth: FFV1)'}
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """
+    A row; times in s, medians over trials but for ``speed_up``, which is of the same trials.
+
+    :param robot: of a trial with the robot's share of a core, all in all.
+    :param compute: of that in the cloud, ``network`` the rest of its ``total``.
+    :param speed_up: of all trials that both did.
+    :param ratio: of compute that was given to the cloud and to the robot.
+    :param limit: what the network's part takes at the least: the bytes at the link's rate, the
+        codec and the hops, each measured alone.
+    """
+
+    scenario: str
+    table: str
+    codec: str
+    robot: float
+    compute: float
+    network: float
+    total: float
+    speed_up: float
+    ratio: float
+    limit: float
+    sent: float
+    paper: tuple[float, float, float]
+    trials: int
+    held_trials: int
+
+
+# --- the robot ----------------------------------------------------------------------------------
+
+class Held:
+    """Processes held to a share of a core, by the kernel's CPU controller, version 1 or 2."""
+
+    PERIOD = 100_000
+
+    def __init__(self, share: float) -> None:
+        root = Path('/sys/fs/cgroup')
+        name = f'fogros2-bench-{os.getpid()}'
+        quota = max(1000, round(share * self.PERIOD))
+        if (root / 'cgroup.controllers').exists():
+            self.folder = root / name
+            (root / 'cgroup.subtree_control').write_text('+cpu')
+            self.folder.mkdir()
+            (self.folder / 'cpu.max').write_text(f'{quota} {self.PERIOD}')
+        else:
+            self.folder = next(path for path in (root / 'cpu', root / 'cpu,cpuacct')
+                               if path.is_dir()) / name
+            self.folder.mkdir()
+            (self.folder / 'cpu.cfs_period_us').write_text(str(self.PERIOD))
+            (self.folder / 'cpu.cfs_quota_us').write_text(str(quota))
+
+    def take(self, process: int) -> None:
+        """Hold a process and its children, those to come as well."""
+        (self.folder / 'cgroup.procs').write_text(str(process))
+        for path in Path(f'/proc/{process}/task').glob('*/children'):
+            for child in path.read_text().split():
+                self.take(int(child))
+
+    def close(self) -> None:
+        """Let go; the processes must have ended."""
+        for _ in range(50):
+            try:
+                self.folder.rmdir()
+            except OSError:
+                time.sleep(0.1)
+            else:
+                return
+
+
+def words(module: str, *parameters: str) -> list[str]:
+    """Return the command line of a node."""
+    return [sys.executable, '-c', f'from {module} import main; main()', '--ros-args',
+            *(word for parameter in parameters for word in ('-p', parameter))]
+
+
+@contextlib.contextmanager
+def running(command: Sequence[str], environment: dict[str, str],
+            hear: Callable[[str], None] = lambda line: None) -> Iterator[subprocess.Popen[str]]:
+    """Run a node until the block ends; ``hear`` gets its lines."""
+    from streaming import end
+
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE,
+                               stderr=subprocess.STDOUT, text=True)
+
+    def read() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            hear(line)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        yield process
+    finally:
+        end(process)
+        reader.join(10)
+
+
+def asked(scenario: Scenario, environment: dict[str, str], trials: int,
+          sent: Callable[[], int] = lambda: 0) -> list[dict[str, Any]]:
+    """
+    Run a scenario's client to its end; return its figures, a dictionary for each trial.
+
+    :param sent: what the link has carried so far, bytes; each trial has what it was then.
+    """
+    said: list[str] = []
+    counts: list[int] = []
+    with tempfile.TemporaryDirectory() as folder:
+        figures = Path(folder, 'figures')
+        figures.touch()
+        with running(words(scenario.client, f'{scenario.count}:={trials}', f'figures:={figures}',
+                           'wait:=900.0', *scenario.asks), environment, said.append) as client:
+            deadline = time.monotonic() + 1200
+            while time.monotonic() < deadline:
+                ended = client.poll() is not None
+                lines = figures.read_text().splitlines()
+                counts += [sent()] * (len(lines) - len(counts))
+                if ended:
+                    break
+                time.sleep(0.01)
+        if client.returncode:
+            raise RuntimeError(f'{scenario.client} ended with {client.returncode}:\n'
+                               f'{"".join(said[-20:])}')
+        return [{**json.loads(line), 'sent': count} for line, count in zip(lines, counts)]
+
+
+def here(scenario: Scenario, trials: int, share: Optional[float]) -> list[dict[str, Any]]:
+    """Run a scenario on the robot; ``share`` of a core is what computes held to, None for not."""
+    environment = {**os.environ, **ONE_THREAD, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '84',
+                   'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    held = None if share is None else Held(share)
+    try:
+        def hear(line: str) -> None:
+            # not before it has started: loading libraries is no part of the figures
+            if held is not None and scenario.ready in line:
+                held.take(node.pid)
+
+        with running(words(scenario.module, *scenario.parameters), environment, hear) as node:
+            return asked(scenario, environment, trials)
+    finally:
+        if held is not None:
+            held.close()
+
+
+# --- the cloud ----------------------------------------------------------------------------------
+
+def there(scenario: Scenario, codec: str, trials: int, launch: Any, machine: Any,
+          link: Any) -> tuple[list[dict[str, Any]], float]:
+    """Run a scenario with the cloud; return its figures, and bytes on the link for each trial."""
+    from streaming import end, LINK
+
+    from fogros2.model import NodeSpec
+
+    environment = {**os.environ, **launch.robot_environment(), **ONE_THREAD,
+                   'PYTHONPATH': str(ROOT)}
+    mark = f'{scenario.module.rpartition(".")[2]}-{codec}-{len(scenario.asks)}'
+    computing = words(scenario.module, *scenario.parameters)
+    link.change(rate=LINK, delay=0.0, loss=0.0)
+    nodes, encoder = [], None
+    if codec:
+        image, stream = scenario.image, f'{scenario.image}/stream'
+
+        def coding(role: str, topic: str) -> list[str]:
+            return [*words(f'image_transport_h264.{role}', f'codec:={codec}',
+                           f'stream:={stream}'), '-r', f'image:={topic}']
+
+        nodes.append(('decoder', coding('decoder', '/decoded')))
+        computing += ['-r', f'{image}:=/decoded']
+        encoder = subprocess.Popen(coding('encoder', image), env=environment,
+                                   stdout=subprocess.DEVNULL)
+    nodes.append(('computing', computing))
+    try:
+        machine.start([NodeSpec(f'{what}-{mark}', what, arguments=tuple(command),
+                                environment={'PYTHONPATH': FOLDER, **ONE_THREAD})
+                       for what, command in nodes])
+        figures = asked(scenario, environment, trials, lambda: _bytes(link))
+        sent = statistics.median(
+            b['sent'] - a['sent'] for a, b in zip(figures, figures[1:]))
+    finally:
+        end(encoder)
+        machine.stop([f'{what}-{mark}' for what, _ in nodes])
+        link.change(rate=0.0, delay=0.0, loss=0.0)
+    return figures, sent
+
+
+def _bytes(link: Any) -> int:
+    folder = Path(f'/sys/class/net/{link.interface}/statistics')
+    return sum(int((folder / f'{way}_bytes').read_text()) for way in ('tx', 'rx'))
+
+
+def prepare(machine: Any) -> None:
+    """Put onto the machine what its nodes are made of."""
+    for package in ('image_transport_h264', 'fogros2_examples'):
+        for path in sorted((ROOT / package).rglob('*.py')):
+            machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(ROOT)}', mode=0o644)
+
+
+@functools.cache
+def coded_alone(codec: str) -> tuple[float, float]:
+    """Return the seconds to encode and decode a depth image, and its bytes: medians of some."""
+    import cv2
+    import numpy
+
+    from fogros2_examples.grasp.bins import camera, depth_image, thrown
+    times, sizes = [], []
+    for seed in range(5):
+        depth = numpy.rint(1000 * depth_image(thrown(seed), camera(), seed)).astype('<u2')
+        begin = time.perf_counter()
+        if codec == 'raw':
+            size = depth.nbytes
+        elif codec == 'png':
+            coded = cv2.imencode('.png', depth)[1]
+            size = len(coded)
+            cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+        else:
+            from image_transport_h264.codec import Decoder, Encoder, Picture
+
+            coder, decoder = Encoder(), Decoder()
+            picture = Picture(depth.shape[1], depth.shape[0], '16UC1', 2 * depth.shape[1],
+                              memoryview(depth.tobytes()))
+            begin = time.perf_counter()
+            packet = coder.encode(picture, seconds=0.0).data
+            size = len(packet)
+            decoder.decode(packet)
+        times.append(time.perf_counter() - begin)
+        sizes.append(size)
+    return statistics.median(times), statistics.median(sizes)
+
+
+# --- all of it ----------------------------------------------------------------------------------
+
+def measured(scenario: Scenario, short: bool, launch: Any, machine: Any,
+             link: Any) -> Iterator[Result]:
+    """Yield a scenario's rows, one for each way that images cross."""
+    from streaming import LINK
+
+    trials = min(scenario.trials, 4) if short else scenario.trials
+    held_trials = min(scenario.held_trials, 2, trials) if short else scenario.held_trials
+    alone = here(scenario, held_trials, scenario.cores / scenario.ratio)
+    hops = statistics.median(f['total'] - f['seconds'] for f in here(scenario, trials, None))
+    for codec in scenario.codecs:
+        figures, sent = there(scenario, codec, trials, launch, machine, link)
+        coding = 0.0
+        if codec:
+            # what was counted has packets twice that the relay's queue had dropped
+            coding, size = coded_alone(codec)
+            sent = PACKETS * (size + ANSWER)
+        yield Result(
+            scenario.name, scenario.table, codec,
+            statistics.median(f['total'] for f in alone),
+            statistics.median(f['seconds'] for f in figures),
+            statistics.median(f['total'] - f['seconds'] for f in figures),
+            statistics.median(f['total'] for f in figures),
+            sum(f['total'] for f in alone) / sum(f['total'] for f in figures[:held_trials]),
+            scenario.ratio,
+            # an image is handed on once more on either side of the link
+            sent * 8 / LINK + coding + hops * (3 if codec else 1),
+            sent, scenario.paper, trials, held_trials)
+
+
+def table(results: Sequence[Result], note: str) -> str:
+    """Return the tables as Markdown, in the paper's form."""
+    lines = ['# Applications on the robot alone, and with the cloud', '', note]
+    for name, title in (('II', 'Visual SLAM, s a frame'), ('III', 'Grasp planning, s a grasp'),
+                        ('IV', 'Motion planning, s a plan')):
+        rows = [r for r in results if r.table == name]
+        if not rows:
+            continue
+        lines += ['', f'## Table {name}: {title}', '',
+                  '| scenario | images | robot only | compute | network | total | speed-up | '
+                  'ratio of compute | limit of network | network / limit | bytes | '
+                  'the paper: robot only, compute, total |', '|---' * 12 + '|']
+        lines += [
+            f'| {r.scenario} | {NAMES.get(r.codec, r.codec)} | {r.robot:.2f} | {r.compute:.2f} | '
+            f'{r.network:.3f} | {r.total:.2f} | {r.speed_up:.1f}x | {r.ratio:.1f}x | '
+            f'{r.limit:.3f} | {r.network / r.limit:.2f} | {r.sent:.0f} | '
+            f'{", ".join(f"{one:g}" for one in r.paper)} |' for r in rows]
+    return '\n'.join([*lines, ''])
+
+
+def rows(results: Sequence[Result]) -> Iterator[Any]:
+    """Yield the figures that have targets."""
+    from figures import Row
+
+    for r in results:
+        what = f'{r.scenario}{f", {NAMES.get(r.codec, r.codec)}" if r.codec else ""}'
+        best = r.codec in ('', 'h264')
+        yield Row(f'{what}: total', r.total, 's', published=f'{r.paper[2]:g} s', runs=r.trials)
+        yield Row(f'{what}: network over its limit', r.network / r.limit, '', 1.5,
+                  runs=r.trials)
+        yield Row(f'{what}: speed-up over ratio of compute', r.speed_up / r.ratio, '',
+                  0.9 if best else None, 'more', runs=r.held_trials)
+
+
+def others() -> Iterator[Callable[..., Sequence[Result]]]:
+    """Yield what measures the other tables: modules beside this one named applications_*."""
+    for path in sorted(HERE.glob('applications_*.py')):
+        yield importlib.import_module(path.stem).measured
+
+
+def main() -> None:
+    """Measure all scenarios, write the figures down."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--short', action='store_true')
+    parser.add_argument('--only', default='', help='scenarios whose name has this in it')
+    arguments = parser.parse_args()
+    from figures import machine as computer
+    from figures import RESULTS, write
+    from streaming import Link
+
+    from fogros2.deploy import Launch
+    from fogros2.model import MachineSpec
+
+    if os.geteuid():
+        raise SystemExit('holding a node to a share of a core takes root')
+    results: list[Result] = []
+    begin = time.monotonic()
+    launch = Launch()
+    link: Optional[Link] = None
+    try:
+        machine = launch.up(MachineSpec('bench-applications', 'container'))
+        prepare(machine)
+        link = Link(launch, machine)
+        for scenario in SCENARIOS:
+            if arguments.only in scenario.name and not (
+                    arguments.short and scenario.name.endswith('Apartment')):
+                for result in measured(scenario, arguments.short, launch, machine, link):
+                    results.append(result)
+                    print(result, flush=True)
+        for other in others():
+            results += other(arguments.only, arguments.short, launch, machine, link)
+    finally:
+        if link is not None:
+            link.close()
+        for error in launch.down():
+            print(error, file=sys.stderr)
+    note = (f'{computer()}; the link carries 10 Mbit/s; the cloud is a container with all cores, '
+            'the robot is held to as much less as "ratio of compute" says.')
+    text = table(results, note)
+    print(text)
+    print(f'took {(time.monotonic() - begin) / 60:.1f} min\n')
+    for name in ('slam', 'grasp', 'planning'):
+        print(f'ros2 launch fogros2_examples {name}.launch.py machine:=aws')
+    if not (arguments.only or arguments.short):
+        write('applications', 'Applications with the cloud', list(rows(results)))
+        (RESULTS / 'applications-table.md').write_text(text)
+        (RESULTS / 'applications-table.json').write_text(json.dumps(
+            {'note': note, 'rows': [dataclasses.asdict(r) for r in results]}, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()
