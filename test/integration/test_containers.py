@@ -7,6 +7,7 @@ is reached by SSH, and with one of its own on a container machine.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib import metadata
 import os
 from pathlib import Path
 import re
@@ -314,11 +315,15 @@ def test_a_container_machine_runs_containers_and_nodes_in_images(
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     name = f'boxes-{secrets.token_hex(3)}'
     before = volumes()
+    mounts = container_root.environment_mounts(None)
+    try:
+        metadata.distribution('ros2-embedded')
+    except metadata.PackageNotFoundError:
+        mounts.append('/usr/lib')  # what ROS 2 is linked with
     path = tmp_path / 'boxes.launch.py'
     path.write_text(LAUNCH_FILE.format(
         name=name, network=cloud_network, images=images, mounts=[str(images), *crun],
-        options=[word for mount in container_root.environment_mounts(None)
-                 for word in ('-v', f'{mount}:{mount}:ro')]))
+        options=[word for mount in mounts for word in ('-v', f'{mount}:{mount}:ro')]))
     with launching() as start:
         launched = start(str(path))
         launched.wait_for(f'I heard: [Hello World from {name} ')
