@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import datetime
 from decimal import Decimal
@@ -468,6 +469,25 @@ def test_a_program_is_shrunk_to_the_same_program():
     exec(compile(boot.shrunk(source), 'short', 'exec'), short)  # noqa: S102
     assert plain['f']('1') == short['f']('1')
     assert 'Say' not in boot.shrunk(source) and 'int' not in boot.shrunk(source)
+
+
+@pytest.mark.parametrize('text', [
+    '''f"{a['k']} {{x}} {a}\\n"''', '''f'{b:>{w}.2f}|{b!r:^9}|{b!s}|' "{}" ''',
+    '''f"{', '.join(f'{k}={v:03d}' for k, v in a.items())}"''', '''f"""'{a['k']}' "x"""''',
+    '''f'{b}' f"{'{'}" '{' '''])
+def test_a_shrunk_program_is_one_for_older_pythons_too(text):
+    """Python 3.12 and newer write f-strings that those before can't read."""
+    names = {'a': {'k': 7}, 'b': 2.5, 'w': 8}
+    short = boot.shrunk(f'found = {text}')
+    assert not any(isinstance(node, ast.JoinedStr) for node in ast.walk(ast.parse(short)))
+    exec(compile(short, 'short', 'exec'), names)  # noqa: S102
+    assert names['found'] == eval(text, {'a': {'k': 7}, 'b': 2.5, 'w': 8})  # noqa: S307
+
+
+def test_the_agent_in_the_user_data_has_no_f_string():
+    program = boot.agent_program()
+    assert not any(isinstance(node, ast.JoinedStr) for node in ast.walk(ast.parse(program)))
+    compile(program, 'agent.py', 'exec')
 
 
 @pytest.mark.parametrize(('answers', 'status'), [

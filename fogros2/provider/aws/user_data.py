@@ -11,7 +11,7 @@ stopped is guarded again, and one made of a baked image isn't guarded by the for
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import functools
 import gzip
 import json
@@ -175,6 +175,21 @@ def shrunk(source: str) -> str:
     return narrow if ast.dump(ast.parse(narrow)) == ast.dump(ast.parse(text)) else text
 
 
+def _fields(parts: Sequence[ast.expr], values: list[ast.expr]) -> str:
+    """Return an f-string's parts as ``format`` has them; the values go to the end of a list."""
+    text = ''
+    for part in parts:
+        if isinstance(part, ast.FormattedValue):
+            values.append(part.value)
+            text += '{' + ('' if part.conversion < 0 else f'!{chr(part.conversion)}')
+            if isinstance(part.format_spec, ast.JoinedStr):
+                text += ':' + _fields(part.format_spec.values, values)
+            text += '}'
+        elif isinstance(part, ast.Constant):
+            text += str(part.value).replace('{', '{{').replace('}', '}}')
+    return text
+
+
 class _Shrinker(ast.NodeTransformer):
     """Takes away what isn't needed to run."""
 
@@ -206,6 +221,25 @@ class _Shrinker(ast.NodeTransformer):
         if isinstance(node.test, ast.Name) and node.test.id == 'TYPE_CHECKING' \
                 and not node.orelse:
             return None
+        return node
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
+        """
+        Make an f-string a call of ``format``.
+
+        Python 3.12 writes f-strings that older ones, which a machine may have, can't read (PEP
+        701): with the outer quotes inside once more.
+        """
+        self.generic_visit(node)
+        values: list[ast.expr] = []
+        text = _fields(node.values, values)
+        return ast.Call(ast.Attribute(ast.Constant(text), 'format', ast.Load()), values, [])
+
+    def visit_FormattedValue(self, node: ast.FormattedValue) -> ast.AST:
+        """Leave a format's own fields to the f-string that it is in."""
+        node.value = self.visit(node.value)
+        if isinstance(node.format_spec, ast.JoinedStr):
+            node.format_spec.values = [self.visit(part) for part in node.format_spec.values]
         return node
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
