@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contexts, nodes, topics, services, timers, clocks."""
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -725,6 +726,25 @@ def test_log_level_from_the_command_line():
         env={**os.environ, 'RCUTILS_CONSOLE_OUTPUT_FORMAT': '{severity} {name} {message}'})
     shown = [line for line in done.stderr.splitlines() if 'sleeper' in line]
     assert 'DEBUG sleeper hidden' in shown and 'ERROR sleeper.arm trouble' in shown
+
+
+LATE = '''
+import threading
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+rclpy.init()
+node = rclpy.create_node('late')
+threading.kept = SingleThreadedExecutor()  # outlives the modules that were imported after this one
+threading.kept.add_node(node)
+threading.kept.spin_once(timeout_sec=0)
+'''
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
+                    reason="ROS 2's own executors stumble over what is gone by then")
+def test_an_executor_that_outlives_its_modules_ends_without_a_word():
+    done = subprocess.run([sys.executable, '-c', LATE], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, '')
 
 
 def test_importing_rclpy_is_quick():
