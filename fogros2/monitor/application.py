@@ -107,6 +107,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         say(f'the web application is at {options.at}')
     except Cancelled:
         pass
+    except CommandError as error:
+        # the engine's own last words say it best
+        said = error.result.stderr.strip().splitlines() or [str(error)]
+        say(f'no web application here: {said[-1]}')
     except FogError as error:
         say(f'no web application here: {error}')
     ended.wait()
