@@ -43,7 +43,7 @@ class Foxglove(Action):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param topics: patterns (``*``, ``?``) of the topics to show.
-    :param port: TCP port.
+    :param port: TCP port; the two after it are for others than the robot, and the application.
     :param monitor_allow: networks (CIDR) from which others than the robot get in, at the port
         after that one, over TLS and with a token; through the provider's firewall, where it has
         one. The machine itself turns all others away.

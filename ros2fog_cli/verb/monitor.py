@@ -49,14 +49,15 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
                 f'port {port} of this computer: {error.strerror}',
                 'another --port, or none for one that is free') from error
         with monitor.carrying(tunnel) as ended:
-            address = urls.bridge('localhost', tunnel.port)
-            page = urls.served('localhost', tunnel.port) \
-                if monitor.has_application(tunnel.port) else urls.app(address)
-            print(f'{entry.name} is at {address} until Ctrl-C; in a browser:\n{page}', flush=True)
-            if browser:
-                import webbrowser
-                webbrowser.open(page)
             try:
+                address = urls.bridge('localhost', tunnel.port)
+                page = urls.served('localhost', tunnel.port) \
+                    if monitor.has_application(tunnel.port) else urls.app(address)
+                print(f'{entry.name} is at {address} until Ctrl-C; in a browser:\n{page}',
+                      flush=True)
+                if browser:
+                    import webbrowser
+                    webbrowser.open(page)
                 ended.wait()
             except KeyboardInterrupt:
                 print()
