@@ -119,7 +119,9 @@ def test_what_a_machine_has(story: Story, page: Browser) -> None:
         launches=[{'id': 'abc123', 'pid': 4711, 'alive': True,
                    'steps': [step('VPN interface', 0, 0.12)]}],
         topics=[{'topic': '/odom', 'type': 'nav_msgs/msg/Odometry', 'from': ['planner'],
-                 'to': [''], 'rate': 50.02, 'bandwidth': 36_100.0, 'sampled': False}],
+                 'to': [''], 'rate': 50.02, 'bandwidth': 36_100.0, 'large': False},
+                {'topic': '/points', 'type': 'sensor_msgs/msg/PointCloud2', 'from': ['planner'],
+                 'to': [''], 'rate': None, 'bandwidth': None, 'large': True}],
         streams=[{'topic': '/camera', 'id': 'abc123 /camera', 'transport': 'h264', 'source': '',
                   'target': 'planner', 'note': '', 'rate': 29.97, 'bandwidth': 81_000.0,
                   'sampled': True, 'picture': 1}])
@@ -130,7 +132,8 @@ def test_what_a_machine_has(story: Story, page: Browser) -> None:
     for words in ('rover-0', '$1.32', 'up for\n60 min', 'time left\n2 h 00 min', '23 ms',
                   '$0.66', 'at $0.66/h', '65 s ago', '250 kB/s', '90.0 kB/s', '10.7 MB',
                   'coming up', '5.0 MB of 20.0 MB', 'process 4711', '30.0 Hz', '81.0 kB/s',
-                  'robot → planner', 'planner → robot', '50.0', '36.1 kB/s', 'all is well'):
+                  'robot → planner', 'planner → robot', '50.0', '36.1 kB/s',
+                  'not measured', 'all is well'):
         assert words in text, words
     page.until('document.querySelector("figure img")?.naturalWidth === 64')
     # what a screen reader and a keyboard need

@@ -77,10 +77,14 @@ def test_topics_that_cross_by_where_their_nodes_are() -> None:
         topic('/both', 'driver talker', 'listener'), topic('/unheard', 'talker', OWN),
         topic('/rosout', 'talker', 'listener'), topic('/parameter_events', 'talker', 'listener'),
         topic('/a/_hidden', 'talker', 'listener'),
+        topic('/fogros2/planner/camera', 'camera_h264_decoder_on_planner', 'unknown', IMAGE),
+        topic('/points', 'slam', 'listener', 'sensor_msgs/msg/PointCloud2'),
         topic('/camera/h264/feedback', 'talker', 'listener')]
     streamed = [Stream('/camera', 'h264', '/camera/h264', PACKET, '', 'planner', True)]
     kind = 'std_msgs/msg/String'
-    assert crossing(graph, hosts, streamed) == [
+    found = crossing(graph, hosts, streamed)
+    assert [one.topic for one in found if one.large] == ['/points']
+    assert [one for one in found if not one.large] == [
         Crossing('/both', kind, ('', 'planner'), ('',)),
         Crossing('/chatter', kind, ('planner',), ('',)),
         Crossing('/status', kind, ('',), ('planner',))]

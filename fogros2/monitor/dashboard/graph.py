@@ -10,14 +10,14 @@ A picture is taken from the image topic on the robot, where a streamed topic kee
 that costs no decoding, and nothing crosses the VPN for it. It is one message a second: the
 subscription is made for it and goes with it. Where nobody else looks at what a decoder publishes
 here, we are a viewer as any other, and stay subscribed, as a stream that begins anew each second
-would be a poor one. Of what crosses, small topics are listened to all
+would be a poor one. Of a stream between two machines it is a packet every five seconds. Of what
+crosses, small topics are listened to all
 the time and large ones for a second in ten; nothing that nobody else listens to is listened to,
 as that would wake its encoder.
 """
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import functools
 import json
@@ -25,15 +25,13 @@ import os
 import sys
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TYPE_CHECKING
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Image
 
 from fogros2.monitor.dashboard.meter import Meter
 from fogros2.monitor.dashboard.ways import (
@@ -48,17 +46,17 @@ from fogros2.monitor.dashboard.ways import (
 )
 from fogros2.monitor.definitions import message_class
 
-#: Seconds between two looks at the graph, from one picture of a topic to the next, and after
-#: which one that doesn't come is asked for anew.
-LOOK, PICTURE, PATIENCE = 0.5, 1.0, 5.0
+if TYPE_CHECKING:
+    from fogros2.monitor.dashboard.cameras import Camera
+
+#: Seconds between two looks at the graph.
+LOOK = 0.5
 #: Topics that are listened to at the most.
 MOST = 64
 #: Hears every publisher, and keeps none of them waiting.
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=32,
                   reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
-_ONE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
-                  reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
-_IMAGE = 'sensor_msgs/msg/Image'
+_IMAGE, _PACKET = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 
 
 class _Ear:
@@ -84,59 +82,6 @@ class _Ear:
         self.meter.heard(time.monotonic(), len(data))
 
 
-class _Camera:
-    """Takes a picture of an image topic each second."""
-
-    def __init__(self, node: GraphNode, topic: str) -> None:
-        self._node, self._topic = node, topic
-        self._subscription: Optional[Subscription] = None
-        self._asked = -1e9
-        self._number = 0
-        self._due = self._stay = False
-
-    def look(self, *, stay: bool) -> None:
-        """
-        Take one if it is time.
-
-        :param stay: whether to stay subscribed from one to the next.
-        """
-        self._stay = stay
-        now = time.monotonic()
-        if self._subscription is not None and now - self._asked > PATIENCE:
-            self.close()  # it may be of a publisher that has gone
-        if now - self._asked > PICTURE - LOOK / 2:
-            if self._subscription is None:
-                self._subscription = self._node.create_subscription(
-                    Image, self._topic, self._take, _ONE, raw=True)
-                self._asked = now
-            self._due = True
-
-    def close(self) -> None:
-        """Stop waiting for one."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
-
-    def _take(self, data: bytes) -> None:
-        if not self._due:
-            return
-        # where images are streamed there is what this takes
-        from fogros2.monitor.dashboard import shots
-        from image_transport_h264.message import picture
-        from image_transport_h264.picture import BadPicture
-        self._due, self._asked = False, time.monotonic()
-        if not self._stay:
-            self.close()
-        try:
-            shot = shots.jpeg(picture(deserialize_message(data, Image)))
-        except BadPicture as error:
-            self._node.tell({'picture': self._topic, 'note': str(error)})
-            return
-        self._number += 1
-        self._node.tell({'picture': self._topic, 'number': self._number,
-                         'data': base64.b64encode(shot).decode()})
-
-
 class GraphNode(Node):
     """Looks at the graph, listens, and tells."""
 
@@ -144,7 +89,7 @@ class GraphNode(Node):
         super().__init__(OWN, enable_rosout=False, start_parameter_services=False)
         self._hosts = Hosts({})
         self._ears: dict[str, Optional[_Ear]] = {}
-        self._cameras: dict[str, _Camera] = {}
+        self._cameras: dict[str, Camera] = {}
         self.create_timer(LOOK, self._look)
 
     def know(self, machines: dict[str, list[str]]) -> None:
@@ -165,15 +110,14 @@ class GraphNode(Node):
         ways = {one.between: one for one in streamed}
         wanted: dict[str, tuple[str, bool]] = {
             name: (one.kind, one.heard) for name, one in ways.items()}
-        wanted.update({one.topic: (one.kind, True) for one in others})
+        wanted.update({one.topic: (one.kind, True) for one in others if not one.large})
         for name in [name for name in self._ears if name not in wanted]:
             self._listen(name, '', heard=False)
             del self._ears[name]
         for name, (kind, heard) in list(wanted.items())[:MOST]:
             self._listen(name, kind, heard=heard)
-        shown = {one.topic for one in streamed if '' in (one.source, one.target)}
-        self._take_pictures([topic for topic in topics
-                             if topic.name in shown and topic.kind == _IMAGE])
+        if streamed or self._cameras:
+            self._take_pictures(topics, streamed)
         self.tell({'streams': [self._stream(one) for one in streamed],
                    'topics': [self._crossing(one) for one in others]})
 
@@ -193,14 +137,31 @@ class GraphNode(Node):
         if ear is not None:
             ear.look(wanted=heard)
 
-    def _take_pictures(self, images: list[Topic]) -> None:
-        here = {image.name: image for image in images
-                if any(not self._hosts.of(node) for node in image.publishers)}
-        for name in [name for name in self._cameras if name not in here]:
-            self._cameras.pop(name).close()
-        for name, image in here.items():
-            alone = not image.subscribers - {OWN} and decoded(image)
-            self._cameras.setdefault(name, _Camera(self, name)).look(stay=alone)
+    def _take_pictures(self, topics: list[Topic], streamed: list[Stream]) -> None:
+        """Have a camera for each stream that has pictures, and let those that are due work."""
+        try:
+            from fogros2.monitor.dashboard.cameras import Camera, StreamCamera
+        except ModuleNotFoundError:
+            return  # all streams are between machines: the robot needn't have what images take
+        by_name = {topic.name: topic for topic in topics}
+        wanted: dict[str, tuple[type[Camera], str, bool]] = {}
+        for one in streamed:
+            image = by_name.get(one.topic)
+            if one.source and one.target:
+                kind = Camera if one.kind == _IMAGE else StreamCamera
+                if one.heard and one.kind in (_IMAGE, _PACKET):
+                    wanted[one.topic] = kind, one.between, False
+            elif image is not None and image.kind == _IMAGE and any(
+                    not self._hosts.of(node) for node in image.publishers):
+                alone = not image.subscribers - {OWN} and decoded(image)
+                wanted[one.topic] = Camera, one.topic, alone
+        for name, camera in list(self._cameras.items()):
+            if name not in wanted or camera.topic != wanted[name][1]:
+                self._cameras.pop(name).end()
+        for name, (kind, topic, stay) in wanted.items():
+            if name not in self._cameras:
+                self._cameras[name] = kind(self, self.tell, name, topic)
+            self._cameras[name].look(stay=stay)
 
     def _rates(self, topic: str) -> dict[str, Any]:
         ear = self._ears.get(topic)
@@ -209,17 +170,13 @@ class GraphNode(Node):
                 'sampled': ear is not None and ear.meter.sampled}
 
     def _stream(self, one: Stream) -> dict[str, Any]:
-        note = ''
-        if one.source and one.target:
-            note = 'between two machines'
-        elif not one.heard:
-            note = 'nobody subscribes'
+        note = '' if one.heard else 'nobody subscribes'
         return {'topic': one.topic, 'transport': one.transport, 'source': one.source,
                 'target': one.target, 'note': note, **self._rates(one.between)}
 
     def _crossing(self, one: Crossing) -> dict[str, Any]:
         return {'topic': one.topic, 'type': one.kind, 'from': one.sources, 'to': one.targets,
-                **self._rates(one.topic)}
+                'large': one.large, **self._rates(one.topic)}
 
 
 def _take_lines(node: GraphNode, ended: functools.partial[None]) -> None:

@@ -17,6 +17,10 @@ _DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
 #: What every node has, and what belongs to a stream.
 _HIDDEN = re.compile(r'/rosout|/parameter_events|.*/_.*|_.*')
 _OF_STREAM = ('keyframe', 'feedback', 'pieces', 'camera_info')
+#: Types that are too large to listen to for a rate: if a node is elsewhere than its name says, such
+#: a topic may never have left its machine.
+_LARGE = frozenset({'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2',
+                    'sensor_msgs/msg/PointCloud', 'nav_msgs/msg/OccupancyGrid'})
 #: Name of the node that looks, which is none of the launch's.
 OWN = '_fogros2_dashboard'
 
@@ -59,6 +63,11 @@ class Crossing:
     kind: str
     sources: tuple[str, ...]
     targets: tuple[str, ...]
+
+    @property
+    def large(self) -> bool:
+        """Whether it isn't listened to for a rate."""
+        return self.kind in _LARGE
 
 
 class Hosts:
@@ -115,10 +124,14 @@ def crossing(
     topics: Iterable[Topic], hosts: Hosts, streamed: Iterable[Stream],
 ) -> list[Crossing]:
     """Return the other topics that have a publisher on one host and a subscriber on another."""
+    streamed = list(streamed)
     between = {one.between for one in streamed}
+    # what nodes on a machine have in place of a streamed topic stays there
+    local = tuple(f'/fogros2/{identifier(host)}/' for one in streamed
+                  for host in (one.source, one.target) if host)
     found = []
     for topic in topics:
-        if _HIDDEN.fullmatch(topic.name) or topic.name in between \
+        if topic.name.startswith(local) or _HIDDEN.fullmatch(topic.name) or topic.name in between \
                 or topic.name.rpartition('/')[0] in between \
                 and topic.name.rpartition('/')[2] in _OF_STREAM:
             continue

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of streamed topics, taken from time to time at as little cost as there is."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+import time
+from typing import Any, Optional
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Empty
+
+from fogros2.monitor.dashboard import shots
+from image_transport_h264 import stills
+from image_transport_h264.codec import CodecError, Decoder, Missing
+from image_transport_h264.message import KEY_REQUEST, picture
+from image_transport_h264.picture import Picture
+
+#: Seconds from one picture of an image topic to the next, the same of what only crosses between
+#: machines, and after which one that doesn't come is asked for anew.
+IMAGE, STREAM, PATIENCE = 1.0, 5.0, 5.0
+#: What a look may come early by, and seconds from one request for a packet to the next.
+SLACK, REQUEST = 0.25, 0.3
+_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=4,
+                  reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+
+Tell = Callable[[dict[str, Any]], None]
+
+
+class Camera:
+    """
+    Takes pictures of an image topic: one message each second, as it came.
+
+    :param tell: gets ``{'picture': name, 'number': n, 'data': base64}``, or with ``note`` why not.
+    :param name: the stream's topic; ``topic`` is the one to look at.
+    """
+
+    interval = IMAGE
+
+    def __init__(self, node: Node, tell: Tell, name: str, topic: str) -> None:
+        self._node, self._tell, self._name, self.topic = node, tell, name, topic
+        self._subscription: Optional[Subscription] = None
+        self._asked = -1e9
+        self._number = 0
+        self._due = self._stay = False
+
+    def look(self, *, stay: bool = False) -> None:
+        """
+        Take one if it is time.
+
+        :param stay: whether to stay subscribed from one to the next.
+        """
+        self._stay = stay
+        now = time.monotonic()
+        if self._subscription is not None and now - self._asked > PATIENCE:
+            self.close()  # it may be of a publisher that has gone
+        if now - self._asked > self.interval - SLACK:
+            if self._subscription is None:
+                self._asked = now
+                self._subscription = self._subscribe()
+            self._due = True
+
+    def close(self) -> None:
+        """Stop waiting for one."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def end(self) -> None:
+        """Give up."""
+        self.close()
+
+    def _subscribe(self) -> Subscription:
+        return self._node.create_subscription(Image, self.topic, self._take, _QOS, raw=True)
+
+    def _take(self, data: bytes) -> None:
+        if self._due:
+            try:
+                shown = self._picture(data)
+                if shown is not None:
+                    self._show(shots.jpeg(shown))
+            except CodecError as error:
+                self._done()
+                self._tell({'picture': self._name, 'note': str(error)})
+
+    def _picture(self, data: bytes) -> Optional[Picture]:
+        return picture(deserialize_message(data, Image))
+
+    def _show(self, shot: bytes) -> None:
+        self._done()
+        self._number += 1
+        self._tell({'picture': self._name, 'number': self._number,
+                    'data': base64.b64encode(shot).decode()})
+
+    def _done(self) -> None:
+        self._due, self._asked = False, time.monotonic()
+        if not self._stay:
+            self.close()
+
+
+class StreamCamera(Camera):
+    """
+    Takes pictures of a stream that nobody decodes here, of packets that need no other.
+
+    Every five seconds it asks for such a packet, so that it need not follow the stream.
+    """
+
+    interval = STREAM
+
+    def __init__(self, node: Node, tell: Tell, name: str, topic: str) -> None:
+        super().__init__(node, tell, name, topic)
+        self._requests: Publisher = node.create_publisher(Empty, f'{topic}/{KEY_REQUEST}', 1)
+        self._requested = -1e9
+        self._decoder = Decoder()
+
+    def end(self) -> None:
+        """Give up."""
+        super().end()
+        self._node.destroy_publisher(self._requests)
+
+    def _subscribe(self) -> Subscription:
+        self._decoder = Decoder()
+        return self._node.create_subscription(
+            CompressedImage, self.topic, self._take, _QOS, raw=True)
+
+    def _picture(self, data: bytes) -> Optional[Picture]:
+        message = deserialize_message(data, CompressedImage)
+        if message.format not in ('h264', 'ffv1'):
+            return stills.decode(message.format, memoryview(message.data))
+        try:
+            return self._decoder.decode(message.data)
+        except Missing:
+            now = time.monotonic()
+            if now - self._requested > REQUEST:
+                self._requested = now
+                self._requests.publish(Empty())
+            return None
