@@ -17,8 +17,8 @@ _DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
 #: What every node has, and what belongs to a stream.
 _HIDDEN = re.compile(r'/rosout|/parameter_events|.*/_.*|_.*')
 _OF_STREAM = ('keyframe', 'feedback', 'pieces', 'camera_info')
-#: Types that are too large to listen to for a rate: if a node is elsewhere than its name says, such
-#: a topic may never have left its machine.
+#: Types that are too large to listen to for a rate: if a node is elsewhere than its name says,
+#: such a topic may never have left its machine.
 _LARGE = frozenset({'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2',
                     'sensor_msgs/msg/PointCloud', 'nav_msgs/msg/OccupancyGrid'})
 #: Name of the node that looks, which is none of the launch's.
