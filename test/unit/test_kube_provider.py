@@ -407,6 +407,11 @@ def test_who_makes_load_balancers(server, groups, maker):
     assert exposure.load_balancers(server, groups) == maker
 
 
+def test_a_load_balancer_of_a_cloud_s_is_waited_for_longer():
+    assert exposure.patience('EKS') == exposure.patience('') == 180.0
+    assert exposure.patience('k3s') == exposure.patience('MetalLB') == 60.0
+
+
 def test_a_load_balancer_has_an_address_or_a_name():
     def service(*ingress: dict[str, str]) -> dict[str, Any]:
         return {'status': {'loadBalancer': {'ingress': list(ingress)}}}

@@ -29,6 +29,8 @@ INTERVAL = 0.1
 ROUNDS = 10
 #: Seconds in which a load balancer has to be there, and to answer: clouds take minutes.
 LOAD_BALANCER = 180.0
+#: The same where it is made within the cluster: some of those who could are switched off.
+LOAD_BALANCER_INSIDE = 60.0
 #: Seconds in which a port of a node that is going to answer does.
 NODE_PORT = 6.0
 
@@ -39,6 +41,8 @@ _SERVERS = {r'\.eks\.amazonaws\.com(\.cn)?$': 'EKS', r'\.azmk8s\.io$': 'AKS',
 _GROUPS = {'metallb.io': 'MetalLB', 'purelb.io': 'PureLB', 'loxilb.io': 'LoxiLB',
            'gke.io': 'GKE', 'k8s.aws': 'EKS', 'amazonaws.com': 'EKS', 'azmk8s.io': 'AKS',
            'k3s.cattle.io': 'k3s'}
+#: Those who make them without a cloud.
+_INSIDE = ('MetalLB', 'PureLB', 'LoxiLB', 'k3s')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +93,11 @@ def load_balancers(server: str, groups: Iterable[str] = ()) -> str:
             return name
     return next((name for end, name in _GROUPS.items() for group in groups
                  if group == end or group.endswith(f'.{end}')), '')
+
+
+def patience(maker: str) -> float:
+    """Return the seconds for which a load balancer is waited for, by who makes it."""
+    return LOAD_BALANCER_INSIDE if maker in _INSIDE else LOAD_BALANCER
 
 
 def ingress(service: Mapping[str, Any]) -> list[str]:

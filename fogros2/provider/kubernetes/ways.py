@@ -167,7 +167,7 @@ class _Search:
         """Try them."""
         deadline = time.monotonic() + timeout
         if service is not None and service['spec']['type'] == 'LoadBalancer':
-            patience = min(exposure.LOAD_BALANCER, timeout * 0.8)
+            patience = min(exposure.patience(maker(self._api, self._cancel)), timeout * 0.8)
             if (found := self._load_balancer(patience)) is not None:
                 return found
         if service is not None and asked in ('auto', 'node_port'):
