@@ -32,6 +32,11 @@ HELPER = '/usr/libexec/fogros2/vpn'
 RULES = '/etc/sudoers.d/fogros2-vpn'
 NAME, OTHER = 'fog0a1b2c', 'fog0a1b2d'
 KEY = 'Sg3Q0Y1Y0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHo='
+#: What finds this Python and, where it is sourced, ROS 2.
+PASSED = [f'PATH={Path(sys.executable).parent}:{os.environ["PATH"]}', *(
+    f'{name}={os.environ[name]}' for name in (
+        'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'ROS_DISTRO', 'ROS_VERSION',
+        'ROS_PYTHON_VERSION') if name in os.environ)]
 #: Everything is there as on this computer, and nothing that is written reaches it.
 ENTER = """\
 mount -t tmpfs tmpfs "$1"
@@ -72,7 +77,7 @@ class Copy:
             return [*inside, *words]
         # not su, which takes the terminal away
         return [*inside, 'setpriv', f'--reuid={user}', f'--regid={user}', '--init-groups',
-                'env', '-i', 'PATH=/usr/bin:/bin', f'HOME=/home/{user}', *words]
+                'env', '-i', *PASSED, f'HOME=/home/{user}', *words]
 
     def run(self, user: str, *words: str, data: bytes = b'', check: bool = False) -> Result:
         return process.run(Command(tuple(self.argv(user, *words)), sudo=True, input=data or b' '),
@@ -262,6 +267,9 @@ def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     wait_until(lambda: copy.run('root', 'kill', '-0', str(pid)).returncode != 0, timeout=5.0,
                what='the launch to be gone')
     assert copy.run('root', HELPER, 'tidy').stdout.count('is gone') == 16
+    if process.which('systemd-analyze'):
+        units = [f'/etc/systemd/system/fogros2-vpn-tidy.{kind}' for kind in ('service', 'timer')]
+        copy.run('root', 'systemd-analyze', 'verify', *units, check=True)
     assert copy.run('root', 'ls', '-A', '/run/fogros2-vpn').stdout == ''
 
 
@@ -345,8 +353,7 @@ def test_a_whole_launch_of_a_user_without_rights(copy: Copy) -> None:
         pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
     copy.run('root', 'sh', '-ec', MACHINE, check=True)
     copy.run('fogada', 'sh', '-c', 'cat >~/first.launch.py', data=LAUNCH.encode(), check=True)
-    ros2 = str(Path(sys.executable).parent)
-    script = (f'cd; export PATH={ros2}:$PATH ROS_DOMAIN_ID=31; sudo -n true && exit 99; '
+    script = ('cd; export ROS_DOMAIN_ID=31; sudo -n true && exit 99; '
               # a shell without a terminal has what it starts beside it ignore Ctrl-C
               'env --default-signal=INT ros2 launch ./first.launch.py >said 2>&1 </dev/null & '
               'for n in $(seq 60); do grep -q "I heard" said && break; sleep 1; done; '
