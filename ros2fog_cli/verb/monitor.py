@@ -51,13 +51,14 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         with monitor.carrying(tunnel) as ended:
             try:
                 address = urls.bridge('localhost', tunnel.port)
-                page = urls.served('localhost', tunnel.port) \
-                    if monitor.has_application(tunnel.port) else urls.app(address)
-                print(f'{entry.name} is at {address} until Ctrl-C; in a browser:\n{page}',
-                      flush=True)
+                pages = [urls.served('localhost', tunnel.port)] \
+                    if monitor.has_application(tunnel.port) else \
+                    [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
+                print(f'{entry.name} is at {address} until Ctrl-C; in a browser:', *pages,
+                      sep='\n', flush=True)
                 if browser:
                     import webbrowser
-                    webbrowser.open(page)
+                    webbrowser.open(pages[0])
                 ended.wait()
             except KeyboardInterrupt:
                 print()

@@ -62,8 +62,10 @@ def sees_by_a_tunnel(name: str) -> None:
     try:
         near = re.search(r'is at (ws://localhost:\d+) ', tunnel.stdout.readline())[1]
         # the machine runs no containers, and so has no application
-        assert tunnel.stdout.readline().startswith(
-            'https://app.foxglove.dev/~/view?ds=foxglove-websocket&ds.url=ws%3A%2F%2F')
+        for page in ('https://app.foxglove.dev/~/view',
+                     'https://lichtblick-suite.github.io/lichtblick/'):
+            assert tunnel.stdout.readline().startswith(
+                f'{page}?ds=foxglove-websocket&ds.url=ws%3A%2F%2F')
         sees_the_talker(near)
     finally:
         tunnel.send_signal(signal.SIGINT)
@@ -131,6 +133,8 @@ def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
         sees_the_talker(inside[1])
         assert (f'{name}: topics at http{inside[1][len("ws"):]}/?ds=foxglove-websocket&'
                 in ros2('fog', 'list').stdout)
+        status = ros2('fog', 'status', name).stdout
+        assert f'monitor open  {at[0]}:{at[1]}' in status and inside[1][len('ws'):] in status
         sees_by_a_tunnel(name)
         with second_address(cloud_network, nobody):
             for _ in range(3):
