@@ -230,7 +230,8 @@ class Live:
                 self._asked = time.monotonic()
                 warnings: list[str] = []
                 entries = machines.survey(warnings.append, name=self._name,
-                                          regions=self._regions, store=self.store)
+                                          regions=self._regions, store=self.store,
+                                          cancel=self._stopped)
                 with self._lock:
                     self._entries, self._warnings = entries, warnings
                 self._wake.set()

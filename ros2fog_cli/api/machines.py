@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import contextlib
 import dataclasses
 from decimal import Decimal
 import threading
@@ -187,7 +188,7 @@ class Entry:
 
 def survey(
     warn: Warn, *, name: Optional[str] = None, regions: Optional[Sequence[str]] = None,
-    store: Optional[Store] = None,
+    store: Optional[Store] = None, cancel: Optional[threading.Event] = None,
 ) -> list[Entry]:
     """
     Return all machines, or those called ``name``, asking all providers at once.
@@ -197,16 +198,17 @@ def survey(
     that no record names, is left out: its SDK takes longer to load than all others to answer.
 
     :param regions: places to ask; a provider that has places is asked then in any case.
+    :param cancel: set to give up; by a Ctrl-C where it is left out.
     """
     records = {record.name: record for record in (store or Store()).machines()}
     if name is not None:
         records = {key: value for key, value in records.items() if key == name}
     tags = {} if name is None else {TAG_NAME: name}
     providers = plugin_system.names('fogros2.provider')
-    with interruptible() as cancel, \
+    with contextlib.nullcontext(cancel) if cancel is not None else interruptible() as given_up, \
             ThreadPoolExecutor(max(1, len(providers)), 'fog-list') as pool:
         answers = list(pool.map(lambda provider: _ask(
-            provider, tags, regions, records.values(), warn, cancel), providers))
+            provider, tags, regions, records.values(), warn, given_up), providers))
     entries: list[Entry] = []
     matched: set[str] = set()
     for machines in answers:
