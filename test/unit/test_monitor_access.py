@@ -13,7 +13,7 @@ from launch.substitutions import TextSubstitution
 import pytest
 
 from fogros2 import ContainerInstance, Foxglove
-from fogros2.actions import networks
+from fogros2.actions import carriers, foxglove, networks
 from fogros2.deploy import Launch, RunningMachine
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
@@ -167,3 +167,31 @@ def test_a_service_that_can_not_be_removed_says_how():
 
     with pytest.raises(ProviderError, match="port 8766 of 'fogros2-planner' can't be closed"):
         publishing.close(Api(), MachineId('robots', 'fogros2-planner', 'u-1', ''), 8766)
+
+
+@pytest.mark.parametrize(('runs', 'on_robot'), [(True, False), (False, False), (True, True)])
+def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, runs, on_robot):
+    made = []
+
+    class Carrier(carriers.Carrier):
+        def __init__(self, spec):
+            made.append(spec)
+            super().__init__(spec)
+
+    monkeypatch.setattr(FakeProvider, 'runs_containers', runs)
+    spec = MachineSpec('planner', 'fake')
+    monkeypatch.setattr(foxglove, 'Carrier', Carrier)
+    monkeypatch.setattr(foxglove, 'send', lambda process, machine: None)
+    monkeypatch.setattr(foxglove, 'Coordinator', SimpleNamespace(of=lambda _: SimpleNamespace(
+        on_robot=lambda _: on_robot, session=lambda _: SimpleNamespace(spec=spec),
+        launch=SimpleNamespace(id='abc123', provider=lambda _: FakeProvider()))))
+    Foxglove('planner', topics=['/a', '/b*'], port=9000, image='x:1',
+             monitor_allow=SOURCES).execute(LaunchContext())
+    words = list(made[0].arguments)
+    name = 'robot' if on_robot else 'planner'
+    assert words[:4] == ['--name', name, '--listen', '127.0.0.1:9000']
+    assert words[-4:] == ['--topic', '/a', '--topic', '/b*']
+    # the robot's own has neither others nor an application
+    assert words[4:-4] == ([] if on_robot else [
+        '--vpn', '9000', *(['--image', 'x:1'] if runs else []), '--guarded', '9001',
+        '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--allow', *SOURCES])
