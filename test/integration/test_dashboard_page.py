@@ -202,7 +202,7 @@ def test_who_deletes_is_asked_and_told(story: Story, page: Browser) -> None:
     page.ask('document.querySelector("button.delete").click()')
     page.until('document.getElementById("ask").open')
     asked = page.ask('document.getElementById("ask").innerText')
-    assert 'launch with process 4711 has this machine' in asked and '1 of its nodes' in asked
+    assert 'launch with process 4711 has this machine' in asked and 'nodes there (1)' in asked
     page.ask('document.getElementById("ask-yes").click()')
     page.until('!document.getElementById("ask").open')
     wait_until(lambda: story.deleted[1:] == [('planner', True)], timeout=10.0, what='the wish')
