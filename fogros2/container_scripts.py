@@ -88,7 +88,8 @@ while :; do
     $as_root $engine wait "$name" >/dev/null & waiting=$!
     wait $waiting || wait $waiting
     wait $logs
-    status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name")
+    # somebody else may have removed it
+    status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name") || status=137 restart=
     [ -z "$asked" ] || break
     case $restart in
         always|unless-stopped) ;;
@@ -119,7 +120,11 @@ passed_on() {
     first=$($as_root $engine inspect -f '{{.State.Pid}}' "$name" 2>/dev/null)
     node=$(cat "/proc/$first/task/$first/children" 2>/dev/null)
     if [ -n "$node" ]; then $as_root kill -s "$1" $node
-    else $as_root $engine rm -f "$name" >/dev/null 2>&1; fi
+    else
+        # it is about to start: its first process would take nothing but this
+        $as_root $engine kill "$name" >/dev/null 2>&1
+        $as_root $engine rm -f "$name" >/dev/null 2>&1
+    fi
     [ "$1" != TERM ] || [ -n "$late" ] || {
         (sleep "$grace"; $as_root $engine kill "$name") >/dev/null 2>&1 & late=$!; }
 }
@@ -152,11 +157,12 @@ $as_root $engine create --pull never --name "$name" --network host --ipc host --
 status=$?
 rm -f "$list"
 [ $status -eq 0 ] || exit 125
+status=130
 if [ -z "$asked" ]; then
     $as_root $engine start -a "$name" & client=$!
     while wait $client; [ -d /proc/$client ]; do :; done
+    status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name" 2>/dev/null) || status=130
 fi
-status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name" 2>/dev/null) || status=130
 $as_root $engine rm -f "$name" >/dev/null 2>&1
 [ -z "$late" ] || kill $late 2>/dev/null
 if [ "$status" -gt 128 ] && [ "$status" -lt 160 ]; then

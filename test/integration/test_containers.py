@@ -163,6 +163,16 @@ def test_one_that_was_told_to_end_is_not_started_again(image, launch, tmp_path):
     assert there(launch) == []
 
 
+def test_one_that_somebody_else_removes_is_not_waited_for(image, launch, tmp_path):
+    follower = started(limited(
+        image, 'sh', '-c', 'echo up; exec busybox sleep 1000', restart='always'), launch, tmp_path)
+    assert follower.stdout.readline() == 'up\n'
+    shell = LocalShell(Endpoint('local'), name='here')
+    shell.run(containers.remove(launch), timeout=60)
+    follower.communicate(timeout=60)
+    assert follower.returncode != 0
+
+
 # --- nodes in images -----------------------------------------------------------------------------
 
 def test_a_node_in_an_image_has_the_machine_s_variables_files_and_user(image, launch, tmp_path):
@@ -207,8 +217,11 @@ def test_a_node_in_an_image_that_is_killed_there_ended_so(image, launch, tmp_pat
     assert there(launch) == []
 
 
-def test_one_that_is_told_to_end_before_it_began_ends(image, launch, tmp_path):
+@pytest.mark.parametrize('moment', ['variables-*', 'container-there'])
+def test_one_that_is_told_to_end_before_it_began_ends(image, launch, tmp_path, moment):
     process = node(image, launch, tmp_path, 'sh', '-c', 'exec busybox sleep 1000')
+    wait_until(lambda: there(launch) if moment == 'container-there'
+               else list(tmp_path.glob(moment)), timeout=20, longest=0.01, what=moment)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
     assert process.returncode != 0
