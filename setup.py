@@ -7,10 +7,12 @@ colcon looks for no package below a package, so this one also installs the index
 """
 
 from pathlib import Path
+import xml.etree.ElementTree as ElementTree
 
 from setuptools import find_packages, setup
 
-VERSION = '0.1.0'
+#: The one place of the version is package.xml.
+VERSION = ElementTree.parse(Path(__file__).with_name('package.xml')).findtext('version')
 #: Packages whose nodes ``ros2 run`` and launch files find: package -> its executables.
 EXECUTABLES = {
     'fogros2_examples': [

@@ -1,16 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``colcon test`` runs: the quick part, unless it is told otherwise."""
+"""What colcon takes from the tree: one version, and the quick part of the tests."""
 
 from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+import re
 from types import SimpleNamespace
+import xml.etree.ElementTree as ElementTree
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 Source = pytest.Config.ArgsSource
+
+
+def test_there_is_one_version() -> None:
+    version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    assert version and re.fullmatch(r'\d+\.\d+\.\d+', version)
+    for name in ('fogros2_examples', 'image_transport_h264'):
+        assert ElementTree.parse(ROOT / name / 'package.xml').findtext('version') == version
+    assert f"\nVERSION = '{version}'\n" in (ROOT / 'ros2_embedded/setup.py').read_text()
+    # the newest part of the change log
+    (newest, *_) = re.findall(r'^(\d\S+)(?: \(.*\))?\n---', (ROOT / 'CHANGELOG.rst').read_text(),
+                              re.MULTILINE)
+    assert newest == version
 
 
 @pytest.mark.parametrize(('prefix', 'source', 'quick'), [

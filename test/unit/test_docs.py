@@ -121,6 +121,11 @@ def test_links(page):
             assert anchor in anchors, f'{page.name}: {target}'
 
 
+def test_all_figures_are_shown():
+    shown = set(re.findall(r'benchmarks/results/(.*\.md)', (ROOT / 'doc/figures.md').read_text()))
+    assert shown == {path.name for path in (ROOT / 'benchmarks/results').glob('*.md')}
+
+
 def test_the_site_is_built_without_a_warning():
     pytest.importorskip('myst_parser', reason='the extra "docs" is not installed')
     built = subprocess.run(
