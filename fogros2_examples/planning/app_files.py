@@ -13,6 +13,10 @@ import numpy
 from fogros2_examples.meshes import Floats, joined, Mesh, quaternion, turned
 from fogros2_examples.planning.scene import Scene
 
+#: How Assimp, with which OMPL.app reads meshes, turns what a file calls up to its y.
+_UPRIGHT = {'X_UP': numpy.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+            'Z_UP': numpy.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+
 
 class BadFile(ValueError):
     """A file is no problem of a rigid body in space; the text says which, and what is wrong."""
@@ -24,12 +28,14 @@ def loaded(path: Path) -> Scene:
 
     :raises BadFile: it can't be read, lacks something, or a mesh can't.
     """
-    # some have comments behind values, and keys with dots
-    parser = configparser.ConfigParser(inline_comment_prefixes=('#', ';'))
+    # some have comments behind values, and name a planner twice
+    parser = configparser.ConfigParser(
+        strict=False, interpolation=None, inline_comment_prefixes=('#', ';'))
     try:
         parser.read_string(path.read_text())
         problem = parser['problem']
-        body, walls = (_mesh(path.parent / problem[name].strip('"'))
+        # poses are those of the body's middle, as OMPL.app has it
+        body, walls = (_mesh(path.parent / problem[name].strip('"'), centred=name == 'robot')
                        for name in ('robot', 'world'))
         poses = [_pose(problem, name) for name in ('start', 'goal')]
         if 'volume.min.x' in problem:
@@ -44,7 +50,6 @@ def loaded(path: Path) -> Scene:
                       ) from error
     except ValueError as error:
         raise BadFile(f'{path}: {error}') from error
-    # poses in the file are of the mesh's frame; the bounds hold it as well
     return Scene(path.stem, body, walls, joined([]), low, high, poses[0], poses[1])
 
 
@@ -59,20 +64,52 @@ def _pose(problem: configparser.SectionProxy, name: str) -> Floats:
     return numpy.array([*(number(one) for one in 'xyz'), *quaternion(turned(axis, angle))])
 
 
-def _mesh(path: Path) -> Mesh:
+def _triangles(path: Path) -> tuple[Floats, Floats]:
+    """Return corners of triangles (n, 3, 3), and the vertices of which the file's mean is."""
     try:
+        if path.suffix.lower() == '.dae':
+            import collada
+
+            file = collada.Collada(str(path))
+            parts = [part.triangleset() if hasattr(part, 'triangleset') else part
+                     for geometry in file.scene.objects('geometry')
+                     for part in geometry.primitives()]
+            # the others are lines
+            parts = [part for part in parts if part.vertex_index is not None
+                     and part.vertex_index.ndim == 2 and part.vertex_index.shape[1] == 3]
+            triangles = numpy.concatenate(
+                [part.vertex[part.vertex_index] for part in parts] or [numpy.empty((0, 3, 3))])
+            # a corner counts once for each direction that its surface has there
+            normals = numpy.concatenate([
+                numpy.zeros((len(part.vertex_index), 3, 3)) if part.normal is None
+                else part.normal[part.normal_index] for part in parts] or [triangles])
+            both = numpy.concatenate([triangles, normals], axis=2).reshape(-1, 6)
+            turn = _UPRIGHT.get(str(file.assetInfo.upaxis), numpy.eye(3))
+            counted = numpy.unique(both.round(5), axis=0)[:, :3]
+            return triangles.astype(float) @ turn.T, counted @ turn.T
         import trimesh
+
+        found: Any = trimesh.load(path, force='mesh', process=False)
     except ImportError as error:
-        raise BadFile(f"{path} can't be read without trimesh: pip install trimesh pycollada"
-                      ) from error
+        raise BadFile(f"{path} can't be read: {error}; pip install trimesh pycollada") from error
+    vertices = numpy.array(found.vertices, float)
+    return vertices[numpy.array(found.faces, int)].reshape(-1, 3, 3), vertices
+
+
+def _mesh(path: Path, *, centred: bool) -> Mesh:
+    """Return a mesh; ``centred`` moves the mean of its vertices into the origin."""
     if not path.is_file():
         raise BadFile(f'there is no {path}')
     try:
-        # all parts of it, where they stand in its scene
-        found: Any = trimesh.load(path, force='mesh')
-    except (ValueError, LookupError, AttributeError, TypeError, OSError, ImportError,
+        triangles, counted = _triangles(path)
+    except BadFile:
+        raise
+    except (ValueError, LookupError, AttributeError, TypeError, OSError, SyntaxError,
             NotImplementedError) as error:
         raise BadFile(f"{path} can't be read as a mesh: {error}") from error
-    if not len(found.faces):
+    if not len(triangles):
         raise BadFile(f'{path} has no triangles')
-    return Mesh(numpy.array(found.vertices, float), numpy.array(found.faces, numpy.int32))
+    if centred:
+        triangles = triangles - counted.mean(axis=0)
+    vertices, indices = numpy.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    return Mesh(vertices, indices.reshape(-1, 3).astype(numpy.int32))

@@ -77,7 +77,9 @@ def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
     covers = _covers(scene, walls)
     parts = [walls[~covers], floor]
     colours = [numpy.tile(WALLS, (len(parts[0]), 1)), numpy.tile(FLOOR, (len(floor), 1))]
-    poses = spaced(path, 0.9) if len(path) else numpy.array([scene.start, scene.goal])
+    # 7 % of a room, whatever the unit
+    apart = float(numpy.linalg.norm(scene.high - scene.low)) / 14
+    poses = spaced(path, apart) if len(path) else numpy.array([scene.start, scene.goal])
     for number, pose in enumerate(poses):
         body = scene.at(pose).corners
         share = number / (len(poses) - 1)
@@ -91,7 +93,7 @@ def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
         over, _ = shaded(camera, numpy.concatenate(parts), numpy.concatenate(colours))
         image = numpy.asarray(cv2.addWeighted(image, 0.5, over, 0.5, 0.0), numpy.uint8)
     if len(path):
-        _draw_way(image, depth, camera, between(path, 0.05)[:, :3])
+        _draw_way(image, depth, camera, between(path, apart / 18)[:, :3], 0.8 * apart)
     for pose, word, colour in ((scene.start, 'start', FIRST), (scene.goal, 'goal', LAST)):
         x, y = map(int, camera.seen(pose[:3])[0])
         for thickness, shade in ((6, (255, 255, 255)), (2, tuple(map(float, 0.7 * colour)))):
@@ -103,25 +105,31 @@ def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
 
 
 def _covers(scene: Scene, corners: Floats) -> NDArray[numpy.bool_]:
-    """Return which triangles are floors of upper storeys, or ceilings: level, large, high up."""
+    """Return which triangles are floors of upper storeys, or ceilings: level, high up, wide."""
     normals = numpy.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = numpy.linalg.norm(normals, axis=1) / 2
     extent = scene.high - scene.low
     level = numpy.abs(normals[:, 2]) > 1.98 * area
-    found: NDArray[numpy.bool_] = level & (area > 0.02 * extent[0] * extent[1]) & (
-        corners[:, :, 2].min(axis=1) > scene.low[2] + 0.2 * extent[2])
+    lowest = corners[:, :, 2].min(axis=1)
+    found = numpy.asarray(level & (lowest > scene.low[2] + 0.2 * extent[2]), bool)
+    # the tops of walls are level too, and cover little
+    heights = numpy.rint(lowest / extent[2] * 1000)
+    for height in numpy.unique(heights[found]):
+        same = found & (heights == height)
+        if area[same].sum() < 0.3 * extent[0] * extent[1]:
+            found &= ~same
     return found
 
 
 def _draw_way(image: NDArray[numpy.uint8], depth: NDArray[numpy.float32], camera: Camera,
-              points: Floats) -> None:
-    """Draw a line through points (n, 3), pale where things are before it."""
+              points: Floats, thick: float) -> None:
+    """Draw a line through points (n, 3), pale where things are ``thick`` before it."""
     pixels, depths = camera.seen(points)
     corners = numpy.round(pixels * 16).astype(numpy.int32)
     limits = [camera.width - 1, camera.height - 1]
     columns, rows = numpy.clip(numpy.round(pixels).astype(int), 0, limits).T
     before = depth[rows, columns]
-    hidden = (before > 0) & (before < depths - 0.7)
+    hidden = (before > 0) & (before < depths - thick)
     pale = image.copy()
     cv2.polylines(pale, [corners], False, LINE, 2, cv2.LINE_AA, 4)
     cv2.addWeighted(pale, 0.35, image, 0.65, 0.0, dst=image)

@@ -124,13 +124,14 @@ class PlanningClient(Node):
         return path
 
     def _show(self, scene: Scene, path: Floats) -> None:
+        apart = float(numpy.linalg.norm(scene.high - scene.low)) / 14
         self.motions.publish(MarkerArray(markers=[
             mesh_marker(scene.body, 'motion', number, scene.name, pose_message(pose),
-                        COLOURS['body']) for number, pose in enumerate(spaced(path, 0.9))]))
+                        COLOURS['body']) for number, pose in enumerate(spaced(path, apart))]))
         if not self.picture:
             return
         length = float(numpy.linalg.norm(numpy.diff(path[:, :3], axis=0), axis=1).sum())
-        drawn = picture(scene, path, f'{scene.name}: a path of {length:.1f} m')
+        drawn = picture(scene, path, f'{scene.name}: a path of {length:.1f}')
         height, width = drawn.shape[:2]
         self.pictures.publish(Image(height=height, width=width, encoding='bgr8', step=3 * width,
                                     data=array.array('B', drawn.tobytes())))

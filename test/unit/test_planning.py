@@ -194,7 +194,9 @@ volume.max.x = 4
 volume.max.y = 2
 volume.max.z = 2
 [planner]
-planner=geometric.RRTConnect
+rrt=
+aps=
+aps=
 """
 
 
@@ -215,6 +217,7 @@ def test_a_problem_of_ompl_app(tmp_path, racer):
     assert scene.name == 'room' and len(scene.walls.triangles) == len(room.walls.triangles)
     assert scene.high.tolist() == [4, 2, 2]
     assert rotation(scene.start[3:]) == pytest.approx(turned((0, 0, 1), 1.5))
+    assert scene.body.vertices.mean(axis=0) == pytest.approx(numpy.zeros(3), abs=1e-9)
     racer.enter(scene)
     assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
     for words, text in [
@@ -229,3 +232,19 @@ def test_a_problem_of_ompl_app(tmp_path, racer):
             loaded(path)
     with pytest.raises(BadFile, match="can't be read"):
         loaded(tmp_path / 'missing.cfg')
+
+
+@pytest.mark.parametrize('up, vertex', [('Y_UP', (1, 2, 3)), ('Z_UP', (1, 3, -2))])
+def test_collada_is_read_as_ompl_app_reads_it(tmp_path, up, vertex):
+    trimesh = pytest.importorskip('trimesh', reason='trimesh is in the extra applications')
+    pytest.importorskip('collada', reason='pycollada is in the extra applications')
+    mesh = box((0, 0, 0), (1, 2, 3))
+    text = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).export(file_type='dae')
+    (tmp_path / 'walls.dae').write_bytes(text.replace(b'Y_UP', up.encode()))
+    assert up in (tmp_path / 'walls.dae').read_text()
+    write(tmp_path / 'body.obj', mesh)
+    path = tmp_path / 'room.cfg'
+    path.write_text(CFG.format(robot='body.obj', theta=0, axis=1).replace('.obj\nst', '.dae\nst'))
+    walls = loaded(path).walls
+    assert numpy.ptp(walls.vertices, axis=0) == pytest.approx(numpy.abs(vertex))
+    assert any(corner == pytest.approx(vertex) for corner in walls.vertices)
