@@ -14,7 +14,8 @@ def generate_launch_description():
              'stereo': ('true', 'whether the synthetic camera has two eyes, or sees depth'),
              'width': ('640', 'of its images'), 'height': ('480', 'of its images'),
              'frames': ('200', 'after which the launch ends; 0 for all that a dataset has'),
-             'rate': ('10.0', 'frames per second'),
+             'rate': ('10.0', 'frames per second, at most'),
+             'wait': ('true', 'whether a frame waits for the pose of the one before'),
              'picture': ('', 'a file to draw the trajectory in'),
              'results': ('', 'a file for the figures, as JSON')}
     return FogROSLaunchDescription([

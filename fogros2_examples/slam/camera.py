@@ -4,8 +4,9 @@ The robot's side of the SLAM example: a camera that also measures what comes bac
 
 Publishes ``camera/image`` and ``camera/depth``, or ``camera/right/image``, each with its camera
 info, all stamped alike; takes ``pose`` and ``path``. A round trip is the time from the
-publication of a frame to the pose that bears its stamp. At the end it says how long those took
-and how good the poses were, and draws the trajectory.
+publication of a frame to the pose that bears its stamp. With ``wait`` a frame waits for the pose
+of the one before, though not for ever: who is slow is seen to be slow, and doesn't get lost.
+At the end it says how long those took and how good the poses were, and draws the trajectory.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
 from fogros2_examples.slam import messages, sources
@@ -53,6 +54,7 @@ class SlamCamera(Node):
         stereo = bool(self.declare_parameter('stereo', True).value)
         seed = int(self.declare_parameter('seed', 1).value)
         rate = float(self.declare_parameter('rate', 10.0).value)
+        self.patient = bool(self.declare_parameter('wait', True).value)
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
         self.source = (sources.dataset(Path(self.folder), count) if self.folder
                        else sources.synthetic(width, height, count, stereo, seed))
@@ -63,6 +65,7 @@ class SlamCamera(Node):
         self.sent: dict[int, float] = {}
         self.truth: dict[int, Array] = {}
         self.answered: dict[int, float] = {}
+        self.computed: dict[int, float] = {}
         self.live: dict[int, Array] = {}
         self.final: dict[int, Array] = {}
         self.deadline = math.inf
@@ -74,6 +77,7 @@ class SlamCamera(Node):
         self.create_subscription(PoseStamped, 'pose', self._take_pose, 10)
         self.create_subscription(PathMessage, 'path', self._take_path, QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.create_subscription(TimeReference, 'computing', self._take_time, 10)
         self.create_timer(1 / rate, self._shoot)
         self.get_logger().info(f'{self.source.count} frames of {self.source.camera.width}x'
                                f'{self.source.camera.height} at {rate:g} Hz')
@@ -87,9 +91,13 @@ class SlamCamera(Node):
         if not self.sent and not self.images.get_subscription_count():
             return
         if self.deadline < math.inf:
-            done = self.sent.keys() <= self.final.keys()
-            self.ended = done or time.monotonic() > self.deadline
+            last = next(reversed(self.sent), None)
+            self.ended = last in self.final or time.monotonic() > self.deadline
             return
+        if self.patient and self.sent:
+            last, when = next(reversed(self.sent.items()))
+            if last not in self.answered and time.perf_counter() - when < PATIENCE / 2:
+                return
         if not self.next.done():
             return  # the disk is slower than the rate
         shot = self.next.result()
@@ -123,14 +131,17 @@ class SlamCamera(Node):
             self.answered.setdefault(stamp, now)
             self.live[stamp] = messages.matrix(pose.pose)
 
+    def _take_time(self, taken: TimeReference) -> None:
+        self.computed[messages.nanoseconds(taken.header.stamp)] = (
+            messages.nanoseconds(taken.time_ref) / 1e9)
+
     def _take_path(self, path: PathMessage) -> None:
         poses = ((messages.nanoseconds(p.header.stamp), p.pose) for p in path.poses)
         self.final = {stamp: messages.matrix(pose) for stamp, pose in poses if stamp in self.sent}
 
     def close(self) -> None:
-        """End the reading thread, then the node."""
+        """End the reading thread."""
         self.reader.shutdown(cancel_futures=True)
-        self.destroy_node()
 
     def report(self) -> None:
         """Say what was measured, write it to ``results``, draw ``picture``."""
@@ -150,6 +161,7 @@ class SlamCamera(Node):
         if self.results:
             Path(self.results).write_text(json.dumps({
                 'sent': len(self.sent), 'round_trips': [float(trip) for trip in trips],
+                'computing': [self.computed.get(stamp, math.nan) for stamp in self.answered],
                 **{f'{name}_{error}': getattr(one, error)
                    for name, one in (('live', live), ('final', final)) if one is not None
                    for error in ('ate', 'rpe')}}))

@@ -4,12 +4,14 @@ Visual SLAM as a node.
 
 Takes ``camera/image`` with ``camera/camera_info``, and with the same stamps either
 ``camera/depth`` or ``camera/right/image`` with its ``camera_info``: whichever comes. Publishes,
-under the stamp of the image, ``pose`` and ``/tf``; ``slam_state``; and, as the map grows,
+under the stamp of the image, ``pose`` and ``/tf``, and ``computing``, the time that it took;
+``slam_state``; and, as the map grows,
 ``path`` and the cloud ``map_points``. World and camera are called ``map`` and the image's frame.
 """
 
 from __future__ import annotations
 
+import time
 from typing import Any, Optional
 
 from geometry_msgs.msg import PoseStamped, TransformStamped
@@ -19,7 +21,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, TimeReference
 from std_msgs.msg import Header, String
 from tf2_msgs.msg import TFMessage
 
@@ -50,6 +52,7 @@ class SlamNode(Node):
         self.frame = ''
         self.poses = self.create_publisher(PoseStamped, 'pose', 10)
         self.transforms = self.create_publisher(TFMessage, '/tf', 10)
+        self.times = self.create_publisher(TimeReference, 'computing', 10)
         self.states = self.create_publisher(String, 'slam_state', KEPT)
         self.paths = self.create_publisher(Path, 'path', KEPT)
         self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
@@ -88,6 +91,7 @@ class SlamNode(Node):
 
     def _process(self, image: Image, other: str, second: Image) -> None:
         """Track a frame and tell where it was; then put it into the map."""
+        begin = time.perf_counter()
         try:
             slam = self._algorithm(other)
             if slam is None:
@@ -99,8 +103,11 @@ class SlamNode(Node):
                    else {'depth': messages.depth(second)}))
         except ValueError as error:
             # what a driver sends is no reason to end: the next one may be better
-            self._say(State.LOST if self.slam else State.STARTING, str(error))
+            started = self.slam is not None and self.slam.state is not State.STARTING
+            self._say(State.LOST if started else State.STARTING, str(error))
             return
+        took = messages.time(round(1e9 * (time.perf_counter() - begin)))
+        self.times.publish(TimeReference(header=image.header, time_ref=took, source='slam'))
         self._publish(image.header, tracked)
         self.changed = slam.extend(tracked) or self.changed or tracked.pose is not None
         self.frame = image.header.frame_id

@@ -45,14 +45,16 @@ def camera(width: int = 640, height: int = 480) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, 0.12)
 
 
-def trajectory(count: int, turns: float = 1.15) -> list[Array]:
+def trajectory(count: int, lap: int = 174) -> list[Array]:
     """
-    Return the poses of a hand-held camera: once around the room's middle and on, so that it comes
+    Return the poses of a hand-held camera: around the room's middle, and on, so that it comes
     back to where it has been.
+
+    :param lap: poses for once around.
     """
     poses = []
     for number in range(count):
-        phi = 2 * math.pi * turns * number / max(1, count - 1)
+        phi = 2 * math.pi * number / lap
         radius = 1.3 + 0.3 * math.cos(3.2 * phi)
         position = numpy.array([3.0 + radius * math.cos(phi), 2.5 + 0.8 * radius * math.sin(phi),
                                 1.35 + 0.12 * math.sin(2.3 * phi)])

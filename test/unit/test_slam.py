@@ -21,7 +21,7 @@ from fogros2_examples.slam.pose import solve  # noqa: E402
 from fogros2_examples.slam.tracking import Slam, State  # noqa: E402
 
 WIDTH, HEIGHT = 320, 240
-FRAMES = 100
+FRAMES, LAP = 100, 87
 
 
 @pytest.fixture(scope='module')
@@ -33,7 +33,7 @@ def made() -> Any:
 def walk(made: Any) -> Any:
     """A walk through the room with an RGB-D camera."""
     return [(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), depth, pose)
-            for number, pose in enumerate(room.trajectory(FRAMES))
+            for number, pose in enumerate(room.trajectory(FRAMES, LAP))
             for image, depth in [made.colour_and_depth(pose, number)]]
 
 
@@ -79,7 +79,7 @@ def test_depth_is_the_distance(made: Any, pose: Any, metres: float) -> None:
 
 
 def test_frames_are_always_the_same_and_neighbours_differ(made: Any) -> None:
-    pose = room.trajectory(50)[7]
+    pose = room.trajectory(50, LAP)[7]
     left, right = made.pair(pose, 3)
     assert (made.pair(pose, 3)[0] == left).all()
     assert (made.pair(pose, 4)[0] != left).any()
@@ -92,7 +92,7 @@ def test_frames_are_always_the_same_and_neighbours_differ(made: Any) -> None:
 
 def test_features_are_spread_and_have_depths(made: Any) -> None:
     """From stereo images within the accuracy that a fifth of a pixel gives, nearly all of them."""
-    camera, pose = made.camera, room.trajectory(50)[10]
+    camera, pose = made.camera, room.trajectory(50, LAP)[10]
     _, exact = made.exact(pose)
     left, right = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in made.pair(pose, 0))
     plain = Extractor(camera, 500).extract(left)
@@ -195,7 +195,7 @@ def test_a_walk_with_depth(made: Any, walk: Any) -> None:
 
 def test_a_walk_with_two_eyes(made: Any) -> None:
     slam = Slam(made.camera)
-    poses = room.trajectory(FRAMES)[:40]
+    poses = room.trajectory(40, LAP)
     for number, pose in enumerate(poses):
         left, right = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in made.pair(pose, number))
         tracked = slam.track(number, left, right=right)
