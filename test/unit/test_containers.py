@@ -325,6 +325,21 @@ def test_a_machine_without_an_engine_and_without_apt_says_so():
         beside(shell, 'docker run image').start()
 
 
+@pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])
+def test_a_computer_that_stays_keeps_no_container(survives, used):
+    shell = FakeShell(handlers={'sh': lambda command: Result(0, 'podman\n', '')})
+    there, undos, tidied = beside(shell, provider=FakeProvider()), [], []
+    there._job.survives = survives
+    there._job.undoing = lambda name, undo: undos.append(undo)
+    there._job.tidy = lambda shell, commands: tidied.extend(commands)
+    there.start()
+    if used:
+        there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
+    (undo,) = undos
+    undo()
+    assert tidied == ([containers.remove('abc')] if survives and used else [])
+
+
 def test_scripts_are_shell():
     for script in ('FIND', 'INSTALL', 'IMAGE', 'RUN', 'FOLLOW', 'NODE', 'INSIDE', 'REMOVE'):
         subprocess.run(['sh', '-n'], input=getattr(container_scripts, script).encode(), check=True)
