@@ -31,10 +31,8 @@ def generate_launch_description():
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='slam', package='fogros2_examples', executable='slam', output='screen',
-                  stream_topics=[
-                      ('/camera/image', LaunchConfiguration('transport')),
-                      ('/camera/right/image', LaunchConfiguration('transport')),
-                      ('/camera/depth', 'h264')]),
+                  stream_topics=[(f'/camera/{name}', LaunchConfiguration('transport')) for name in
+                                 ('image', 'right/image')] + [('/camera/depth', 'h264')]),
         Node(package='fogros2_examples', executable='slam_camera', output='screen',
              parameters=[{name: LaunchConfiguration(name) for name in shown}],
              on_exit=Shutdown()),

@@ -80,7 +80,7 @@ def twin(source):
         'FogROSLaunchDescription', 'LaunchDescription').replace('CloudNode', 'Node')
 
 
-@pytest.mark.parametrize('name', ['grasp', 'planning'])
+@pytest.mark.parametrize('name', ['grasp', 'planning', 'slam'])
 def test_a_launch_file_is_ten_lines_longer_than_its_twin_at_most(name, launch, tmp_path):
     source = launch_file(name).read_text()
     here = twin(source)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ORB-SLAM2 or 3 from a container image of yours, in the place of the example's own SLAM."""
+
+from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    """Describe the two; names are those of the usual ROS 2 wrapper of ORB-SLAM3."""
+    asked = {'image': (None, 'with ROS 2 and ORB-SLAM, such as me/orb-slam3:jazzy'),
+             'package': ('orbslam3', 'in the image'), 'executable': ('stereo', 'of that package'),
+             'vocabulary': ('/ORB_SLAM3/Vocabulary/ORBvoc.txt', 'in the image'),
+             'settings': ('/ORB_SLAM3/fogros2_room.yaml', "the camera's, in the image"),
+             'left': ('camera/left', 'its topic for the image, or the left one'),
+             'right': ('camera/right', 'its topic for the right image'),
+             'depth': ('camera/depth', 'its topic for the depth image'),
+             'pose': ('camera/pose', 'its topic for poses (geometry_msgs/PoseStamped)')}
+    shown = {'dataset': ('', "a folder in TUM's RGB-D format, '' for the synthetic room"),
+             'stereo': ('true', 'whether the synthetic camera has two eyes, or sees depth'),
+             'frames': ('200', 'after which the launch ends; 0 for all that a dataset has'),
+             'rate': ('10.0', 'frames per second, at most'),
+             'picture': ('', 'a file to draw the trajectory in'),
+             'results': ('', 'a file for the figures, as JSON')}
+    names = [(LaunchConfiguration('left'), '/camera/image'),
+             (LaunchConfiguration('right'), '/camera/right/image'),
+             (LaunchConfiguration('depth'), '/camera/depth'),
+             (LaunchConfiguration('pose'), '/pose')]
+    return FogROSLaunchDescription([
+        DeclareLaunchArgument('machine', default_value='container',
+                              choices=['container', 'aws', 'kubernetes'],
+                              description='where SLAM runs'),
+        DeclareLaunchArgument('transport', default_value='h264',
+                              description='of the images there: h264, compressed or raw'),
+        *(DeclareLaunchArgument(name, default_value=value, description=what)
+          for name, (value, what) in (asked | shown).items()),
+        FogMachine(LaunchConfiguration('machine'), {'name': 'slam'}),
+        CloudNode(machine='slam', image=LaunchConfiguration('image'), output='screen',
+                  package=LaunchConfiguration('package'),
+                  executable=LaunchConfiguration('executable'), remappings=names,
+                  arguments=[LaunchConfiguration('vocabulary'), LaunchConfiguration('settings'),
+                             'false'],
+                  stream_topics=[(f'/camera/{name}', LaunchConfiguration('transport')) for name in
+                                 ('image', 'right/image')] + [('/camera/depth', 'h264')]),
+        Node(package='fogros2_examples', executable='slam_camera', output='screen',
+             parameters=[{name: LaunchConfiguration(name) for name in shown}],
+             on_exit=Shutdown()),
+    ])
