@@ -72,10 +72,12 @@ class Containers:
 
     def _get(self, images: Iterable[str]) -> dict[str, str]:
         """Return what the engine knows images as that nodes run in."""
+        found = dict.fromkeys(images, '')
+        if not found:
+            return found
         rmw = self._job.launch.dds().rmw
-        found = {}
         with self._lock:
-            for image in dict.fromkeys(images):
+            for image in found:
                 if (image, rmw) not in self._images:
                     self._job.provider.check_containers(self._job.spec)
                     with self._job.step(f'image {image}'):
