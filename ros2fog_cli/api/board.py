@@ -53,6 +53,4 @@ class Board:
         self._live.delete(machine, force=force)
 
     def _look_at_graphs(self, live: Live) -> dict[str, Any]:
-        if self._graphs is None:
-            return {}
-        return self._graphs.update(live.running() if live.watched else [], live.names())
+        return {} if self._graphs is None else self._graphs.look(live)

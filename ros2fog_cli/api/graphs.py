@@ -17,6 +17,7 @@ from typing import Any, Optional
 from fogros2.errors import FogError
 from fogros2.store import Record, Store
 from ros2fog_cli.api import reach
+from ros2fog_cli.api.live import Live
 
 #: The program; a process of its own, as a launch has a DDS configuration of its own.
 _PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
@@ -58,9 +59,9 @@ class Graph:
         """The last thing that it said before it ended."""
         return self._said[-1] if self._said else f'exit status {self._process.returncode}'
 
-    def know(self, machines: dict[str, tuple[str, ...]]) -> None:
-        """Tell it what runs where."""
-        line = json.dumps({'machines': machines})
+    def know(self, machines: dict[str, tuple[str, ...]], *, pictures: bool = True) -> None:
+        """Tell it what runs where, and whether pictures are wanted."""
+        line = json.dumps({'machines': machines, 'pictures': pictures})
         if line != self._told and self._process.stdin is not None:
             self._told = line
             with contextlib.suppress(OSError, ValueError):
@@ -112,12 +113,20 @@ class Graph:
 
 
 class Graphs:
-    """The programs of all launches that run."""
+    """
+    The programs of all launches that run.
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    :param pictures: whether they take pictures.
+    """
+
+    def __init__(self, store: Store, *, pictures: bool = True) -> None:
+        self._store, self._pictures = store, pictures
         self._graphs: dict[str, Graph] = {}
         self._refused: dict[str, tuple[float, str]] = {}
+
+    def look(self, live: Live) -> dict[str, Any]:
+        """Return what belongs to a live state: nothing, and no program, while nobody looks."""
+        return self.update(live.running() if live.watched else [], live.names())
 
     def update(
         self, records: list[Record], machines: dict[str, tuple[str, ...]],
@@ -136,7 +145,8 @@ class Graphs:
         for launch, several in launches.items():
             graph = self._graph(launch, several[0])
             if graph is not None:
-                graph.know({record.name: machines.get(record.name, ()) for record in several})
+                graph.know({record.name: machines.get(record.name, ()) for record in several},
+                           pictures=self._pictures)
         trouble = [why for launch, (_, why) in self._refused.items()
                    if launch in launches and launch not in self._graphs]
         return {

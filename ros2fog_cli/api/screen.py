@@ -56,7 +56,8 @@ def frame(
     """
     Return a screenful: no more lines than ``rows``, none longer than ``columns``.
 
-    :param machine: as :func:`ros2fog_cli.api.live.machine_json` has it.
+    :param machine: as :func:`ros2fog_cli.api.live.machine_json` has it, with ``streams`` and
+        ``topics`` of its launch where they are known.
     :param lines: of its log, of which the last ones are shown.
     :param now: in seconds since the epoch.
     """
@@ -77,6 +78,10 @@ def frame(
             (str(node['name']), str(node['state']), str(node['pid'] or '-'),
              '-' if node['returncode'] is None else str(node['returncode']),
              str(node['restarts'] or 0)) for node in machine['nodes']], column=1)
+    crossing = _crossing(machine)
+    if crossing:
+        parts.append(('', ''))
+        parts += _table(('TOPIC', 'FROM', 'TO', 'HZ', 'BANDWIDTH'), crossing, column=0)
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
@@ -121,6 +126,23 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
         yield 'agent', (f"since {duration(max(0.0, now - (agent['since'] or now)))}, "
                         f"{size(agent['rss'] or 0)}, heartbeat "
                         + ('-' if beat is None else f'{duration(beat)} ago'))
+
+
+def _crossing(machine: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
+    """Return a row for each topic that crosses the VPN to or from a machine."""
+    found = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
+             for one in machine.get('streams', [])]
+    found += [(one['topic'], one['from'], one['to'], one) for one in machine.get('topics', [])]
+    return [
+        (name, _hosts(sources), _hosts(targets),
+         '-' if one['rate'] is None else f"{one['rate']:.1f}",
+         '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s")
+        for name, sources, targets, one in found
+        if machine['name'] in (*sources, *targets)]
+
+
+def _hosts(names: Sequence[str]) -> str:
+    return ', '.join(name or 'robot' for name in names)
 
 
 def _rate(rate: Any) -> str:

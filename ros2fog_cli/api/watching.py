@@ -10,8 +10,9 @@ import sys
 import time
 from typing import Any, Optional
 
-from fogros2.store import check_name
+from fogros2.store import check_name, Store
 from ros2fog_cli.api import reach, screen
+from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.live import Live, PRESENT
 
 _WAITING = 'no such machine yet'
@@ -19,15 +20,19 @@ _WAITING = 'no such machine yet'
 
 def watch(
     name: str, *, interval: float = 1.0, regions: Optional[list[str]] = None,
-    as_json: bool = False,
+    as_json: bool = False, topics: bool = False,
 ) -> int:
     """
     Show a machine's state each ``interval`` seconds; of a pipe or a file, what changes.
 
     :param as_json: a line of JSON for each change instead.
+    :param topics: whether a node joins the launch, for rates of topics.
     :raises ConfigurationError: no machine can be called so.
     """
-    live = Live(name=check_name(name), regions=regions, interval=max(0.5, interval))
+    check_name(name)
+    graphs = Graphs(Store(), pictures=False) if topics else None
+    live = Live(name=name, regions=regions, interval=max(0.5, interval),
+                more=graphs.look if graphs is not None else None)
     live.start()
     try:
         if as_json or not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
@@ -40,11 +45,16 @@ def watch(
         reach.hush()
     finally:
         live.close()
+        if graphs is not None:
+            graphs.close()
     return 0
 
 
 def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
-    return next((one for one in state.get('machines', []) if one['name'] == name), None)
+    found = next((one for one in state.get('machines', []) if one['name'] == name), None)
+    return None if found is None else {
+        **found, **{key: state[key] for key in ('streams', 'topics') if key in state},
+        'problems': [*found['problems'], *state.get('graph_trouble', [])]}
 
 
 def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:

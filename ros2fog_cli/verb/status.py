@@ -22,6 +22,9 @@ class StatusVerb(VerbExtension):
         add_json(parser)
         parser.add_argument('--watch', '-w', action='store_true',
                             help='go on until Ctrl-C; also before the machine is there')
+        parser.add_argument('--topics', action='store_true',
+                            help='with --watch: rates of topics across the VPN, too, by a node '
+                                 'that joins the launch')
         parser.add_argument('--interval', type=float, default=1.0, metavar='SECONDS',
                             help='of --watch, from one look to the next (1)')
 
@@ -35,7 +38,10 @@ class StatusVerb(VerbExtension):
                 raise ConfigurationError(f'--interval {args.interval:g} makes no sense',
                                          'give 0.1 to 3600 seconds')
             return watch(args.name, interval=args.interval, regions=args.region,
-                         as_json=args.json)
+                         as_json=args.json, topics=args.topics)
+        if args.topics:
+            raise ConfigurationError('--topics is for --watch: a rate takes a while',
+                                     'add --watch')
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'agent': None}
         problems: list[str] = []

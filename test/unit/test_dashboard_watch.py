@@ -193,6 +193,23 @@ def test_a_machine_as_a_screenful() -> None:
     assert screen.frame(gone, [], 1100.0)[0] == 'planner (aws i-1)  gone  50 s'
 
 
+def test_topics_across_the_vpn_in_a_screenful() -> None:
+    shown = '\n'.join(screen.frame(machine(
+        streams=[{'topic': '/camera', 'transport': 'h264', 'source': '', 'target': 'planner',
+                  'rate': 29.96, 'bandwidth': 81_000.0},
+                 {'topic': '/map', 'transport': 'h264', 'source': 'one', 'target': 'two',
+                  'rate': None, 'bandwidth': None}],
+        topics=[{'topic': '/odom', 'from': ['planner', 'one'], 'to': [''], 'rate': None,
+                 'bandwidth': None}]), [], 1100.0, rows=40))
+    assert re.search(r'^/camera \(h264\) +robot +planner +30\.0 +81\.0 kB/s$', shown, re.MULTILINE)
+    assert re.search(r'^/odom +planner, one +robot +- +-$', shown, re.MULTILINE)
+    assert '/map' not in shown
+
+
+def test_topics_take_a_watch() -> None:
+    assert 'is for --watch' in str(main(argv=['fog', 'status', 'planner', '--topics']))
+
+
 def test_what_a_node_prints_commands_no_terminal() -> None:
     bad = '\x1b]0;owned\x07\x1b[2J\x9b31mred\r\n'
     lines = [LogLine(1, 1.0, f'n{bad}', True, f'before {bad}after')]

@@ -2,9 +2,9 @@
 """
 The program that joins a launch for the dashboard, while somebody looks.
 
-It takes lines of JSON, ``{"machines": {name: [nodes]}}``, on its standard input and ends with it.
-It prints lines of JSON: ``{"streams": [...], "topics": [...]}`` and, with each new picture,
-``{"picture": topic, "number": n, "data": base64}``.
+It takes lines of JSON, ``{"machines": {name: [nodes]}, "pictures": true}``, on its standard input
+and ends with it. It prints lines of JSON: ``{"streams": [...], "topics": [...]}`` and, with each
+new picture, ``{"picture": topic, "number": n, "data": base64}``.
 
 A picture is taken from the image topic on the robot, where a streamed topic keeps its own name:
 that costs no decoding, and nothing crosses the VPN for it. It is one message a second: the
@@ -88,13 +88,15 @@ class GraphNode(Node):
     def __init__(self) -> None:
         super().__init__(OWN, enable_rosout=False, start_parameter_services=False)
         self._hosts = Hosts({})
+        self._pictures = False
         self._ears: dict[str, Optional[_Ear]] = {}
         self._cameras: dict[str, Camera] = {}
         self.create_timer(LOOK, self._look)
 
-    def know(self, machines: dict[str, list[str]]) -> None:
-        """Take what runs where; from any thread."""
+    def know(self, machines: dict[str, list[str]], *, pictures: bool) -> None:
+        """Take what runs where, and whether pictures are wanted; from any thread."""
         self._hosts = Hosts(machines)
+        self._pictures = pictures
 
     def tell(self, what: dict[str, Any]) -> None:
         """Print a line; whoever no longer reads it has closed the standard input, too."""
@@ -116,7 +118,7 @@ class GraphNode(Node):
             del self._ears[name]
         for name, (kind, heard) in list(wanted.items())[:MOST]:
             self._listen(name, kind, heard=heard)
-        if streamed or self._cameras:
+        if self._pictures and (streamed or self._cameras):
             self._take_pictures(topics, streamed)
         self.tell({'streams': [self._stream(one) for one in streamed],
                    'topics': [self._crossing(one) for one in others]})
@@ -182,7 +184,8 @@ class GraphNode(Node):
 def _take_lines(node: GraphNode, ended: functools.partial[None]) -> None:
     for line in sys.stdin:
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
-            node.know(json.loads(line)['machines'])
+            told = json.loads(line)
+            node.know(told['machines'], pictures=bool(told['pictures']))
     ended()
 
 
