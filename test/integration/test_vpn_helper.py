@@ -278,7 +278,7 @@ def without_product(copy: Copy, user: str) -> bool:
 
 
 PRODUCT = """\
-import json, sys
+import json, os, sys
 from pathlib import Path
 from fogros2.deploy import check_robot, Launch
 from fogros2.store import Store
@@ -286,13 +286,15 @@ check_robot()
 launch = Launch(store=Store(Path(sys.argv[1])))
 robot = launch.robot_vpn()
 robot.ensure()
-print(json.dumps([robot.interface.name, robot.interface.key_file]), flush=True)
+print(json.dumps([robot.interface.name, robot.interface.key_file, os.getpid()]), flush=True)
 sys.stdin.readline()
 print(json.dumps([str(error) for error in launch.down()]))
 """
 
 
-def test_a_launch_takes_it_by_itself(copy: Copy) -> None:
+@pytest.mark.parametrize('killed', [False, True])
+def test_a_launch_takes_it_by_itself(copy: Copy, killed: bool) -> None:
+    """Up and down, or what is left of one that was killed goes by ``ros2 fog gc``."""
     if without_product(copy, 'fogada'):
         pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
     words = process.argv(Command(tuple(copy.argv(
@@ -302,15 +304,23 @@ def test_a_launch_takes_it_by_itself(copy: Copy) -> None:
     timer = threading.Timer(60.0, child.kill)
     timer.start()
     try:
-        name, key = json.loads(child.stdout.readline())
+        name, key, pid = json.loads(child.stdout.readline())
         assert key == f'/run/fogros2-vpn/{name}/key' and name in copy.links()
-        rest, _ = child.communicate('\n')
-        assert json.loads(rest) == []
+        if killed:
+            copy.run('fogada', 'kill', '-9', str(pid), check=True)
+            child.wait(10.0)
+            said = copy.run('fogada', 'env', 'FOGROS2_STATE_HOME=/home/fogada/state', 'ros2',
+                            'fog', 'gc')
+            assert said.returncode == 0, said
+        else:
+            rest, _ = child.communicate('\n')
+            assert json.loads(rest) == []
         assert name not in copy.links()
     finally:
         timer.cancel()
         child.kill()
         child.communicate()
+
 
 LAUNCH = """\
 from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
