@@ -12,6 +12,7 @@ At the end it says how long those took and how good the poses were, and draws th
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -174,6 +175,10 @@ class SlamCamera(Node):
     def _accuracy(self, estimate: dict[int, Array]) -> Optional[Accuracy]:
         both = sorted(estimate.keys() & self.truth.keys())
         if len(both) < FEWEST:
+            return None
+        if importlib.util.find_spec('evo') is None:
+            self.get_logger().warning(
+                "no errors and no picture: 'pip install evo' brings what tells them", once=True)
             return None
         return accuracy([self.truth[s] for s in both], [estimate[s] for s in both])
 

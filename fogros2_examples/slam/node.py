@@ -23,10 +23,14 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, TimeReference
 from std_msgs.msg import Header, String
-from tf2_msgs.msg import TFMessage
 
 from fogros2_examples.slam import messages
 from fogros2_examples.slam.tracking import Slam, State, Tracked
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # it is no part of the smallest ROS 2
+    TFMessage = None
 
 #: The newest alone: who is slow is to be late for one image, not for all.
 NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -51,7 +55,7 @@ class SlamNode(Node):
         self.changed = False
         self.frame = ''
         self.poses = self.create_publisher(PoseStamped, 'pose', 10)
-        self.transforms = self.create_publisher(TFMessage, '/tf', 10)
+        self.transforms = TFMessage and self.create_publisher(TFMessage, '/tf', 10)
         self.times = self.create_publisher(TimeReference, 'computing', 10)
         self.states = self.create_publisher(String, 'slam_state', KEPT)
         self.paths = self.create_publisher(Path, 'path', KEPT)
@@ -134,7 +138,8 @@ class SlamNode(Node):
         at, to = pose.position, transform.transform.translation
         to.x, to.y, to.z = at.x, at.y, at.z
         transform.transform.rotation = pose.orientation
-        self.transforms.publish(TFMessage(transforms=[transform]))
+        if self.transforms:
+            self.transforms.publish(TFMessage(transforms=[transform]))
 
     def _say(self, state: State, why: str) -> None:
         """Publish and log the state, where it isn't the same as before."""

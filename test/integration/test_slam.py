@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 import json
 from pathlib import Path
 import re
@@ -15,7 +16,6 @@ import pytest
 
 pytest.importorskip('cv2', reason='OpenCV (the extra "applications") is not installed')
 pytest.importorskip('gtsam', reason='GTSAM (the extra "applications") is not installed')
-pytest.importorskip('evo', reason='evo (the extra "applications") is not installed')
 rclpy = pytest.importorskip('rclpy')
 
 from ament_index_python.packages import get_package_prefix  # noqa: E402
@@ -28,17 +28,17 @@ from rclpy.context import Context  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_msgs.msg import Header, String  # noqa: E402
-from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from fogros2.testing.launched import launching  # noqa: E402
 from fogros2.waiting import wait_until  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
-from fogros2_examples.slam.node import KEPT  # noqa: E402
+from fogros2_examples.slam.node import KEPT, TFMessage  # noqa: E402
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
 ]
+TRANSFORMS = [('/tf', TFMessage, 10)] if TFMessage else []
 SMALL = ('width:=320', 'height:=240', 'frames:=25', 'rate:=20.0')
 
 
@@ -57,6 +57,7 @@ def launch():
 
 
 @pytest.mark.parametrize(('machine', 'stereo'), [('container', 'true'), ('robot', 'false')])
+@pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
 def test_the_launch_file(launch, engine, tmp_path, machine, stereo):
     """Every frame is answered, the way is found, the picture drawn."""
     run = launch('fogros2_examples', 'slam.launch.py', f'machine:={machine}', *SMALL,
@@ -95,7 +96,7 @@ class Side:
                 ('image', Image), ('depth', Image), ('camera_info', CameraInfo))}
         self.heard = {}
         for topic, kind, qos in (
-                ('pose', PoseStamped, 10), ('/tf', TFMessage, 10), ('slam_state', String, KEPT),
+                ('pose', PoseStamped, 10), ('slam_state', String, KEPT), *TRANSFORMS,
                 ('path', PathMessage, KEPT), ('map_points', PointCloud2, KEPT)):
             self.heard[topic] = []
             self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
@@ -156,8 +157,9 @@ def test_what_cameras_send_at_times():
         side.until(lambda: side.heard['map_points'] and side.heard['path']
                    and side.heard['path'][-1].header.stamp.sec > since, 'path and points')
         assert side.heard['pose'][0].header.frame_id == 'map'
-        (transform,) = side.heard['/tf'][0].transforms
-        assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'eye')
+        for transforms in side.heard.get('/tf', [])[:1]:
+            (transform,) = transforms.transforms
+            assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'eye')
         assert side.heard['map_points'][-1].width > 100
         moved = messages.matrix(side.heard['path'][-1].poses[-1].pose)
         truth = [pose[:3, 3] for pose in room.trajectory(3)]
