@@ -10,7 +10,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError
-from fogros2.kubernetes_api import Api, ApiError, path
+from fogros2.kubernetes_api import Api, ApiError, path, Unreachable
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.kubernetes import exposure, hints, manifests, names
 from fogros2.provider.kubernetes.exposure import Exposure
@@ -237,7 +237,8 @@ class _Search:
     def _node(self) -> list[str]:
         """Return the addresses of the pod's node; its own is known where nodes can't be read."""
         name = str(self._pod['spec'].get('nodeName') or '')
-        with contextlib.suppress(ApiError):
+        with contextlib.suppress(ApiError, Unreachable):
+            # most robots may not, which isn't worth the wait for another answer
             return exposure.node_addresses(self._api.request(
-                'GET', path('nodes', '', name), cancel=self._cancel))
+                'GET', path('nodes', '', name), patience=2.0, cancel=self._cancel))
         return []
