@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+import itertools
 import json
 import time
 from typing import Any, Optional
@@ -37,9 +38,9 @@ class GraspCamera(Node):
     """
     The camera.
 
-    Parameters: ``trials``, bins to show; ``seed`` of the first; ``encoding``, 16UC1 (mm) or 32FC1
-    (m); ``picture``, a PNG file to write, '' for none; ``figures``, a file to which each trial's
-    times go, as a line of JSON; ``wait`` in s, how long an answer may take.
+    Parameters: ``trials``, bins to show, 0 for ever more; ``seed`` of the first; ``encoding``,
+    16UC1 (mm) or 32FC1 (m); ``picture``, a PNG file to write, '' for none; ``figures``, a file to
+    which each trial's times go, as a line of JSON; ``wait`` in s, how long an answer may take.
     """
 
     def __init__(self) -> None:
@@ -84,7 +85,7 @@ class GraspCamera(Node):
             self.get_logger().fatal(f'no depth image was answered in {self.wait:g} s')
             return 2
         found, pictures = 0, []
-        for number in range(self.trials):
+        for number in range(self.trials) if self.trials else itertools.count():
             depth = self._bin(self.seed + number)
             begin = time.monotonic()
             key = self._asked(depth, self.wait)
@@ -103,8 +104,10 @@ class GraspCamera(Node):
                                            'seconds': self.seconds[key], 'grasps': len(grasps)}
                 with open(self.figures, 'a') as file:
                     file.write(json.dumps(figures) + '\n')
-            pictures.append(picture(depth, grasps, self.eye.focal, f'bin {number}: {best}'))
-            self._show(pictures[-1])
+            drawn = picture(depth, grasps, self.eye.focal, f'bin {number}: {best}')
+            self._show(drawn)
+            if self.trials:
+                pictures.append(drawn)
         if self.picture and pictures:
             if cv2.imwrite(self.picture, beside(pictures)):
                 self.get_logger().info(f'wrote {self.picture}')
@@ -153,5 +156,6 @@ def main() -> None:
         raise SystemExit(GraspCamera().run())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
-    finally:
+    except SystemExit:
         rclpy.try_shutdown()
+        raise

@@ -18,7 +18,8 @@ def generate_launch_description():
                               description='how depth crosses: raw, or h264 (lossless)'),
         DeclareLaunchArgument('foxglove', default_value='false',
                               description='show the topics in a browser: ros2 fog monitor'),
-        DeclareLaunchArgument('trials', default_value='10', description='how many bins'),
+        DeclareLaunchArgument('trials', default_value='10',
+                              description='how many bins, 0 for ever more'),
         DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'grasping', 'launch_foxglove': LaunchConfiguration('foxglove')}),

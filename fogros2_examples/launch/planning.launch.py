@@ -20,7 +20,8 @@ def generate_launch_description():
                               description='apartment, cubicles, or a .cfg file of OMPL.app'),
         DeclareLaunchArgument('time', default_value='60.0',
                               description='seconds after which a plan is given up'),
-        DeclareLaunchArgument('count', default_value='1', description='how many plans'),
+        DeclareLaunchArgument('count', default_value='1',
+                              description='how many plans, 0 for ever more'),
         DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'planner', 'launch_foxglove': LaunchConfiguration('foxglove')}),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+import itertools
 import json
 from pathlib import Path as File
 import time
@@ -48,8 +49,9 @@ class PlanningClient(Node):
     The client.
 
     Parameters: ``environment``, 'apartment', 'cubicles', or a file of OMPL.app's (``.cfg``);
-    ``count`` of plans; ``picture``, a PNG file to write, '' for none; ``wait`` in s, how long an
-    answer may take; ``figures``, a file to which each plan's times go, as a line of JSON.
+    ``count`` of plans, 0 for ever more; ``picture``, a PNG file to write, '' for none; ``wait`` in
+    s, how long an answer may take; ``figures``, a file to which each plan's times go, as a line of
+    JSON.
     """
 
     def __init__(self) -> None:
@@ -88,10 +90,16 @@ class PlanningClient(Node):
         if not self._until(lambda: self.told is not None and self.told.hardware_id == scene.name):
             self.get_logger().fatal(f'no planner took the environment in {self.wait:g} s')
             return 2
-        found = [path for number in range(self.count) if len(path := self._plan(scene, number))]
+        found, path = 0, numpy.empty((0, 7))
+        for number in range(self.count) if self.count else itertools.count():
+            answer = self._plan(scene, number)
+            if len(answer):
+                found, path = found + 1, answer
+                if not self.count:
+                    self._show(scene, path)
         if found:
-            self._show(scene, found[-1])
-        return 0 if len(found) == self.count else 1
+            self._show(scene, path)
+        return 0 if found == self.count else 1
 
     def _plan(self, scene: Scene, number: int) -> Floats:
         request = GetPlan.Request()
@@ -128,17 +136,16 @@ class PlanningClient(Node):
         self.motions.publish(MarkerArray(markers=[
             mesh_marker(scene.body, 'motion', number, scene.name, pose_message(pose),
                         COLOURS['body']) for number, pose in enumerate(spaced(path, apart))]))
-        if not self.picture:
-            return
         length = float(numpy.linalg.norm(numpy.diff(path[:, :3], axis=0), axis=1).sum())
         drawn = picture(scene, path, f'{scene.name}: a path of {length:.1f}')
         height, width = drawn.shape[:2]
         self.pictures.publish(Image(height=height, width=width, encoding='bgr8', step=3 * width,
                                     data=array.array('B', drawn.tobytes())))
-        if not cv2.imwrite(self.picture, drawn):
-            self.get_logger().error(f'{self.picture} can not be written')
-            return
-        self.get_logger().info(f'wrote {self.picture}')
+        if self.picture:
+            if cv2.imwrite(self.picture, drawn):
+                self.get_logger().info(f'wrote {self.picture}')
+            else:
+                self.get_logger().error(f'{self.picture} can not be written')
 
     def _until(self, true: Callable[[], bool], wait: float = 0.0) -> bool:
         """Handle messages until something is true; return whether it came to be in time."""
@@ -157,5 +164,6 @@ def main() -> None:
         raise SystemExit(PlanningClient().run())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
-    finally:
+    except SystemExit:
         rclpy.try_shutdown()
+        raise
