@@ -118,17 +118,12 @@ class Step:
     total: int = 0
 
 
-def read(folder: Path) -> list[Step]:
-    """Return a launch's steps in the order in which they began; none where nothing is there."""
-    try:
-        lines = (folder / FILE).read_text(errors='replace').splitlines()
-    except OSError:
-        return []
-    return steps(lines)
-
-
 def steps(lines: list[str]) -> list[Step]:
-    """Return what the lines of a journal tell; a line that is damaged is left out."""
+    """
+    Return what the lines of a journal tell, in the order in which the steps began.
+
+    A line that is damaged is left out.
+    """
     found: list[Step] = []
     for line in lines:
         try:

@@ -147,13 +147,12 @@ class Browser:
         """Return what the page shows, as text."""
         return str(self.ask('document.body ? document.body.innerText : ""'))
 
-    def press(self, key: str, code: int, *, shift: bool = False) -> None:
+    def press(self, key: str, code: int) -> None:
         """Press a key: its name and Windows' code for it, as ('Tab', 9)."""
         text = {'text': '\r'} if key == 'Enter' else {}
         for kind in ('keyDown', 'keyUp'):
             self.do('Input.dispatchKeyEvent', type=kind, key=key, code=key,
-                    windowsVirtualKeyCode=code, modifiers=8 if shift else 0,
-                    **(text if kind == 'keyDown' else {}))
+                    windowsVirtualKeyCode=code, **(text if kind == 'keyDown' else {}))
 
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
         """Write what is seen (or the whole page) as PNG."""

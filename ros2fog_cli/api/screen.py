@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from decimal import Decimal
 import os
-import shutil
 from typing import Any, TextIO
 
 from ros2fog_cli.api.follower import LogLine
@@ -199,8 +198,3 @@ def alternate(stream: TextIO) -> Iterator[Callable[[Sequence[str]], None]]:
     finally:
         stream.write(_LEAVE)
         stream.flush()
-
-
-def terminal_size() -> tuple[int, int]:
-    """Return columns and rows of the terminal as it is now."""
-    return shutil.get_terminal_size()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import shutil
 import sys
 import time
 from typing import Any, Optional
@@ -90,7 +91,7 @@ def _screen(live: Live, name: str, interval: float) -> None:
         while True:
             begin = time.monotonic()
             state = live.state()
-            columns, rows = screen.terminal_size()
+            columns, rows = shutil.get_terminal_size()
             machine = _machine(state, name)
             if machine is None:
                 shown = [f'{name}: {_WAITING}']
