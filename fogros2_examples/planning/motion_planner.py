@@ -7,6 +7,8 @@ What came of a plan is on ``planning_status``: the service's path can only be em
 
 from __future__ import annotations
 
+import signal
+
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from nav_msgs.srv import GetPlan
 import numpy
@@ -117,4 +119,6 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
     finally:
+        # a second one must not keep the searches from being ended
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         node.racer.close()

@@ -56,6 +56,7 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
     """
     Return the first motion that a search finds, or why none did.
 
+    :raises SystemExit: whoever asked has gone; the searches are ended.
     :param asked: ``start``, ``goal``, ``seconds``; of ``seeds`` each is a search, by the planner
         of ``planners`` whose turn it is.
     """
@@ -75,7 +76,11 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
     best: Optional[Outcome] = None
     try:
         while pipes and (best is None or best.end == 'time'):
-            for read in select.select(list(pipes), [], [])[0]:
+            ready = select.select([*pipes, sys.stdin.fileno()], [], [])[0]
+            if sys.stdin.fileno() in ready:
+                # nobody asks before the answer: who asked has gone
+                raise SystemExit
+            for read in ready:
                 data = os.read(read, 1 << 16)
                 texts[read] += data
                 if data:
@@ -115,7 +120,7 @@ def main() -> None:
     # a Ctrl-C in a terminal goes to all; who started this one closes its input
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     space: Optional[Space] = None
-    with contextlib.suppress(BrokenPipeError):
+    with contextlib.suppress(BrokenPipeError, SystemExit):
         for line in sys.stdin:
             asked = json.loads(line)
             if 'scene' in asked:

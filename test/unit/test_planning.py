@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 import signal
 import threading
 
@@ -14,7 +15,8 @@ import pytest
 fcl = pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 pytest.importorskip('ompl', reason='ompl is in the extra applications')
 
-from fogros2_examples.meshes import (  # noqa: E402 - only where its libraries are
+from fogros2.waiting import wait_until  # noqa: E402 - only where its libraries are
+from fogros2_examples.meshes import (  # noqa: E402
     box,
     cylinder,
     joined,
@@ -150,6 +152,23 @@ def test_a_search_that_dies_is_told_and_replaced():
         assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
     finally:
         racer.close()
+
+
+def test_searches_end_with_who_asked():
+    racer, scene = Racer(workers=2), box_room(wall=True)
+    racer.enter(scene)
+    worker = racer._process.pid
+    asking = threading.Thread(target=lambda: pytest.raises(
+        RuntimeError, racer.plan, scene.start, scene.goal, seconds=60), daemon=True)
+    asking.start()
+    children = Path(f'/proc/{worker}/task/{worker}/children')
+    searches = wait_until(lambda: len(found := children.read_text().split()) == 2 and found,
+                          timeout=20.0, what='the searches')
+    racer._process.stdin.close()
+    asking.join(20)
+    racer.close()
+    assert not asking.is_alive()
+    assert not [pid for pid in searches if Path('/proc', pid).exists()]
 
 
 def test_a_path_between_its_poses_turns_the_shorter_way():
