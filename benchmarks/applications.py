@@ -417,7 +417,7 @@ def main() -> None:
     launch = Launch()
     link: Optional[Link] = None
     try:
-        machine = launch.up(MachineSpec('bench-applications', 'container'))
+        machine = launch.up(MachineSpec(f'bench-applications-{os.getpid()}', 'container'))
         prepare(machine)
         link = Link(launch, machine)
         for scenario in SCENARIOS:
