@@ -8,74 +8,25 @@ nobody looks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import dataclasses
 import json
-import os
-from pathlib import Path
 import threading
 import time
-from typing import Any, Optional, TextIO
+from typing import Any, Optional
 
-from fogros2 import journal
 from fogros2.errors import FogError, MachineNotFound
-from fogros2.store import process_alive, Record, robot_name, Store
+from fogros2.store import Record, robot_name, Store
 from ros2fog_cli.api import endings, machines
 from ros2fog_cli.api.follower import Follower, LogLine
 from ros2fog_cli.api.machines import Entry
+from ros2fog_cli.api.shown import as_json, machine_json, phase, process_of, Shown, ShownLaunch
 
 #: Seconds between two looks at the store, and two questions to the providers: with machines there
 #: and with none; and for how long somebody who looked counts as looking.
 LOOK, ASK, ASK_SELDOM, PRESENT = 0.25, 15.0, 60.0, 20.0
 #: Seconds for which a machine that has gone, and a launch that is over, are still shown.
 KEPT = 900.0
-#: Steps after which a machine is up, and steps of its way down.
-UP, DOWN = 'agent', ('delete', 'stop', 'keep', 'let go')
-
-
-@dataclasses.dataclass
-class _Shown:
-    """A machine, and all that is known of it; what it was when it has gone."""
-
-    entry: Entry
-    follower: Optional[Follower] = None
-    steps: tuple[journal.Step, ...] = ()
-    launch: str = ''
-    ended: float = 0.0
-    deleting: bool = False
-    trouble: str = ''
-
-
-@dataclasses.dataclass
-class _Launch:
-    """A launch: its process and its steps."""
-
-    pid: int = 0
-    alive: bool = True
-    #: Open, as it goes with the launch's folder, and its last lines with it.
-    file: Optional[TextIO] = None
-    size: int = 0
-    steps: tuple[journal.Step, ...] = ()
-    ended: float = 0.0
-
-    def read(self, folder: Path) -> None:
-        """Read what the journal has by now."""
-        try:
-            if self.file is None:
-                self.file = open(folder / journal.FILE, errors='replace')
-            size = os.fstat(self.file.fileno()).st_size
-            if size != self.size:
-                self.size = size
-                self.file.seek(0)
-                self.steps = tuple(journal.steps(self.file.read().splitlines()))
-        except OSError:
-            return  # there is none yet
-
-    def close(self) -> None:
-        """Read no more."""
-        if self.file is not None:
-            self.file.close()
-            self.file = None
 
 
 class Live:
@@ -94,8 +45,8 @@ class Live:
     ) -> None:
         self.store = store or Store()
         self._name, self._regions, self._interval, self._more = name, regions, interval, more
-        self._shown: dict[str, _Shown] = {}
-        self._launches: dict[str, _Launch] = {}
+        self._shown: dict[str, Shown] = {}
+        self._launches: dict[str, ShownLaunch] = {}
         self._warnings: list[str] = []
         self._asked = -1e9
         self._known: frozenset[tuple[str, Optional[str]]] = frozenset()
@@ -185,7 +136,7 @@ class Live:
         self._deleting.append(thread)
         thread.start()
 
-    def _delete(self, shown: _Shown, force: bool) -> None:
+    def _delete(self, shown: Shown, force: bool) -> None:
         try:
             # as its provider knows it now
             for entry in machines.survey(lambda text: None, name=shown.entry.name,
@@ -251,7 +202,7 @@ class Live:
             for record in records.values():
                 entries[record.name] = self._entry(record)
             for name, entry in entries.items():
-                shown = self._shown.setdefault(name, _Shown(entry))
+                shown = self._shown.setdefault(name, Shown(entry))
                 shown.entry, shown.ended = entry, 0.0
             for name, shown in list(self._shown.items()):
                 self._update(shown, now, there=name in entries)
@@ -281,8 +232,8 @@ class Live:
         folder = self.store.root / 'launches'
         there = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
         for name, path in there.items():
-            launch = self._launches.setdefault(name, _Launch())
-            launch.pid, launch.alive = _process(path)
+            launch = self._launches.setdefault(name, ShownLaunch())
+            launch.pid, launch.alive = process_of(path)
             launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in there:
@@ -294,7 +245,7 @@ class Live:
                 if now - launch.ended > KEPT:
                     del self._launches[name]
 
-    def _update(self, shown: _Shown, now: float, *, there: bool) -> None:
+    def _update(self, shown: Shown, now: float, *, there: bool) -> None:
         record = shown.entry.record
         if there and record is not None and record.launch:
             shown.launch = record.launch
@@ -328,84 +279,3 @@ class Live:
                     self._launches.items(), key=lambda item: item[1].ended or 1e12)],
             'machines': [machine_json(shown) for _, shown in sorted(self._shown.items())],
         }
-
-
-def machine_json(shown: _Shown) -> dict[str, Any]:
-    """Return a machine as JSON values: times in seconds since the epoch, money in US dollars."""
-    entry, follower, record = shown.entry, shown.follower, shown.entry.record
-    agent = follower.agent if follower is not None else None
-    steps = [as_json(step, ended=bool(shown.ended)) for step in shown.steps]
-    return {
-        'name': entry.name, 'provider': entry.provider, 'id': entry.machine_id,
-        'state': 'gone' if shown.ended else entry.state, 'phase': _phase(shown),
-        'launch': shown.launch,
-        'launch_pid': record.pid if record is not None and record.launch_alive else 0,
-        'launch_alive': record is not None and record.launch_alive and not shown.ended,
-        'created': entry.created, 'expires': entry.expires, 'ended': shown.ended or None,
-        'address': entry.address, 'place': entry.place, 'kind': entry.kind,
-        'cost_per_hour': None if entry.cost is None else str(entry.cost),
-        'on_exit': record.spec.on_exit if record is not None else '',
-        'bridge': record.monitor if record is not None else 0,
-        'steps': steps,
-        'vpn': _vpn(follower.vpn) if follower is not None else None,
-        'agent': None if agent is None else {
-            key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
-        'nodes': [] if agent is None else agent['nodes'],
-        'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
-        if follower is not None else [],
-        'log': follower.last if follower is not None else 0,
-        'deleting': shown.deleting, 'trouble': shown.trouble,
-    }
-
-
-def _vpn(vpn: Optional[Mapping[str, Any]]) -> Optional[dict[str, Any]]:
-    if vpn is None:
-        return None
-    age = vpn['handshake_age']
-    return {**{key: vpn[key] for key in (
-        'address', 'interface', 'received', 'sent', 'latency', 'receiving', 'sending')},
-        'handshake': None if age is None else round(time.time() - age)}
-
-
-def as_json(step: journal.Step, *, ended: bool = False) -> dict[str, Any]:
-    """
-    Return a step as JSON values.
-
-    :param ended: the launch is over, and nothing runs any more.
-    """
-    state = 'done' if ended and step.state == 'running' else step.state
-    return {**dataclasses.asdict(step), 'state': state}
-
-
-def phase(steps: tuple[journal.Step, ...]) -> str:
-    """Return where a machine is on its way, by its steps: 'coming', 'running', 'ending'."""
-    found = 'coming'
-    for step in steps:
-        if step.step in DOWN:
-            return 'ending'
-        if step.step == UP and step.state == 'done':
-            found = 'running'
-        elif step.state == 'failed' and found == 'coming':
-            return 'ending'
-    return found
-
-
-def _phase(shown: _Shown) -> str:
-    record = shown.entry.record
-    if shown.ended:
-        return 'gone'
-    if shown.deleting:
-        return 'ending'
-    if record is not None and record.launch_alive:
-        return phase(shown.steps) if shown.steps or not record.agent else 'running'
-    return shown.entry.state.partition(' ')[0]
-
-
-def _process(folder: Path) -> tuple[int, bool]:
-    """Return a launch's process and whether it lives, by what it has written."""
-    try:
-        data = json.loads((folder / 'process.json').read_text())
-        pid = int(data['pid'])
-        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0, True  # it has just been made

@@ -55,7 +55,7 @@ def frame(
     """
     Return a screenful: no more lines than ``rows``, none longer than ``columns``.
 
-    :param machine: as :func:`ros2fog_cli.api.live.machine_json` has it, with ``streams`` and
+    :param machine: as :func:`ros2fog_cli.api.shown.machine_json` has it, with ``streams`` and
         ``topics`` of its launch where they are known.
     :param lines: of its log, of which the last ones are shown.
     :param now: in seconds since the epoch.

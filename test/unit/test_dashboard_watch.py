@@ -27,9 +27,10 @@ from fogros2.report import (
     StepFailed,
     StepStarted,
 )
-from ros2fog_cli.api import live, screen
+from ros2fog_cli.api import screen
 from ros2fog_cli.api.follower import agent_state, LogLine, node_name, rates
 from ros2fog_cli.api.reach import Link
+from ros2fog_cli.api.shown import as_json, phase
 
 
 def read(folder: Path) -> list[Step]:
@@ -114,7 +115,7 @@ def test_an_undo_that_failed_is_told_alone() -> None:
     ([('agent', 'done'), ('let go', 'done')], 'ending'),
 ])
 def test_the_phase_by_the_steps(steps: list[tuple[str, str]], expected: str) -> None:
-    assert live.phase(tuple(Step('a', name, 1.0, state) for name, state in steps)) == expected
+    assert phase(tuple(Step('a', name, 1.0, state) for name, state in steps)) == expected
 
 
 @pytest.mark.parametrize(('words', 'expected'), [
@@ -242,9 +243,9 @@ def test_a_name_that_no_machine_can_have() -> None:
 
 def test_a_step_as_json_when_all_is_over() -> None:
     running = Step('a', 'delete', 1.0)
-    assert live.as_json(running)['state'] == 'running'
-    assert live.as_json(running, ended=True)['state'] == 'done'
-    json.dumps(live.as_json(running))
+    assert as_json(running)['state'] == 'running'
+    assert as_json(running, ended=True)['state'] == 'done'
+    json.dumps(as_json(running))
 
 
 def test_a_reader_of_lines_that_goes_away(tmp_path: Path) -> None:

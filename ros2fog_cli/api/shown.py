@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of machines and launches that are shown, and the same as JSON values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+import json
+import os
+from pathlib import Path
+import time
+from typing import Any, Optional, TextIO
+
+from fogros2 import journal
+from fogros2.store import process_alive
+from ros2fog_cli.api.follower import Follower
+from ros2fog_cli.api.machines import Entry
+
+#: Steps after which a machine is up, and steps of its way down.
+UP, DOWN = 'agent', ('delete', 'stop', 'keep', 'let go')
+
+
+@dataclasses.dataclass
+class Shown:
+    """A machine, and all that is known of it; what it was when it has gone."""
+
+    entry: Entry
+    follower: Optional[Follower] = None
+    steps: tuple[journal.Step, ...] = ()
+    launch: str = ''
+    ended: float = 0.0
+    deleting: bool = False
+    trouble: str = ''
+
+
+@dataclasses.dataclass
+class ShownLaunch:
+    """A launch: its process and its steps."""
+
+    pid: int = 0
+    alive: bool = True
+    #: Open, as it goes with the launch's folder, and its last lines with it.
+    file: Optional[TextIO] = None
+    size: int = 0
+    steps: tuple[journal.Step, ...] = ()
+    ended: float = 0.0
+
+    def read(self, folder: Path) -> None:
+        """Read what the journal has by now."""
+        try:
+            if self.file is None:
+                self.file = open(folder / journal.FILE, errors='replace')
+            size = os.fstat(self.file.fileno()).st_size
+            if size != self.size:
+                self.size = size
+                self.file.seek(0)
+                self.steps = tuple(journal.steps(self.file.read().splitlines()))
+        except OSError:
+            return  # there is none yet
+
+    def close(self) -> None:
+        """Read no more."""
+        if self.file is not None:
+            self.file.close()
+            self.file = None
+
+
+def machine_json(shown: Shown) -> dict[str, Any]:
+    """Return a machine as JSON values: times in seconds since the epoch, money in US dollars."""
+    entry, follower, record = shown.entry, shown.follower, shown.entry.record
+    agent = follower.agent if follower is not None else None
+    steps = [as_json(step, ended=bool(shown.ended)) for step in shown.steps]
+    return {
+        'name': entry.name, 'provider': entry.provider, 'id': entry.machine_id,
+        'state': 'gone' if shown.ended else entry.state, 'phase': _phase(shown),
+        'launch': shown.launch,
+        'launch_pid': record.pid if record is not None and record.launch_alive else 0,
+        'launch_alive': record is not None and record.launch_alive and not shown.ended,
+        'created': entry.created, 'expires': entry.expires, 'ended': shown.ended or None,
+        'address': entry.address, 'place': entry.place, 'kind': entry.kind,
+        'cost_per_hour': None if entry.cost is None else str(entry.cost),
+        'on_exit': record.spec.on_exit if record is not None else '',
+        'bridge': record.monitor if record is not None else 0,
+        'steps': steps,
+        'vpn': _vpn(follower.vpn) if follower is not None else None,
+        'agent': None if agent is None else {
+            key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
+        'nodes': [] if agent is None else agent['nodes'],
+        'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
+        if follower is not None else [],
+        'log': follower.last if follower is not None else 0,
+        'deleting': shown.deleting, 'trouble': shown.trouble,
+    }
+
+
+def _vpn(vpn: Optional[Mapping[str, Any]]) -> Optional[dict[str, Any]]:
+    if vpn is None:
+        return None
+    age = vpn['handshake_age']
+    return {**{key: vpn[key] for key in (
+        'address', 'interface', 'received', 'sent', 'latency', 'receiving', 'sending')},
+        'handshake': None if age is None else round(time.time() - age)}
+
+
+def as_json(step: journal.Step, *, ended: bool = False) -> dict[str, Any]:
+    """
+    Return a step as JSON values.
+
+    :param ended: the launch is over, and nothing runs any more.
+    """
+    state = 'done' if ended and step.state == 'running' else step.state
+    return {**dataclasses.asdict(step), 'state': state}
+
+
+def phase(steps: tuple[journal.Step, ...]) -> str:
+    """Return where a machine is on its way, by its steps: 'coming', 'running', 'ending'."""
+    found = 'coming'
+    for step in steps:
+        if step.step in DOWN:
+            return 'ending'
+        if step.step == UP and step.state == 'done':
+            found = 'running'
+        elif step.state == 'failed' and found == 'coming':
+            return 'ending'
+    return found
+
+
+def _phase(shown: Shown) -> str:
+    record = shown.entry.record
+    if shown.ended:
+        return 'gone'
+    if shown.deleting:
+        return 'ending'
+    if record is not None and record.launch_alive:
+        return phase(shown.steps) if shown.steps or not record.agent else 'running'
+    return shown.entry.state.partition(' ')[0]
+
+
+def process_of(folder: Path) -> tuple[int, bool]:
+    """Return a launch's process and whether it lives, by what it has written."""
+    try:
+        data = json.loads((folder / 'process.json').read_text())
+        pid = int(data['pid'])
+        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, True  # it has just been made
