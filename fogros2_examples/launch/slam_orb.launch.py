@@ -2,7 +2,7 @@
 """ORB-SLAM2 or 3 from a container image of yours, in the place of the example's own SLAM."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
@@ -36,7 +36,9 @@ def generate_launch_description():
                               description='of the images there: h264, compressed or raw'),
         *(DeclareLaunchArgument(name, default_value=value, description=what)
           for name, (value, what) in (asked | shown).items()),
-        FogMachine(LaunchConfiguration('machine'), {'name': 'slam'}),
+        # other machines run containers without being asked
+        FogMachine(LaunchConfiguration('machine'), {'name': 'slam', 'containers': PythonExpression(
+            ["'true' if '", LaunchConfiguration('machine'), "' == 'container' else ''"])}),
         CloudNode(machine='slam', image=LaunchConfiguration('image'), output='screen',
                   package=LaunchConfiguration('package'),
                   executable=LaunchConfiguration('executable'), remappings=names,

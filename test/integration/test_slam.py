@@ -82,6 +82,16 @@ def test_a_folder_that_is_none(launch, tmp_path):
     assert not re.search(r'\[slam_camera-\d+\] Traceback', run.text), run.text
 
 
+def test_orb_slam_in_its_place(launch):
+    """What it runs is the user's: an image must be named. The rest is as it is for our own."""
+    shown = launch('fogros2_examples', 'slam_orb.launch.py', '--show-args')
+    assert shown.ended() == 0, shown.text
+    assert "'image'" in shown.text
+    refused = launch('fogros2_examples', 'slam_orb.launch.py', 'machine:=aws')
+    assert refused.ended() == 1
+    assert "missing required argument 'image'" in refused.text
+
+
 class Side:
     """A robot's side in this process: publishes what a test says, keeps what comes back."""
 

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Table II of the paper, visual SLAM: what applications.py calls for it.
+
+A stereo camera of VGA in the synthetic room of the examples; a frame's time is from its
+publication to the pose that bears its stamp, and the next one waits for that. The name of a row
+has the trajectory's errors, as evo has them: they are what lossy video costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import contextlib
+import json
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import tempfile
+import time
+from typing import Any, Optional
+
+import applications
+from applications import FOLDER, Held, ONE_THREAD, PACKETS, Result, ROOT, running, words
+
+NODE, CAMERA = 'fogros2_examples.slam.node', 'fogros2_examples.slam.camera'
+#: Seconds a frame: robot alone, computing in the cloud (what the total leaves at the most), total.
+PAPER = (0.68, 0.22, 0.22)
+TOPICS = ('/camera/image', '/camera/right/image')
+WIDTH, HEIGHT = 640, 480
+#: Frames at the beginning that don't count: the first key, libraries that load.
+WARM_UP = 5
+
+
+def walked(environment: dict[str, str], frames: int, seed: int) -> dict[str, Any]:
+    """Run the camera to its end; return what it measured."""
+    said: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder, 'results')
+        with running(words(CAMERA, f'frames:={frames}', 'rate:=10.0', f'seed:={seed}',
+                           f'results:={results}'), environment, said.append) as camera:
+            camera.wait(600)
+        if not results.exists():
+            raise RuntimeError(f'{CAMERA} measured nothing:\n{"".join(said[-20:])}')
+        found: dict[str, Any] = json.loads(results.read_text())
+    return found
+
+
+def here(frames: int, seed: int, share: Optional[float]) -> dict[str, Any]:
+    """Run all on the robot; SLAM held to a share of a core, None for not."""
+    environment = {**os.environ, **ONE_THREAD, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '85',
+                   'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    with contextlib.ExitStack() as stack:
+        held = None if share is None else Held(share)
+        if held is not None:
+            stack.callback(held.close)
+
+        def hear(line: str) -> None:
+            # not before it has started: loading libraries is no part of the figures
+            if held is not None and 'no image yet' in line:
+                held.take(node.pid)
+
+        node = stack.enter_context(running(words(NODE), environment, hear))
+        return walked(environment, frames, seed)
+
+
+def there(codec: str, frames: int, seed: int, launch: Any, machine: Any,
+          link: Any) -> dict[str, Any]:
+    """Run SLAM on the machine, over the link; return what was measured."""
+    from streaming import end, LINK
+
+    from fogros2.model import NodeSpec
+
+    environment = {**os.environ, **launch.robot_environment(), **ONE_THREAD,
+                   'PYTHONPATH': str(ROOT)}
+
+    def coding(role: str, topic: str) -> list[str]:
+        image = topic if role == 'encoder' else f'/there{topic}'
+        return [*words(f'image_transport_h264.{role}', f'codec:={codec}',
+                       f'stream:={topic}/stream'), '-r', f'image:={image}']
+
+    computing = words(NODE)
+    for topic in (*TOPICS, '/camera/camera_info', '/camera/right/camera_info'):
+        computing += ['-r', f'{topic}:=/there{topic}']
+    nodes = [('slam', computing), *(
+        (f'decoder-{number}', coding('decoder', topic)) for number, topic in enumerate(TOPICS))]
+    ids = [f'{what}-{codec}-{seed}' for what, _ in nodes]
+    link.change(rate=LINK, delay=0.0, loss=0.0)
+    encoders: list[subprocess.Popen[bytes]] = []
+    try:
+        machine.start([NodeSpec(name, what, arguments=tuple(command),
+                                environment={'PYTHONPATH': FOLDER, **ONE_THREAD})
+                       for name, (what, command) in zip(ids, nodes)])
+        encoders += [subprocess.Popen(coding('encoder', topic), env=environment,
+                                      stdout=subprocess.DEVNULL) for topic in TOPICS]
+        return walked(environment, frames, seed)
+    finally:
+        for encoder in encoders:
+            end(encoder)
+        machine.stop(ids)
+        link.change(rate=0.0, delay=0.0, loss=0.0)
+
+
+def coded_alone(codec: str) -> tuple[float, float]:
+    """Return the seconds to encode and decode a pair of images one by one, and their bytes."""
+    import cv2
+
+    from fogros2_examples.slam.room import camera, Room, trajectory
+    from image_transport_h264.codec import Decoder, Encoder, Picture
+
+    room = Room(camera(WIDTH, HEIGHT))
+    coder, decoder = Encoder(), Decoder()
+    times, sizes = [], []
+    for number, pose in enumerate(trajectory(10)):
+        image = room.exact(pose)[0]
+        size = image.nbytes
+        begin = time.perf_counter()
+        if codec == 'jpeg':
+            coded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+            size = len(coded)
+            cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        elif codec == 'h264':
+            picture = Picture(WIDTH, HEIGHT, 'bgr8', 3 * WIDTH, memoryview(image.tobytes()))
+            packet = coder.encode(picture, seconds=number / 10).data
+            size = len(packet)
+            decoder.decode(packet)
+        times.append(time.perf_counter() - begin)
+        sizes.append(size)
+    return 2 * statistics.median(times), 2 * statistics.median(sizes)
+
+
+def measured(only: str, short: bool, launch: Any, machine: Any, link: Any) -> Sequence[Result]:
+    """Return the table's rows, one for each way that images cross."""
+    return list(_measured(short, launch, machine, link)) if only in 'visual SLAM' else []
+
+
+def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Result]:
+    from streaming import LINK
+
+    frames, held_frames, seeds = (60, 20, (1,)) if short else (200, 60, (1, 2, 3))
+    ratio = PAPER[0] / PAPER[1]
+    alone = here(held_frames, seeds[0], 1 / ratio)
+    robot = statistics.median(alone['round_trips'][WARM_UP:])
+    # the same images, if slowly, as those that cross raw: a walk over the link would take long
+    free = [here(frames, seed, None) for seed in seeds]
+    hops = statistics.median(wait for found in free for wait in _network(found))
+    for codec in ('raw', 'jpeg', 'h264'):
+        if codec == 'raw':
+            runs, walks = [there(codec, 20, seeds[0], launch, machine, link)], free
+        else:
+            walks = runs = [there(codec, frames, seed, launch, machine, link) for seed in seeds]
+        ate, rpe = (100 * statistics.median(
+            found.get(f'final_{error}', float('nan')) for found in walks)
+            for error in ('ate', 'rpe'))
+        trips = [trip for found in runs for trip in found['round_trips'][WARM_UP:]]
+        total = statistics.median(trips)
+        network = statistics.median(wait for found in runs for wait in _network(found))
+        coding, size = coded_alone(codec)
+        sent = PACKETS * size
+        yield Result(
+            f'visual SLAM, stereo VGA: ATE {ate:.2f} cm, RPE {rpe:.2f} cm/m', 'II', codec, robot,
+            total - network, network, total, robot / total, ratio,
+            # an image is handed on once more on either side of the link
+            sent * 8 / LINK + coding + 3 * hops, sent, PAPER, len(trips), held_frames - WARM_UP)
+
+
+def _network(found: dict[str, Any]) -> list[float]:
+    return [trip - computing for trip, computing in zip(
+        found['round_trips'][WARM_UP:], found['computing'][WARM_UP:]) if computing == computing]
+
+
+if __name__ == '__main__':
+    applications.main()
