@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import ctypes as ct
 import importlib.util
 from pathlib import Path
+import signal
 import threading
 from typing import Any, NamedTuple
 
@@ -185,6 +186,9 @@ def close_domain(domain_id: int) -> None:
 @atexit.register
 def _close_all() -> None:
     """Say goodbye: without it other computers believe in this process until its lease ends."""
+    if threading.current_thread() is threading.main_thread():
+        # a second Ctrl-C would end this half-way, with a traceback
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     with _domains_lock:
         for handle, _ in _domains.values():
             _lib.dds_delete(handle)

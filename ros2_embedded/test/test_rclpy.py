@@ -747,6 +747,28 @@ def test_an_executor_that_outlives_its_modules_ends_without_a_word():
     assert (done.returncode, done.stderr) == (0, '')
 
 
+#: Interrupted once more while it says goodbye.
+INTERRUPTED_AT_ITS_END = '''
+import os, signal, rclpy
+from rclpy import _dds
+class Slow:
+    def dds_delete(self, handle):
+        os.kill(os.getpid(), signal.SIGINT)
+        return library.dds_delete(handle)
+rclpy.init()
+node = rclpy.create_node('interrupted')
+library, _dds._lib = _dds._lib, Slow()
+'''
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
+                    reason="it is the embedded default's own ending")
+def test_a_second_interrupt_at_the_end_is_no_error():
+    done = subprocess.run([sys.executable, '-c', INTERRUPTED_AT_ITS_END], capture_output=True,
+                          text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 def test_importing_rclpy_is_quick():
     code = 'import time; t = time.perf_counter(); import rclpy; print(time.perf_counter() - t)'
     times = [float(subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
