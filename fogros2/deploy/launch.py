@@ -240,9 +240,9 @@ class Launch:
                 # no peers: the machines announce themselves
                 write_private(
                     path, vendor.render(interfaces, (), self.user_environment).encode())
-                # for terminals that join
-                write_private(path.with_name('rmw'), vendor.rmw.encode())
+                # for terminals that join, which look for the second
                 write_private(path.with_name('domain'), str(self.domain).encode())
+                write_private(path.with_name('rmw'), vendor.rmw.encode())
                 robot.ensure()
                 self._route(vendor, path.parent)
                 self._robot_environment = dict(

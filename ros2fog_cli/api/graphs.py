@@ -185,8 +185,5 @@ class Graphs:
             return None
         if environment is None:
             return None  # just over
-        domain = self._store.root / 'launches' / launch / 'domain'
-        with contextlib.suppress(OSError):
-            environment['ROS_DOMAIN_ID'] = domain.read_text()
         self._graphs[launch] = Graph({**os.environ, **environment})
         return self._graphs[launch]

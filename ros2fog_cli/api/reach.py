@@ -271,4 +271,5 @@ def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
                        'unset RMW_IMPLEMENTATION here')
     vendor = plugin_system.load('fogros2.dds', rmw)()
     path = chosen.with_name(vendor.file_name)
-    return dict(vendor.environment(str(path), os.environ))
+    return {**vendor.environment(str(path), os.environ),
+            'ROS_DOMAIN_ID': chosen.with_name('domain').read_text()}

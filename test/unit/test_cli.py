@@ -414,13 +414,14 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert 'no launch is running' in str(run('env', 'a'))
     path = Store().launch('abc123') / 'dds.xml'
     path.write_text('<x/>')
+    path.with_name('domain').write_text('42')
     path.with_name('rmw').write_text('rmw_cyclonedds_cpp')
     assert run('env', 'a') == 0
     said = capsys.readouterr().out
-    shown = subprocess.run(
-        ['sh', '-c', f'{said}\nprintf "%s\\n" "$RMW_IMPLEMENTATION" "$CYCLONEDDS_URI"'],
-        capture_output=True, text=True, check=True).stdout.splitlines()
-    assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}']
+    names = '"$RMW_IMPLEMENTATION" "$CYCLONEDDS_URI" "$ROS_DOMAIN_ID"'
+    shown = subprocess.run(['sh', '-c', f'{said}\nprintf "%s\\n" {names}'],
+                           capture_output=True, text=True, check=True).stdout.splitlines()
+    assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}', '42']
     assert run('env', 'a', '--json') == 0
     assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
