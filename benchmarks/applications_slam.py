@@ -37,7 +37,7 @@ def walked(environment: dict[str, str], frames: int, seed: int) -> dict[str, Any
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder, 'results')
-        with running(words(CAMERA, f'frames:={frames}', 'rate:=10.0', f'seed:={seed}',
+        with running(words(CAMERA, f'frames:={frames}', 'rate:=50.0', f'seed:={seed}',
                            f'results:={results}'), environment, said.append) as camera:
             camera.wait(600)
         if not results.exists():
