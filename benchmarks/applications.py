@@ -275,7 +275,8 @@ def there(scenario: Scenario, codec: str, trials: int, launch: Any, machine: Any
 
     environment = {**os.environ, **launch.robot_environment(), **ONE_THREAD,
                    'PYTHONPATH': str(ROOT)}
-    mark = f'{scenario.module.rpartition(".")[2]}-{codec}-{len(scenario.asks)}'
+    # a name is for one node, once
+    mark = f'{scenario.name.rpartition(" ")[2]}-{codec}'
     computing = words(scenario.module, *scenario.parameters)
     link.change(rate=LINK, delay=0.0, loss=0.0)
     nodes, encoder = [], None
