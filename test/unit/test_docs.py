@@ -14,8 +14,10 @@ import sys
 
 from launch import LaunchDescription
 from launch.frontend import Parser
+from launch_ros.actions import Node
 import pytest
 
+import fogros2
 from fogros2 import plugin_system
 from fogros2.actions import override
 
@@ -40,14 +42,18 @@ def blocks(kind: str) -> list[pytest.param]:
 
 @pytest.mark.parametrize('text', blocks('python'))
 def test_python(text, tmp_path):
-    """A launch file is built, which does nothing; what is no launch file compiles."""
-    compile(text, 'block', 'exec')
+    """A launch file is built, which does nothing; so is what a page shows of one."""
+    code = compile(text, 'block', 'exec')
     if 'def generate_launch_description' in text:
         path = tmp_path / 'x.launch.py'
         path.write_text(text)
         description = runpy.run_path(str(path))['generate_launch_description']()
         assert isinstance(description, LaunchDescription)
         assert description.entities
+    elif 'Ec2Box' not in text:  # which makes computers: test/integration/test_ec2_box.py does
+        exec(code, {name: getattr(fogros2, name) for name in fogros2.__all__} | {
+            'Node': Node, **{name: fogros2.ContainerInstance(name=name)
+                             for name in ('machine', 'mapper', 'planner')}})
 
 
 @pytest.mark.parametrize('text', [*blocks('xml'), *blocks('yaml')])
