@@ -43,17 +43,19 @@ def blocks(kind: str) -> list[pytest.param]:
 @pytest.mark.parametrize('text', blocks('python'))
 def test_python(text, tmp_path):
     """A launch file is built, which does nothing; so is what a page shows of one."""
-    code = compile(text, 'block', 'exec')
+    compile(text, 'block', 'exec')
+    path = tmp_path / 'x.launch.py'
+    path.write_text(text)
     if 'def generate_launch_description' in text:
-        path = tmp_path / 'x.launch.py'
-        path.write_text(text)
         description = runpy.run_path(str(path))['generate_launch_description']()
         assert isinstance(description, LaunchDescription)
         assert description.entities
     elif 'Ec2Box' not in text:  # which makes computers: test/integration/test_ec2_box.py does
-        exec(code, {name: getattr(fogros2, name) for name in fogros2.__all__} | {
-            'Node': Node, **{name: fogros2.ContainerInstance(name=name)
-                             for name in ('machine', 'mapper', 'planner')}})
+        machines = {name: fogros2.ContainerInstance(name=name)
+                    for name in ('machine', 'mapper', 'planner')}
+        runpy.run_path(str(path), {
+            **{name: getattr(fogros2, name) for name in fogros2.__all__}, 'Node': Node,
+            **machines})
 
 
 @pytest.mark.parametrize('text', [*blocks('xml'), *blocks('yaml')])
