@@ -374,8 +374,8 @@ def test_the_guard_is_armed_at_boot_and_comes_back(cloud):
             Command(('test', '-S', '/run/fogros2/agent.sock')), timeout=10.0,
             check=False).returncode == 0, timeout=10.0, what="the guard's socket")
         said(shell, 'kill', '-KILL', first, sudo=True)
-        second = wait_until(lambda: guard() or None, timeout=10.0, what='the guard to come back')
-        assert first != second
+        # the one that is killed may be there a moment longer
+        wait_until(lambda: guard() not in ('', first), timeout=10.0, what='the guard to come back')
 
 
 def test_a_guard_that_waits_in_vain_ends_the_machine(cloud):

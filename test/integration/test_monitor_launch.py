@@ -91,7 +91,7 @@ def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = Tru
     """Return what answers a request, nothing where the connection just ends."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError), \
+    with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError, ssl.SSLZeroReturnError), \
             socket.create_connection(at, timeout=20, source_address=(source, 0)) as plain, \
             context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
         connection.sendall(f'GET {target} HTTP/1.1\r\nHost: x\r\n\r\n'.encode())
