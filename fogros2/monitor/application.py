@@ -103,8 +103,17 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     threading.Thread(target=_until_eof, args=(ended,), daemon=True).start()
     application = Application(options.image, options.port, ended)
     try:
+        _start(application, options.at)
+        ended.wait()
+    finally:
+        application.stop()
+
+
+def _start(application: Application, at: str) -> None:
+    """Start it and say where it is, or why there is none: the bridge goes on without."""
+    try:
         application.start()
-        say(f'the web application is at {options.at}')
+        say(f'the web application is at {at}')
     except Cancelled:
         pass
     except CommandError as error:
@@ -113,8 +122,6 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         say(f'no web application here: {said[-1]}')
     except FogError as error:
         say(f'no web application here: {error}')
-    ended.wait()
-    application.stop()
 
 
 def say(text: str) -> None:
