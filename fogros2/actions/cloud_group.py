@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import functools
 from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
@@ -13,7 +14,7 @@ from fogros2.actions import components, streaming, words
 from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import CloudInstance
-from fogros2.actions.remote import RemoteProcess, send
+from fogros2.actions.remote import carriers_here, carriers_of, RemoteProcess, send
 from fogros2.actions.wrapping import wrap
 from fogros2.errors import ConfigurationError
 
@@ -75,5 +76,9 @@ class CloudGroup(GroupAction):
             send(entity, self._resolved, self._streams)
         elif isinstance(entity, Action) and components.are_loaded_by(entity):
             coordinator = Coordinator.of(context)
-            if not coordinator.on_robot(self._resolved):
-                components.tell(entity, coordinator.session(self._resolved).told_to_components)
+            if coordinator.on_robot(self._resolved):
+                components.tell(entity, dict, functools.partial(carriers_here, self._streams))
+            else:
+                session = coordinator.session(self._resolved)
+                components.tell(entity, session.told_to_components, functools.partial(
+                    carriers_of, self._streams, session=session))

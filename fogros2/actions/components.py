@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from typing import Optional
 
@@ -22,19 +22,25 @@ def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
     return any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__)
 
 
-def tell(action: Action, names: Callable[[], Mapping[str, str]]) -> None:
+def tell(
+    action: Action, names: Callable[[], Mapping[str, str]],
+    carriers: Callable[[LaunchContext], Sequence[LaunchDescriptionEntity]],
+) -> None:
     """
     Have an action that loads components tell them what topics are called on their machine.
 
     :param names: returns new names by the full old ones, when the action is executed.
+    :param carriers: adds the components' streams, before that, and returns what carries them.
     """
     if 'execute' in vars(action):
         return  # another visit of it
     execute = action.execute
 
     def telling(context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        beside = carriers(context)
         with _renamed(action, context, names()):
-            return execute(context)
+            entities = execute(context)
+        return [*(entities or ()), *beside]
 
     vars(action)['execute'] = telling
 

@@ -74,7 +74,7 @@ class RemoteProcess(ExecuteLocal):
             return None
         entities = super().execute(context)
         if self._fogros2_here:
-            return [*(entities or ()), *self._carriers_here(context)]
+            return [*(entities or ()), *carriers_here(self._fogros2_streams, context)]
         future = private.completed(self)
         assert future is not None
         run = RemoteRun(self, context, self._fogros2_session, self._fogros2_node, future)
@@ -85,12 +85,9 @@ class RemoteProcess(ExecuteLocal):
 
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
         """Return the processes that carry the streams asked for here and nowhere before."""
-        session = self._fogros2_session
         if isinstance(self, carriers.Carrier):
             return []
-        if session.interrupted:
-            return self._carriers_here(context)
-        return self._carry(context, self._fogros2_streams, session)
+        return carriers_of(self._fogros2_streams, context, self._fogros2_session)
 
     def _beside(self, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         """Return what the machine runs beside its nodes, for the first of them."""
@@ -110,25 +107,6 @@ class RemoteProcess(ExecuteLocal):
             found.append(Foxglove(
                 session.spec.name, monitor_allow=session.spec.monitor_allow))
         return found
-
-    def _carriers_here(self, context: LaunchContext) -> list[ExecuteLocal]:
-        """Return those that bring what a machine publishes for this process to the robot."""
-        coordinator = Coordinator.of(context)
-        found: list[ExecuteLocal] = []
-        for entry in self._fogros2_streams:
-            if isinstance(entry, tuple) or entry.source is None:
-                continue
-            found += self._carry(
-                context, [streaming.to_robot(entry)], coordinator.session(entry.source))
-        return found
-
-    def _carry(
-        self, context: LaunchContext, streams: Sequence[Entry], session: Session,
-    ) -> list[ExecuteLocal]:
-        return [
-            carriers.RobotCarrier(spec, session.came_up) if machine is None else
-            carrier_on(spec, machine)
-            for machine, spec in Coordinator.of(context).stream(streams, session)]
 
     @property
     def can_come_here(self) -> bool:
@@ -185,6 +163,36 @@ def send(
     assert isinstance(action, RemoteProcess)
     action._fogros2_machine = machine
     action._fogros2_streams = streams
+
+
+def carriers_of(
+    streams: Sequence[Entry], context: LaunchContext, session: Session,
+) -> list[ExecuteLocal]:
+    """Return the processes that carry streams of what a machine runs, but for those there are."""
+    if session.interrupted:
+        return carriers_here(streams, context)
+    return _carriers_to(streams, context, session)
+
+
+def carriers_here(streams: Sequence[Entry], context: LaunchContext) -> list[ExecuteLocal]:
+    """Return those that bring what other machines publish to the robot, for what runs here."""
+    coordinator = Coordinator.of(context)
+    found: list[ExecuteLocal] = []
+    for entry in streams:
+        if isinstance(entry, tuple) or entry.source is None:
+            continue
+        found += _carriers_to(
+            [streaming.to_robot(entry)], context, coordinator.session(entry.source))
+    return found
+
+
+def _carriers_to(
+    streams: Sequence[Entry], context: LaunchContext, session: Session,
+) -> list[ExecuteLocal]:
+    return [
+        carriers.RobotCarrier(spec, session.came_up) if machine is None else
+        carrier_on(spec, machine)
+        for machine, spec in Coordinator.of(context).stream(streams, session)]
 
 
 def carrier_on(spec: NodeSpec, machine: str) -> ExecuteLocal:

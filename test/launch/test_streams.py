@@ -39,6 +39,7 @@ from fogros2 import (
     FogROSLaunchDescription,
     StreamTopic,
 )
+from fogros2.actions.override import OverrideMachines, Overrides
 from fogros2.image_transport.h264 import H264
 from fogros2.testing.plugins import instead
 
@@ -392,6 +393,34 @@ def test_components_are_told(run, fake, planner, caplog, box, streams):
     # nothing of it stays, and what isn't loaded isn't looked at
     assert len(list(view.remappings)) == 2 and Loading.told[2] == []
     assert not [record for record in caplog.records if 'components were' in record.getMessage()]
+
+
+def test_a_group_that_only_loads_components_starts_their_streams(run, fake, planner, box, caplog):
+    """Into a container that another group has; its streams are known when they are told."""
+    ends_when_all_started(fake, 3)
+    load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
+    assert run(watched(
+        fake, FogROSLaunchDescription, CloudGroup(planner, [box]),
+        CloudGroup(planner, [load, load], stream_topics=[('/camera', 'h264')]))) == 0
+    assert there(fake, 'planner') == ['camera_h264_decoder', 'own']
+    assert here(fake) == ['camera_h264_encoder']
+    assert Loading.told == 2 * ([
+        ('/camera', '/fogros2/planner/camera'),
+        ('/camera_info', '/fogros2/planner/camera_info')],)
+    assert not [record for record in caplog.records if 'components were' in record.getMessage()]
+
+
+def test_components_on_the_robot_have_streams_from_machines(run, fake, mapper):
+    ends_when_all_started(fake, 3)
+    load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
+    description = watched(
+        fake, LaunchDescription, talker(mapper), CloudGroup(
+            ContainerInstance(name='here'), [load],
+            stream_topics=[StreamTopic('/map', source=mapper), ('/camera', 'h264')]))
+    assert run(LaunchDescription([OverrideMachines(Overrides(['here=robot']), [description])])) == 0
+    assert there(fake, 'mapper') == ['map_h264_encoder', 'own']
+    assert here(fake) == ['map_h264_decoder_from_mapper']
+    assert Loading.told == ([],)
 
 
 @pytest.mark.parametrize('condition', ['true', 'false'])
