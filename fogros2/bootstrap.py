@@ -24,7 +24,7 @@ from typing import Literal, Optional
 from fogros2 import host, process
 from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import DEFAULT_RMW, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
@@ -149,6 +149,7 @@ def ensure(
     :param on_plan: is told how things will run there as soon as files can be sent and the VPN set
         up, which needs nothing of what takes longest.
     :returns: how things run there, and a few words on what was done.
+    :raises ConfigurationError: the machine is this computer.
     :raises PrerequisiteError: the machine can't be made ready.
     :raises WorkspaceError: the workspace can't go there, built or not.
     """
@@ -158,6 +159,7 @@ def ensure(
         there = shell.run(question, timeout=timeout, cancel=cancel)
         robot = here.result()
     facts = host.parse_facts(there.stdout)
+    check_elsewhere(spec, facts, robot)
     workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
     todo = plan_alike(spec, facts, robot, under, workspace)
     if todo is None:
@@ -179,6 +181,21 @@ def ensure(
     for command in todo.commands:
         shell.run(command, timeout=timeout, cancel=cancel)
     return todo.install, todo.note
+
+
+def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:
+    """
+    Check that a machine has a network of its own.
+
+    What goes from an address of a network to another of the same one never leaves it, so it can't
+    come out of a VPN.
+
+    :raises ConfigurationError: it has the robot's.
+    """
+    if facts.network and facts.network == robot.network:
+        raise ConfigurationError(
+            f"'{spec.name}' is this robot itself, or shares its network: no VPN leads there",
+            f'run its nodes here with --machine {spec.name}=robot, or in a ContainerInstance')
 
 
 _asking = threading.Lock()

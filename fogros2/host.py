@@ -52,6 +52,9 @@ done
 [ ! -c /dev/net/tun ] || echo tun
 df -Pk "$HOME" 2>/dev/null | while read -r _ _ _ free _; do echo "disk $free"; done | tail -n 1
 ip -4 route show 2>/dev/null | while read -r to _; do echo "route $to"; done
+if read -r b 2>/dev/null </proc/sys/kernel/random/boot_id && n=$(readlink /proc/self/ns/net); then
+    echo "network $b $n"
+fi
 for k in "$HOME"/.local/share/fogros2/*/complete; do
     [ ! -e "$k" ] || { k=${k%/complete}; echo "installed ${k##*/}"; }
 done
@@ -107,6 +110,8 @@ class HostFacts:
     :param ros: prefixes of ROS 2 by distro, ``rmw`` the middlewares each has.
     :param free_bytes: on the home's disk; None where unknown.
     :param routes: IPv4 networks the computer has routes to, in CIDR form or as addresses.
+    :param network: tells the network that its processes have from any other's, '' where unknown:
+        the boot of its kernel and the network namespace.
     :param installed: keys of embedded defaults that earlier launches have left complete.
     :param environments: of the prefixes asked for, those that are there and work, each with a
         signature of the packages in it.
@@ -130,6 +135,7 @@ class HostFacts:
     tun: bool = False
     free_bytes: Optional[int] = None
     routes: tuple[str, ...] = ()
+    network: str = ''
     installed: frozenset[str] = frozenset()
     environments: Mapping[str, str] = dataclasses.field(default_factory=dict)
     cloud_launch: str = ''
@@ -204,5 +210,5 @@ def parse_facts(output: str) -> HostFacts:
         pythons=tuple(pythons), programs=frozenset(programs), ros=ros, rmw=rmw,
         kernel_wireguard='kernel-wireguard' in one, tun='tun' in one,
         free_bytes=int(disk) * 1024 if disk.isdigit() else None, routes=tuple(routes),
-        installed=frozenset(installed), environments=environments,
-        cloud_launch=one.get('cloud_launch', ''))
+        network=one.get('network', ''), installed=frozenset(installed),
+        environments=environments, cloud_launch=one.get('cloud_launch', ''))

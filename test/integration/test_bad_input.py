@@ -19,10 +19,12 @@ import uuid
 
 import pytest
 
+from fogros2 import process
 from fogros2.provider import container_root
 from fogros2.store import Store
 from fogros2.testing.bare_computer import bare_computer
 from fogros2.testing.launched import launching
+from fogros2.testing.sshd import private_sshd
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -307,6 +309,17 @@ def test_a_refused_key(refused, computer, tmp_path):
     error, _ = refused(ssh(computer, key=str(key)))
     assert f'({computer.user}@{computer.address}) does not accept {key}' in error
     assert 'authorized_keys' in error
+
+
+@pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
+def test_a_computer_that_is_the_robot(refused, tmp_path):
+    """Its two ends of the VPN would be in one network, where nothing goes through a VPN."""
+    with private_sshd(tmp_path / 'sshd') as server:
+        error, text = refused(
+            f"SSHInstance('localhost', {server.endpoint.user!r}, {server.port}, "
+            f'{server.endpoint.key_file!r}, {server.host_key!r}, name={NAME!r})')
+    assert f"'{NAME}' is this robot itself" in error
+    assert f'--machine {NAME}=robot' in error
 
 
 def test_a_computer_without_rsync(refused, computer):

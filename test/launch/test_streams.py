@@ -417,7 +417,8 @@ def test_components_on_the_robot_have_streams_from_machines(run, fake, mapper):
         fake, LaunchDescription, talker(mapper), CloudGroup(
             ContainerInstance(name='here'), [load],
             stream_topics=[StreamTopic('/map', source=mapper), ('/camera', 'h264')]))
-    assert run(LaunchDescription([OverrideMachines(Overrides(['here=robot']), [description])])) == 0
+    here_too = OverrideMachines(Overrides(['here=robot']), [description])
+    assert run(LaunchDescription([here_too])) == 0
     assert there(fake, 'mapper') == ['map_h264_encoder', 'own']
     assert here(fake) == ['map_h264_decoder_from_mapper']
     assert Loading.told == ([],)

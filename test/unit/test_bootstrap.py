@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from fogros2 import bootstrap, host, process, wheels
-from fogros2.errors import PrerequisiteError, WorkspaceError
+from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import HostFacts, Python
 from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import Underlay
@@ -96,6 +97,23 @@ def test_the_probe_works_here() -> None:
     assert ('rsync' in facts.programs) == (process.which('rsync') is not None)
     assert sys.prefix in facts.environments
     assert facts.cloud_launch.endswith('fogros2/cloud_launch.py')
+
+
+def test_a_machine_that_has_the_robot_s_network_is_refused() -> None:
+    boot = '6f2c1f5e-7a8e-4f0e-9a57-0d6a3c1f6f7d'
+    robot = dataclasses.replace(NOBLE, network=f'{boot} net:[4026531840]')
+    spec = MachineSpec('m', 'ssh')
+    with pytest.raises(ConfigurationError, match="'m' is this robot itself") as caught:
+        bootstrap.check_elsewhere(spec, robot, robot)
+    assert '--machine m=robot' in str(caught.value)
+    # a container on the robot, another computer, one without /proc
+    for network in (f'{boot} net:[4026532312]', f'{boot[::-1]} net:[4026531840]', ''):
+        other = dataclasses.replace(NOBLE, network=network)
+        bootstrap.check_elsewhere(spec, other, robot)
+        bootstrap.check_elsewhere(spec, other, NOBLE)
+    # what this computer says of itself
+    here = host.parse_facts(process.run(host.probe(), timeout=30).stdout).network
+    assert re.fullmatch(r'[-0-9a-f]{36} net:\[\d+\]', here)
 
 
 def test_the_probe_survives_odd_prefixes(tmp_path: Path) -> None:
