@@ -15,6 +15,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+from image_transport_h264.turns import Turns
+
 #: A stream's packets: for recorders and others who ask for it, those the network lost come again.
 STREAM_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.RELIABLE,
@@ -55,7 +57,13 @@ class LazyNode(Node):
         super().__init__(name)
         self._complained: set[str] = set()
         self._complaining = threading.Lock()
+        self._turns = Turns()
         self.failed = False
+
+    def destroy_node(self) -> None:
+        """End the node, whose worker has ended."""
+        self._turns.close()
+        super().destroy_node()
 
     def fail(self) -> None:
         """End the process: a node that can't do its work is to be started anew."""
@@ -73,13 +81,16 @@ class LazyNode(Node):
 
     def put_through(self, publisher: Publisher, message: Any) -> None:
         """
-        Publish a message, and if it is a large one, wait until it is there.
+        Publish a message; if it is a large one, when it is its turn, and wait until it is there.
 
         Large images in quick succession leave a slow link no room for what it lost of them: none
         would ever be whole. What comes meanwhile is left out, but for the newest.
         """
-        self.put_out(publisher, message)
-        if len(message.data) >= LARGE:
+        if len(message.data) < LARGE:
+            self.put_out(publisher, message)
+            return
+        with self._turns.taken(LONGEST):
+            self.put_out(publisher, message)
             try:
                 publisher.wait_for_all_acked(Duration(seconds=LONGEST))
             except RuntimeError:  # RCLError, in rclpy's words: the end has come meanwhile
