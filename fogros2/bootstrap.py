@@ -138,7 +138,7 @@ def dependencies(spec: MachineSpec, under: Underlay) -> str:
 def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None, wheel_folder: Optional[Path] = None,
-    on_plan: Callable[[RosInstall], object] = lambda install: None,
+    on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
 ) -> tuple[RosInstall, str]:
     """
     Make a machine ready for ROS 2 nodes, by what it has and by ``spec.bootstrap``.
@@ -148,8 +148,9 @@ def ensure(
     :param wheel_folder: the robot's wheel cache, if not the usual one.
     :param on_plan: is told how things will run there as soon as files can be sent and the VPN set
         up, which needs nothing of what takes longest.
+    :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :returns: how things run there, and a few words on what was done.
-    :raises ConfigurationError: the machine is this computer.
+    :raises ConfigurationError: the machine is to be elsewhere, and isn't.
     :raises PrerequisiteError: the machine can't be made ready.
     :raises WorkspaceError: the workspace can't go there, built or not.
     """
@@ -159,7 +160,8 @@ def ensure(
         there = shell.run(question, timeout=timeout, cancel=cancel)
         robot = here.result()
     facts = host.parse_facts(there.stdout)
-    check_elsewhere(spec, facts, robot)
+    if elsewhere:
+        check_elsewhere(spec, facts, robot)
     workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
     todo = plan_alike(spec, facts, robot, under, workspace)
     if todo is None:

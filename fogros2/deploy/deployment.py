@@ -109,7 +109,8 @@ class Deployment:
         with job.step('ROS 2') as detail:
             ros, note = bootstrap.ensure(
                 shell, self.launch.underlay(job.spec.workspace), job.spec,
-                timeout=job.timeouts.install, cancel=job.cancel, on_plan=on_plan)
+                timeout=job.timeouts.install, cancel=job.cancel, on_plan=on_plan,
+                elsewhere=True)
             detail.append(note)
             return ros
 
