@@ -5,7 +5,8 @@ The robot's side of the SLAM example: a camera that also measures what comes bac
 Publishes ``camera/image`` and ``camera/depth``, or ``camera/right/image``, each with its camera
 info, all stamped alike; takes ``pose`` and ``path``. A round trip is the time from the
 publication of a frame to the pose that bears its stamp. With ``wait`` a frame waits for the pose
-of the one before, though not for ever: who is slow is seen to be slow, and doesn't get lost.
+of the one before (of the one ``ahead`` before it), though not for ever: who is slow is seen to be
+slow, and doesn't get lost.
 At the end it says how long those took and how good the poses were, and draws the trajectory.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 import importlib.util
+from itertools import islice
 import json
 import math
 from pathlib import Path
@@ -56,6 +58,7 @@ class SlamCamera(Node):
         seed = int(self.declare_parameter('seed', 1).value)
         rate = float(self.declare_parameter('rate', 10.0).value)
         self.patient = bool(self.declare_parameter('wait', True).value)
+        self.ahead = max(1, int(self.declare_parameter('ahead', 1).value))
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
         self.source = (sources.dataset(Path(self.folder), count) if self.folder
                        else sources.synthetic(width, height, count, stereo, seed))
@@ -95,9 +98,9 @@ class SlamCamera(Node):
             last = next(reversed(self.sent), None)
             self.ended = last in self.final or time.monotonic() > self.deadline
             return
-        if self.patient and self.sent:
-            last, when = next(reversed(self.sent.items()))
-            if last not in self.answered and time.perf_counter() - when < PATIENCE / 2:
+        if self.patient and len(self.sent) >= self.ahead:
+            before, when = next(islice(reversed(self.sent.items()), self.ahead - 1, None))
+            if before not in self.answered and time.perf_counter() - when < PATIENCE / 2:
                 return
         if not self.next.done():
             return  # the disk is slower than the rate
@@ -163,6 +166,9 @@ class SlamCamera(Node):
             Path(self.results).write_text(json.dumps({
                 'sent': len(self.sent), 'round_trips': [float(trip) for trip in trips],
                 'computing': [self.computed.get(stamp, math.nan) for stamp in self.answered],
+                # when each came, seconds after the first
+                'came': [when - next(iter(self.answered.values()))
+                         for when in self.answered.values()],
                 **{f'{name}_{error}': getattr(one, error)
                    for name, one in (('live', live), ('final', final)) if one is not None
                    for error in ('ate', 'rpe')}}))
