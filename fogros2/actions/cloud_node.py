@@ -17,7 +17,7 @@ from fogros2.actions.remote import RemoteProcess
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from launch import SomeSubstitutionsType
+    from launch import SomeSubstitutionsType, Substitution
 
     from fogros2.image_transport.streams import Entry
 
@@ -34,14 +34,15 @@ class CloudNode(Node, RemoteProcess):
         those that the robot publishes and the machine reads, or StreamTopic.
     :param image: container image that the node runs in on the machine, such as
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
-    :param image_options: what ``docker run`` is told besides, such as ['--gpus=all'].
+    :param image_options: what ``docker run`` is told besides, such as ['--gpus=all']; of a
+        substitution, the words that a comma parts.
     """
 
     def __init__(
         self, machine: Union[CloudInstance, SomeSubstitutionsType],
         stream_topics: Sequence[Entry] = (),
         image: Optional[SomeSubstitutionsType] = None,
-        image_options: Sequence[SomeSubstitutionsType] = (), **kwargs: Any,
+        image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (), **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(machine, CloudInstance) and not words.is_text(machine):
@@ -51,7 +52,7 @@ class CloudNode(Node, RemoteProcess):
         self._fogros2_machine = machine
         self.stream_topics = list(stream_topics)
         self._image = image
-        self._image_options = list(image_options)
+        self._image_options = words.items(image_options)
         if isinstance(image_options, str) or image_options and image is None:
             raise ConfigurationError(
                 f'image_options={image_options!r} is no list of options for an image',
@@ -72,7 +73,7 @@ class CloudNode(Node, RemoteProcess):
 
     def _use_image(self, context: LaunchContext) -> None:
         image = words.resolve(context, self._image)
-        options = [words.resolve(context, option) for option in self._image_options]
+        options = words.resolve(context, self._image_options)
         containers.node_container(image, options)
         if self.shell:
             raise ConfigurationError(

@@ -11,7 +11,7 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING, Union
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from launch import LaunchContext, SomeSubstitutionsType
+    from launch import LaunchContext, SomeSubstitutionsType, Substitution
 
 _TRUTHS = {'true': True, '1': True, 'false': False, '0': False}
 
@@ -28,10 +28,13 @@ class Listed:
 
 
 def items(
-    values: Union[Iterable[SomeSubstitutionsType], Listed, None],
+    values: Union[Iterable[SomeSubstitutionsType], Substitution, Listed, None],
 ) -> Union[Items, Listed, None]:
-    """Return values that stay apart, None for none."""
-    return values if values is None or isinstance(values, Listed) else Items(values)
+    """Return values that stay apart, None for none; a substitution is several in one text."""
+    if values is None or isinstance(values, Listed):
+        return values
+    # known by what it does: describing a machine doesn't import launch
+    return Listed(values) if hasattr(values, 'perform') else Items(values)
 
 
 def split(text: str) -> list[str]:

@@ -17,11 +17,15 @@ def generate_launch_description():
              'left': ('camera/left', 'its topic for the image, or the left one'),
              'right': ('camera/right', 'its topic for the right image'),
              'depth': ('camera/depth', 'its topic for the depth image'),
-             'pose': ('camera/pose', 'its topic for poses (geometry_msgs/PoseStamped)')}
+             'pose': ('camera/pose', 'its topic for poses (geometry_msgs/PoseStamped)'),
+             'options': ('', "of 'docker run' for it, such as '--gpus=all, -v, /orb:/orb:ro'"),
+             'mounts': ('', 'folders that a container machine sees, such as that of the image')}
     shown = {'dataset': ('', "a folder in TUM's RGB-D format, '' for the synthetic room"),
              'stereo': ('true', 'whether the synthetic camera has two eyes, or sees depth'),
+             'width': ('640', 'of its images'), 'height': ('480', 'of its images'),
              'frames': ('200', 'after which the launch ends; 0 for all that a dataset has'),
              'rate': ('10.0', 'frames per second, at most'),
+             'wait': ('true', 'whether a frame waits for the pose of the one before'),
              'picture': ('', 'a file to draw the trajectory in'),
              'results': ('', 'a file for the figures, as JSON')}
     names = [(LaunchConfiguration('left'), '/camera/image'),
@@ -37,9 +41,12 @@ def generate_launch_description():
         *(DeclareLaunchArgument(name, default_value=value, description=what)
           for name, (value, what) in (asked | shown).items()),
         # other machines run containers without being asked
-        FogMachine(LaunchConfiguration('machine'), {'name': 'slam', 'containers': PythonExpression(
-            ["'true' if '", LaunchConfiguration('machine'), "' == 'container' else ''"])}),
+        FogMachine(LaunchConfiguration('machine'), {
+            'name': 'slam', 'mounts': LaunchConfiguration('mounts'),
+            'containers': PythonExpression(
+                ["'true' if '", LaunchConfiguration('machine'), "' == 'container' else ''"])}),
         CloudNode(machine='slam', image=LaunchConfiguration('image'), output='screen',
+                  image_options=LaunchConfiguration('options'),
                   package=LaunchConfiguration('package'),
                   executable=LaunchConfiguration('executable'), remappings=names,
                   arguments=[LaunchConfiguration('vocabulary'), LaunchConfiguration('settings'),

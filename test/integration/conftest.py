@@ -1,25 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network that leads nowhere for simulated clouds, and a look at what a test leaves behind."""
+"""
+A network that leads nowhere for simulated clouds, images for its machines' engines, and a look at
+what a test leaves behind.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import metadata
 import ipaddress
 import os
 from pathlib import Path
+import shutil
 import subprocess
+import sys
 import uuid
 
 import pytest
 
 from fogros2.model import Command
 from fogros2.process import run, which
+from fogros2.provider import container_root
+from fogros2.testing.cluster import images as cluster_images
 from fogros2.testing.traces import nothing_left as nothing_left_of
 from fogros2.testing.traces import RUN, Traces
 
 #: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
 #: the tests may meet on one computer.
 SUBNETS = [f'198.51.100.{host}/28' for host in range(0, 256, 16)]
+#: Stands for ROS 2 without Cyclone DDS, and for the package manager that brings it.
+ROS = {
+    'usr/bin/apt-get': """#!/bin/sh
+[ "$1" != install ] || busybox touch /opt/ros/jazzy/lib/librmw_cyclonedds_cpp.so
+""",
+    'opt/ros/jazzy/setup.sh': 'AMENT_PREFIX_PATH=/opt/ros/jazzy\n',
+    'opt/ros/jazzy/lib/demo/program': """#!/bin/sh
+echo "it has $(cd /opt/ros/jazzy/lib; echo *) for $RMW_IMPLEMENTATION and was told $*"
+""",
+}
+#: What of a Debian system Python and ROS 2's libraries don't need.
+LEFT_OUT = ('./var', './usr/share', './usr/sbin', './usr/lib/apt', './usr/lib/systemd',
+            './usr/lib/*/perl*', './usr/lib/*/gconv')
 
 
 @pytest.fixture(scope='session')
@@ -86,6 +107,82 @@ def nobody(engine: str, cloud_network: str) -> str:
                           '{{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60).stdout
     # the engine hands addresses out from the other end
     return str(list(ipaddress.ip_network(subnet.strip()).hosts())[-1])
+
+
+@pytest.fixture(scope='session')
+def busybox(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a layer that holds busybox alone."""
+    program = shutil.which('busybox')
+    if program is None:
+        pytest.skip('needs busybox')
+    path = tmp_path_factory.mktemp('busybox') / 'layer.tar'
+    archive = container_root.Archive()
+    archive.file('bin/busybox', Path(program).read_bytes(), 0o755)
+    archive.link('bin/sh', 'busybox')
+    path.write_bytes(archive.data())
+    return path
+
+
+@pytest.fixture(scope='session')
+def crun(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Return mounts that bring crun to a machine made of this computer's root."""
+    if which('crun'):
+        return []
+    folder = tmp_path_factory.mktemp('crun')
+    # not installed here, where podman would take it for its own containers
+    made = run(Command(('sh', '-ec', 'cd "$1"; apt-get download -q crun libyajl2; '
+                        'for each in *.deb; do dpkg -x "$each" .; done', 'sh', str(folder))),
+               timeout=60, check=False)
+    if made.returncode:
+        pytest.skip('needs crun, or a package index that has it')
+    return [f'{path.resolve()}:/{path.relative_to(folder)}'
+            for name in ('usr/bin/crun', 'libyajl.so.2') for path in folder.rglob(name)]
+
+
+@pytest.fixture(scope='session')
+def images(engine: str, busybox: Path, tmp_path_factory: pytest.TempPathFactory,
+           ) -> Iterator[Path]:
+    """Return a folder with images as files: a Debian system, one like ROS 2's, and busybox."""
+    if which('debootstrap') is None:
+        pytest.skip('needs debootstrap')
+    folder = tmp_path_factory.mktemp('images')
+    cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/kubernetes')
+    with cluster_images.alone(cache):
+        root = cluster_images.base(cache, print)
+    system, top, ros = (folder / f'{name}.layer' for name in ('system', 'top', 'ros'))
+    run(Command(('tar', '-C', str(root), '--one-file-system', '-cf', str(system), *(
+        f'--exclude={pattern}' for pattern in LEFT_OUT), '.'), sudo=True), timeout=60)
+    # the robot's Python may lie in root's home
+    archive = container_root.Archive()
+    archive.folder('root', 0o711)
+    top.write_bytes(archive.data())
+    archive = container_root.Archive()
+    for name, text in ROS.items():
+        archive.file(name, text.encode(), 0o755)
+    ros.write_bytes(archive.data())
+    # as an entry point would set up what is mounted: the robot's ROS 2, or the embedded default
+    here = [f'PATH={sys.prefix}/bin:/usr/bin:/bin', 'AMENT_PREFIX_PATH=' + ':'.join(
+        [*filter(None, [os.environ.get('AMENT_PREFIX_PATH')]), sys.prefix])]
+    here += [f'{name}={os.environ[name]}' for name in ('LD_LIBRARY_PATH', 'PYTHONPATH')
+             if name in os.environ]
+    for name, layers, variables in (
+            ('system', (system, top), here), ('ros', (busybox, ros), ['PATH=/usr/bin:/bin']),
+            ('box', (busybox,), ['PATH=/bin'])):
+        cluster_images.write_archive(folder / f'{name}.tar', [cluster_images.Image(
+            f'fogros2.test/{name}:1', layers, {'Env': variables})])
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(scope='session')
+def with_python() -> list[str]:
+    """Return options of ``docker run`` that bring this Python environment into ``system.tar``."""
+    mounts = container_root.environment_mounts(None)
+    try:
+        metadata.distribution('ros2-embedded')
+    except metadata.PackageNotFoundError:
+        mounts.append('/usr/lib')  # what ROS 2 is linked with
+    return [word for mount in mounts for word in ('-v', f'{mount}:{mount}:ro')]
 
 
 @pytest.fixture

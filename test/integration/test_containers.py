@@ -7,15 +7,12 @@ is reached by SSH, and with one of its own on a container machine.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from importlib import metadata
 import os
 from pathlib import Path
 import re
 import secrets
-import shutil
 import signal
 import subprocess
-import sys
 
 import pytest
 
@@ -24,26 +21,11 @@ from fogros2.containers import Container
 from fogros2.errors import CommandError
 from fogros2.model import Command, CreateRequest, Endpoint, MachineSpec, NodeSpec
 from fogros2.process import run, which
-from fogros2.provider import container_engine, container_root
+from fogros2.provider import container_engine
 from fogros2.provider.container import ContainerProvider
 from fogros2.shell.local import LocalShell
-from fogros2.testing.cluster import images as cluster_images
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
-
-
-@pytest.fixture(scope='module')
-def busybox(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a layer that holds busybox alone."""
-    program = shutil.which('busybox')
-    if program is None:
-        pytest.skip('needs busybox')
-    path = tmp_path_factory.mktemp('busybox') / 'layer.tar'
-    archive = container_root.Archive()
-    archive.file('bin/busybox', Path(program).read_bytes(), 0o755)
-    archive.link('bin/sh', 'busybox')
-    path.write_bytes(archive.data())
-    return path
 
 
 @pytest.fixture(scope='module')
@@ -249,72 +231,6 @@ def generate_launch_description():
         Node(package='fogros2_examples', executable='listener', output='screen')])
 """
 
-#: Stands for ROS 2 without Cyclone DDS, and for the package manager that brings it.
-ROS = {
-    'usr/bin/apt-get': """#!/bin/sh
-[ "$1" != install ] || busybox touch /opt/ros/jazzy/lib/librmw_cyclonedds_cpp.so
-""",
-    'opt/ros/jazzy/setup.sh': 'AMENT_PREFIX_PATH=/opt/ros/jazzy\n',
-    'opt/ros/jazzy/lib/demo/program': """#!/bin/sh
-echo "it has $(cd /opt/ros/jazzy/lib; echo *) for $RMW_IMPLEMENTATION and was told $*"
-""",
-}
-#: What of a Debian system Python and ROS 2's libraries don't need.
-LEFT_OUT = ('./var', './usr/share', './usr/sbin', './usr/lib/apt', './usr/lib/systemd',
-            './usr/lib/*/perl*', './usr/lib/*/gconv')
-
-
-@pytest.fixture(scope='module')
-def crun(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Return mounts that bring crun to a machine made of this computer's root."""
-    if which('crun'):
-        return []
-    folder = tmp_path_factory.mktemp('crun')
-    # not installed here, where podman would take it for its own containers
-    made = run(Command(('sh', '-ec', 'cd "$1"; apt-get download -q crun libyajl2; '
-                        'for each in *.deb; do dpkg -x "$each" .; done', 'sh', str(folder))),
-               timeout=60, check=False)
-    if made.returncode:
-        pytest.skip('needs crun, or a package index that has it')
-    return [f'{path.resolve()}:/{path.relative_to(folder)}'
-            for name in ('usr/bin/crun', 'libyajl.so.2') for path in folder.rglob(name)]
-
-
-@pytest.fixture(scope='module')
-def images(engine: str, busybox: Path, tmp_path_factory: pytest.TempPathFactory,
-           ) -> Iterator[Path]:
-    """Return a folder with images as files: a Debian system, one like ROS 2's, and busybox."""
-    if which('debootstrap') is None:
-        pytest.skip('needs debootstrap')
-    folder = tmp_path_factory.mktemp('images')
-    cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/kubernetes')
-    with cluster_images.alone(cache):
-        root = cluster_images.base(cache, print)
-    system, top, ros = (folder / f'{name}.layer' for name in ('system', 'top', 'ros'))
-    run(Command(('tar', '-C', str(root), '--one-file-system', '-cf', str(system), *(
-        f'--exclude={pattern}' for pattern in LEFT_OUT), '.'), sudo=True), timeout=60)
-    # the robot's Python may lie in root's home
-    archive = container_root.Archive()
-    archive.folder('root', 0o711)
-    top.write_bytes(archive.data())
-    archive = container_root.Archive()
-    for name, text in ROS.items():
-        archive.file(name, text.encode(), 0o755)
-    ros.write_bytes(archive.data())
-    # as an entry point would set up what is mounted: the robot's ROS 2, or the embedded default
-    here = [f'PATH={sys.prefix}/bin:/usr/bin:/bin', 'AMENT_PREFIX_PATH=' + ':'.join(
-        [*filter(None, [os.environ.get('AMENT_PREFIX_PATH')]), sys.prefix])]
-    here += [f'{name}={os.environ[name]}' for name in ('LD_LIBRARY_PATH', 'PYTHONPATH')
-             if name in os.environ]
-    for name, layers, variables in (
-            ('system', (system, top), here), ('ros', (busybox, ros), ['PATH=/usr/bin:/bin']),
-            ('box', (busybox,), ['PATH=/bin'])):
-        cluster_images.write_archive(folder / f'{name}.tar', [cluster_images.Image(
-            f'fogros2.test/{name}:1', layers, {'Env': variables})])
-    yield folder
-    shutil.rmtree(folder)
-
-
 def volumes() -> set[str]:
     listed = run(Command(('podman', 'volume', 'ls', '-q'), sudo=True), timeout=30).stdout
     return set(listed.split())
@@ -324,19 +240,14 @@ def volumes() -> set[str]:
 @pytest.mark.usefixtures('nothing_left')
 @pytest.mark.skipif(which('ros2') is None, reason='needs ros2 on PATH')
 def test_a_container_machine_runs_containers_and_nodes_in_images(
-        images, crun, cloud_network, tmp_path, monkeypatch):
+        images, crun, with_python, cloud_network, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     name = f'boxes-{secrets.token_hex(3)}'
     before = volumes()
-    mounts = container_root.environment_mounts(None)
-    try:
-        metadata.distribution('ros2-embedded')
-    except metadata.PackageNotFoundError:
-        mounts.append('/usr/lib')  # what ROS 2 is linked with
     path = tmp_path / 'boxes.launch.py'
     path.write_text(LAUNCH_FILE.format(
         name=name, network=cloud_network, images=images, mounts=[str(images), *crun],
-        options=[word for mount in mounts for word in ('-v', f'{mount}:{mount}:ro')]))
+        options=with_python))
     with launching() as start:
         launched = start(str(path))
         launched.wait_for(f'I heard: [Hello World from {name} ')

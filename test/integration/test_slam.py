@@ -92,6 +92,23 @@ def test_orb_slam_in_its_place(launch):
     assert "missing required argument 'image'" in refused.text
 
 
+@pytest.mark.timeout(150)
+@pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
+def test_another_slam_in_an_image(launch, images, crun, with_python, tmp_path):
+    """Our own stands for it: in an image of this computer's, under names that are its own."""
+    run = launch(
+        'fogros2_examples', 'slam_orb.launch.py', f'image:=oci-archive:{images}/system.tar',
+        f'mounts:={", ".join([str(images), *crun])}', f'options:={", ".join(with_python)}',
+        'package:=fogros2_examples', 'executable:=slam', 'left:=camera/image',
+        'right:=camera/right/image', 'pose:=pose', *SMALL, f'results:={tmp_path}/results.json')
+    assert run.ended(120) == 0, run.text
+    assert run.errors == [], run.text
+    found = json.loads((tmp_path / 'results.json').read_text())
+    assert found['sent'] == 25
+    assert len(found['round_trips']) >= 20, run.text
+    assert found['live_ate'] < 0.1
+
+
 class Side:
     """A robot's side in this process: publishes what a test says, keeps what comes back."""
 

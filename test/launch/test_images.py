@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 import pytest
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2 import CloudNode, ContainerInstance, FogMachine, FogROSLaunchDescription
 from fogros2.actions.override import OverrideMachines, Overrides
 
 
@@ -37,6 +37,31 @@ def test_what_is_in_an_image_is_not_looked_for_here(run, fake, planner):
     assert eyes.image_options == ('--gpus', 'all')
     assert any('rate: 5' in text for text in eyes.files.values())
     assert (talker.image, talker.image_options) == ('', ())
+
+
+@pytest.mark.parametrize(('given', 'options'), [
+    ('', ()), ('--gpus=all', ('--gpus=all',)), ('-v, /a b:/c:ro', ('-v', '/a b:/c:ro')),
+    ("['-e', 'A=1,2']", ('-e', 'A=1,2'))])
+def test_options_may_come_as_one_argument(run, fake, planner, given, options):
+    fake.on_start = ends
+    assert run(LaunchDescription([
+        DeclareLaunchArgument('options', default_value=given),
+        CloudNode(machine=planner, package='demo', executable='talker', image='ros:jazzy',
+                  image_options=LaunchConfiguration('options'))])) == 0
+    (talker,) = fake.machines['planner'].all
+    assert talker.image_options == options
+
+
+@pytest.mark.parametrize(('provider', 'given', 'mounts'), [
+    ('container', '', []), ('container', '/usr, /etc:/other', ['/usr', '/etc:/other']),
+    ('aws', '', None)])
+def test_a_machine_s_folders_may_come_as_one_argument(provider, given, mounts):
+    context = LaunchContext()
+    context.launch_configurations.update(provider=provider, mounts=given)
+    action = FogMachine(LaunchConfiguration('provider'), {
+        'name': 'planner', 'ros_workspace': '', 'mounts': LaunchConfiguration('mounts')})
+    action.execute(context)
+    assert action.machine.spec(context).options.get('mounts') == mounts
 
 
 @pytest.mark.parametrize(('overrides', 'more', 'why'), [

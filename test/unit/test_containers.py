@@ -171,7 +171,7 @@ def test_an_image_is_an_attribute_in_xml(tmp_path):
     description: LaunchDescription = get_launch_description_from_any_launch_file(str(path))
     (node,) = description.entities
     assert node._image == 'ros:jazzy'
-    assert node._image_options == ['--gpus=all', '--init']
+    assert node._image_options == ('--gpus=all', '--init')
 
 
 # --- the scripts, with an engine that notes what it is told --------------------------------------
