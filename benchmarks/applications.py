@@ -29,7 +29,10 @@ import sys
 import tempfile
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from trajectories import Errors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -107,8 +110,8 @@ class Result:
     :param speed_up: of all trials that both did.
     :param ratio: of compute that was given to the cloud and to the robot.
     :param limit: what the network's part takes at the least: the bytes at the link's rate, the
-        codec and the hops, each measured alone.
-    :param ate: error of a trajectory in cm, ``rpe`` in cm a metre; None where there is none.
+        codec and the hops, each measured alone; 0 where it goes on beside the computing.
+    :param errors: of trajectories; None where there are none.
     """
 
     scenario: str
@@ -125,8 +128,7 @@ class Result:
     paper: tuple[float, float, float]
     trials: int
     held_trials: int
-    ate: Optional[float] = None
-    rpe: Optional[float] = None
+    errors: Optional[Errors] = None
 
 
 # --- the robot ----------------------------------------------------------------------------------
@@ -402,13 +404,18 @@ def table(results: Sequence[Result], note: str) -> str:
         lines += [
             f'| {r.scenario}{_errors(r)} | {NAMES[r.codec]} | {r.robot:.2f} | {r.compute:.2f} | '
             f'{r.network:.3f} | {r.total:.2f} | {r.speed_up:.1f}x | {r.ratio:.1f}x | '
-            f'{r.limit:.3f} | {r.network / r.limit:.2f} | {r.sent:.0f} | '
+            f'{_limit(r)} | {r.sent:.0f} | '
             f'{", ".join(f"{one:g}" for one in r.paper)} |' for r in rows]
     return '\n'.join([*lines, ''])
 
 
+def _limit(r: Result) -> str:
+    return f'{r.limit:.3f} | {r.network / r.limit:.2f}' if r.limit else ' | '
+
+
 def _errors(r: Result) -> str:
-    return '' if r.ate is None else f': ATE {r.ate:.2f} cm, RPE {r.rpe:.2f} cm/m'
+    return '' if r.errors is None else (
+        f': ATE {r.errors.ate:.2f} cm, RPE {r.errors.rpe:.2f} cm/m')
 
 
 def rows(results: Sequence[Result]) -> Iterator[Any]:
@@ -419,15 +426,15 @@ def rows(results: Sequence[Result]) -> Iterator[Any]:
         what = f'{r.scenario}{f", {NAMES[r.codec]}" if r.codec else ""}'
         best = r.codec in ('', 'h264')
         yield Row(f'{what}: total', r.total, 's', published=f'{r.paper[2]:g} s', runs=r.trials)
-        yield Row(f'{what}: network over its limit', r.network / r.limit, '', 1.5,
-                  runs=r.trials)
+        if r.limit:
+            yield Row(f'{what}: network over its limit', r.network / r.limit, '', 1.5,
+                      runs=r.trials)
         yield Row(f'{what}: speed-up over ratio of compute', r.speed_up / r.ratio, '',
                   0.9 if best else None, 'more', runs=r.held_trials)
-    raw = {r.scenario: r.ate for r in results if r.codec == 'raw' and r.ate}
-    for r in results:
-        if r.codec != 'raw' and r.ate and r.scenario in raw:
-            yield Row(f'{r.scenario}, {NAMES[r.codec]}: ATE over that of raw',
-                      r.ate / raw[r.scenario], '', 1.2 if r.codec == 'h264' else None)
+        if r.errors is not None and r.codec != 'raw':
+            yield Row(f'{what}: ATE over that of raw, 95 % between {r.errors.low:.2f} and '
+                      f'{r.errors.high:.2f}', r.errors.ratio, '', 1.2 if best else None,
+                      runs=r.errors.rooms)
 
 
 def others() -> Iterator[Callable[..., Sequence[Result]]]:
