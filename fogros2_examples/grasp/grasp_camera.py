@@ -28,8 +28,14 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from fogros2_examples.grasp.bins import camera, depth_image, thrown
-from fogros2_examples.grasp.messages import depth_message, grasps_of, info_message
+from fogros2_examples.grasp.messages import (
+    depth_message,
+    ENCODINGS,
+    grasps_of,
+    info_message,
+)
 from fogros2_examples.grasp.picture import beside, picture
+from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -45,12 +51,15 @@ class GraspCamera(Node):
 
     def __init__(self) -> None:
         super().__init__('grasp_camera')
-        self.trials = int(self.declare_parameter('trials', 10).value)
-        self.seed = int(self.declare_parameter('seed', 0).value)
+        self.trials = within(self, 'trials', 10, 0)
+        self.seed = within(self, 'seed', 0, 0)
         self.encoding = str(self.declare_parameter('encoding', '16UC1').value)
-        self.picture = str(self.declare_parameter('picture', '').value)
-        self.figures = str(self.declare_parameter('figures', '').value)
-        self.wait = float(self.declare_parameter('wait', 60.0).value)
+        if self.encoding not in ENCODINGS:
+            raise BadParameter(
+                f"'encoding' is '{self.encoding}': it has to be {', '.join(ENCODINGS)}")
+        self.picture = writable(self, 'picture', PICTURES)
+        self.figures = writable(self, 'figures')
+        self.wait = within(self, 'wait', 60.0, 0.1)
         self.eye = camera()
         self.ready = False
         self.seconds: dict[tuple[int, int], float] = {}
@@ -113,6 +122,7 @@ class GraspCamera(Node):
                 self.get_logger().info(f'wrote {self.picture}')
             else:
                 self.get_logger().error(f'{self.picture} can not be written')
+                return 1
         return 0 if found == self.trials else 1
 
     def _bin(self, seed: int) -> NDArray[numpy.float32]:
@@ -150,10 +160,12 @@ def _key(stamp: Time) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Run until all bins were shown."""
+    """Run until all bins were shown; a parameter that is none ends it at once."""
     rclpy.init()
     try:
         raise SystemExit(GraspCamera().run())
+    except BadParameter as error:
+        raise SystemExit(f'grasp_camera: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
     except SystemExit:

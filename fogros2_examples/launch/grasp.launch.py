@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Grasp planning: the planner where ``machine:=`` says, a depth camera over ten bins here."""
 
-from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
@@ -24,8 +26,9 @@ def generate_launch_description():
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'grasping', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='grasping', package='fogros2_examples', executable='grasp_planner',
-                  output='screen', stream_topics=[('/depth', LaunchConfiguration('transport'))]),
+                  output='screen', on_exit=ended,
+                  stream_topics=[('/depth', LaunchConfiguration('transport'))]),
         Node(package='fogros2_examples', executable='grasp_camera', output='screen',
-             parameters=[{'trials': LaunchConfiguration('trials'),
-                          'picture': LaunchConfiguration('picture')}], on_exit=Shutdown()),
+             parameters=[{name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+                          for name, kind in (('trials', int), ('picture', str))}], on_exit=ended),
     ])

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion planning: the planner where ``machine:=`` says, who asks it here."""
 
-from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
@@ -26,9 +28,10 @@ def generate_launch_description():
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'planner', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='planner', package='fogros2_examples', executable='motion_planner',
-                  output='screen', parameters=[{'time': LaunchConfiguration('time')}]),
+                  output='screen', on_exit=ended, parameters=[
+                      {'time': ParameterValue(LaunchConfiguration('time'), value_type=float)}]),
         Node(package='fogros2_examples', executable='planning_client', output='screen',
-             parameters=[{'environment': LaunchConfiguration('environment'),
-                          'count': LaunchConfiguration('count'),
-                          'picture': LaunchConfiguration('picture')}], on_exit=Shutdown()),
+             parameters=[{name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+                          for name, kind in (('environment', str), ('count', int),
+                                             ('picture', str))}], on_exit=ended),
     ])

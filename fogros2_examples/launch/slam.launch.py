@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Visual SLAM: the algorithm where ``machine:=`` says, the camera here."""
 
-from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
+from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
     """Describe the two; a stereo camera in a synthetic room, unless told otherwise."""
     shown = {'dataset': ('', "a folder in TUM's RGB-D format, '' for the synthetic room"),
-             'stereo': ('true', 'whether the synthetic camera has two eyes, or sees depth'),
-             'width': ('640', 'of its images'), 'height': ('480', 'of its images'),
-             'frames': ('200', 'after which the launch ends; 0 for all that a dataset has'),
-             'rate': ('10.0', 'frames per second, at most'),
-             'wait': ('true', 'whether a frame waits for the pose of the one before'),
+             'stereo': (True, 'whether the synthetic camera has two eyes, or sees depth'),
+             'width': (640, 'of its images'), 'height': (480, 'of its images'),
+             'frames': (200, 'after which the launch ends; 0 for all that a dataset has'),
+             'rate': (10.0, 'frames per second, at most'),
+             'wait': (True, 'whether a frame waits for the pose of the one before'),
              'picture': ('', 'a file to draw the trajectory in'),
              'results': ('', 'a file for the figures, as JSON')}
     return FogROSLaunchDescription([
@@ -26,14 +28,15 @@ def generate_launch_description():
                               description='of the images there: h264, compressed or raw'),
         DeclareLaunchArgument('foxglove', default_value='false',
                               description='show the topics in a browser: ros2 fog monitor'),
-        *(DeclareLaunchArgument(name, default_value=value, description=what)
+        *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='slam', package='fogros2_examples', executable='slam', output='screen',
+                  on_exit=ended,
                   stream_topics=[(f'/camera/{name}', LaunchConfiguration('transport')) for name in
                                  ('image', 'right/image')] + [('/camera/depth', 'h264')]),
         Node(package='fogros2_examples', executable='slam_camera', output='screen',
-             parameters=[{name: LaunchConfiguration(name) for name in shown}],
-             on_exit=Shutdown()),
+             parameters=[{name: ParameterValue(LaunchConfiguration(name), value_type=type(value))
+                          for name, (value, _) in shown.items()}], on_exit=ended),
     ])

@@ -31,6 +31,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
+from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
 from fogros2_examples.slam import messages, sources
 from fogros2_examples.slam.evaluation import Accuracy, accuracy
 from fogros2_examples.slam.geometry import Array
@@ -41,6 +42,12 @@ from fogros2_examples.slam.tum import DatasetError
 PATIENCE = 5.0
 #: Poses of which an error can be told.
 FEWEST = 3
+#: Pixels: ORB looks for corners 31 from an image's edge; no codec takes more.
+NARROWEST, WIDEST = 64, 4096
+#: Of the synthetic room, which is rendered before it is shown.
+BYTES = 4 << 30
+#: Frames a second.
+SLOWEST, FASTEST = 0.01, 1000
 
 
 class SlamCamera(Node):
@@ -49,16 +56,17 @@ class SlamCamera(Node):
     def __init__(self) -> None:
         super().__init__('slam_camera')
         self.folder = str(self.declare_parameter('dataset', '').value)
-        self.picture = str(self.declare_parameter('picture', '').value)
-        self.results = str(self.declare_parameter('results', '').value)
-        width = int(self.declare_parameter('width', 640).value)
-        height = int(self.declare_parameter('height', 480).value)
-        count = int(self.declare_parameter('frames', 200).value)
+        self.picture = writable(self, 'picture', (*PICTURES, '.pdf', '.svg'))
+        self.results = writable(self, 'results')
+        width = within(self, 'width', 640, NARROWEST, WIDEST)
+        height = within(self, 'height', 480, NARROWEST, WIDEST)
+        count = (within(self, 'frames', 200, 0) if self.folder else
+                 within(self, 'frames', 200, 1, BYTES // (6 * width * height)))
         stereo = bool(self.declare_parameter('stereo', True).value)
         seed = int(self.declare_parameter('seed', 1).value)
-        rate = float(self.declare_parameter('rate', 10.0).value)
+        rate = within(self, 'rate', 10.0, SLOWEST, FASTEST)
         self.patient = bool(self.declare_parameter('wait', True).value)
-        self.ahead = max(1, int(self.declare_parameter('ahead', 1).value))
+        self.ahead = within(self, 'ahead', 1, 1)
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
         self.source = (sources.dataset(Path(self.folder), count) if self.folder
                        else sources.synthetic(width, height, count, stereo, seed))
@@ -147,14 +155,18 @@ class SlamCamera(Node):
         """End the reading thread."""
         self.reader.shutdown(cancel_futures=True)
 
-    def report(self) -> None:
-        """Say what was measured, write it to ``results``, draw ``picture``."""
+    def report(self) -> int:
+        """
+        Say what was measured, write it to ``results``, draw ``picture``; return the exit status.
+
+        :raises OSError: a file can't be written.
+        """
         log = self.get_logger()
         trips = numpy.array([when - self.sent[stamp] for stamp, when in self.answered.items()])
         log.info(f'{len(trips)} of {len(self.sent)} frames were answered')
         if not len(trips):
             log.error("no pose came back: see 'slam_state'")
-            return
+            return 1
         middle, late = 1e3 * numpy.quantile(trips, [0.5, 0.95])
         log.info(f'round trip: median {middle:.0f} ms, 95 % within {late:.0f} ms')
         live, final = self._accuracy(self.live), self._accuracy(self.final)
@@ -177,6 +189,7 @@ class SlamCamera(Node):
             draw(Path(self.picture), final, [1e3 * float(trip) for trip in trips],
                  furnished=not self.folder)
             log.info(f'the trajectory is drawn in {self.picture}')
+        return 0
 
     def _accuracy(self, estimate: dict[int, Array]) -> Optional[Accuracy]:
         both = sorted(estimate.keys() & self.truth.keys())
@@ -190,20 +203,19 @@ class SlamCamera(Node):
 
 
 def main() -> None:
-    """Run until all frames are answered, or interrupted; a folder that is none ends it at once."""
+    """Run until all frames are answered, or interrupted; what it can't do ends it at once."""
     rclpy.init()
     try:
         node = SlamCamera()
-    except DatasetError as error:
+    except (BadParameter, DatasetError) as error:
         raise SystemExit(f'slam_camera: {error}') from error
     try:
         while not node.ended:
             rclpy.spin_once(node, timeout_sec=0.1)
-    except DatasetError as error:
+        raise SystemExit(node.report())
+    except (DatasetError, OSError) as error:
         raise SystemExit(f'slam_camera: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
-    else:
-        node.report()
     finally:
         node.close()

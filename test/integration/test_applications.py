@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import json
 from pathlib import Path
 import re
 import shutil
@@ -243,7 +244,78 @@ def test_a_planner_of_motions_outlives_bad_questions(launch):
     assert planner.returncode == 0, said
 
 
-def test_a_launch_says_what_can_not_be_planned(launch, tmp_path):
-    run = launch('fogros2_examples', 'planning.launch.py', 'machine:=robot', 'environment:=attic')
-    assert run.ended() == 0 and 'exit code 2' in run.text
-    assert "no environment is called 'attic': there are apartment, cubicles" in run.text
+@pytest.mark.parametrize(('name', 'asked', 'said'), [
+    ('planning', 'environment:=attic', "no environment is called 'attic': there are apartment, "),
+    ('planning', 'time:=soon', "could not convert string to float: 'soon'"),
+    ('slam', 'rate:=0', "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000"),
+    ('slam', 'frames:=-1', "slam_camera: 'frames' is -1: it has to be from 1 to 2330"),
+    ('slam', 'width:=0', "slam_camera: 'width' is 0: it has to be from 64 to 4096"),
+    ('slam', 'dataset:=/nowhere', 'slam_camera: /nowhere/rgb.txt: No such file or directory'),
+    ('grasp', 'picture:=/nowhere/x.png', 'grasp_camera: .*: there is no folder /nowhere')])
+def test_a_launch_says_what_can_not_be_done_and_fails(name, asked, said, launch):
+    run = launch('fogros2_examples', f'{name}.launch.py', 'machine:=robot', asked)
+    assert run.ended() == 1, run.text
+    assert re.search(said, run.text), run.text
+    # the other node may be interrupted while it starts
+    assert not re.search(r'\[(slam_camera|grasp_camera|planning_client)-\d+\] Traceback', run.text)
+
+
+def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
+    """Of the machine it says the rest: what was asked for wrongly is the robot's."""
+    run = launch('fogros2_examples', 'planning.launch.py', 'environment:=attic')
+    assert run.ended() == 1, run.text
+    assert "no environment is called 'attic'" in run.text
+    assert 'planner: delete' in run.text
+
+
+def test_a_camera_has_so_many_frames_under_way(tmp_path):
+    """Two leave before the first is answered, and not a third."""
+    import cv2
+    from geometry_msgs.msg import PoseStamped
+    from nav_msgs.msg import Path as PathMessage
+    import numpy
+    import rclpy
+    from sensor_msgs.msg import Image
+
+    from fogros2.waiting import wait_until
+    from fogros2_examples.grasp.grasp_camera import LATCHED
+
+    cv2.imwrite(str(tmp_path / 'grey.png'), numpy.full((48, 64, 3), 99, numpy.uint8))
+    cv2.imwrite(str(tmp_path / 'far.png'), numpy.full((48, 64), 9999, numpy.uint16))
+    for which, file in (('rgb', 'grey'), ('depth', 'far')):
+        (tmp_path / f'{which}.txt').write_text(
+            ''.join(f'{time}.0 {file}.png\n' for time in (1, 2, 3)))
+    camera = started('slam_camera', *(word for setting in (
+        f'dataset:={tmp_path}', 'ahead:=2', 'frames:=0', 'rate:=100.0',
+        f'results:={tmp_path}/results.json') for word in ('-p', setting)))
+    rclpy.init()
+    node = rclpy.create_node('slam')
+    poses = node.create_publisher(PoseStamped, 'pose', 10)
+    paths = node.create_publisher(PathMessage, 'path', LATCHED)
+    seen = []
+    node.create_subscription(Image, 'camera/image', lambda image: seen.append(image.header), 2)
+
+    def until(true, timeout=30.0):
+        def spun():
+            rclpy.spin_once(node, timeout_sec=0.02)
+            return true()
+        wait_until(spun, timeout=timeout, what='frames', longest=0.001)
+
+    try:
+        until(lambda: len(seen) == 2)
+        # at 100 Hz a third would be here at once; after 2.5 s it doesn't wait any more
+        with pytest.raises(RuntimeError):
+            until(lambda: len(seen) > 2, 0.5)
+        poses.publish(PoseStamped(header=seen[0]))
+        until(lambda: len(seen) == 3, 1.5)
+        poses.publish(PoseStamped(header=seen[1]))
+        paths.publish(PathMessage(poses=[PoseStamped(header=seen[2])]))
+        said = camera.communicate(timeout=20)[0]
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+        camera.kill()
+    assert camera.returncode == 0, said
+    assert '2 of 3 frames were answered' in said
+    first, second = json.loads((tmp_path / 'results.json').read_text())['came']
+    assert first == 0.0 < second

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the examples' nodes take for a parameter, and how a launch ends with a node."""
+
+from __future__ import annotations
+
+import math
+import types
+
+import pytest
+
+pytest.importorskip('rclpy')
+from launch import LaunchContext
+from launch.actions import Shutdown
+
+from fogros2_examples.ending import ended
+from fogros2_examples.parameters import (
+    BadParameter,
+    PICTURES,
+    within,
+    writable,
+)
+
+
+class Given:
+    """A node that was started with a parameter."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def declare_parameter(self, name, default):
+        return types.SimpleNamespace(value=self.value)
+
+
+@pytest.mark.parametrize(('value', 'default', 'least', 'most'), [
+    (0, 10, 0, math.inf), (64, 640, 64, 4096), (4096, 640, 64, 4096), (0.01, 1.0, 0.01, 1e3)])
+def test_a_number_that_is_taken(value, default, least, most):
+    taken = within(Given(value), 'rate', default, least, most)
+    assert (taken, type(taken)) == (value, type(default))
+
+
+@pytest.mark.parametrize(('value', 'default', 'least', 'most', 'said'), [
+    (-1, 200, 0, math.inf, "'rate' is -1: it has to be 0 at least"),
+    (0.0, 10.0, 0.01, 1000, "'rate' is 0: it has to be from 0.01 to 1000"),
+    (math.nan, 10.0, 0.01, 1000, "'rate' is nan: it has to be from 0.01 to 1000"),
+    (math.inf, 10.0, 0.01, 1000, "'rate' is inf: it has to be from 0.01 to 1000"),
+    (0, 640, 64, 4096, "'rate' is 0: it has to be from 64 to 4096")])
+def test_a_number_that_is_not(value, default, least, most, said):
+    with pytest.raises(BadParameter) as caught:
+        within(Given(value), 'rate', default, least, most)
+    assert str(caught.value) == said
+
+
+def test_files_that_can_be_written(tmp_path):
+    there = tmp_path / 'there.PNG'
+    there.touch()
+    for path in (there, tmp_path / 'new.jpg'):
+        assert writable(Given(str(path)), 'picture', PICTURES) == str(path)
+    assert writable(Given(str(tmp_path / 'figures')), 'results') == str(tmp_path / 'figures')
+    assert writable(Given(''), 'picture', PICTURES) == ''
+
+
+def test_files_that_can_not(tmp_path):
+    (tmp_path / 'folder.png').mkdir()
+    for name, said in (
+            ('no/x.png', f'there is no folder {tmp_path}/no'), ('folder.png', "can't be written"),
+            ('x.bmp.', 'it has to end in .png, .jpg, .jpeg'), ('x', 'it has to end in .png')):
+        with pytest.raises(BadParameter, match=f"^'picture' is {tmp_path}/{name}: .*{said}"):
+            writable(Given(str(tmp_path / name)), 'picture', PICTURES)
+
+
+def test_a_launch_ends_as_its_node_does():
+    context = LaunchContext()
+
+    def exited(status):
+        return ended(types.SimpleNamespace(process_name='camera-1', returncode=status), context)
+
+    assert isinstance(exited(0), Shutdown)
+    with pytest.raises(RuntimeError, match='^camera-1 ended with exit status 2$'):
+        exited(2)
+    context._set_is_shutdown(True)
+    assert exited(2) is None and exited(0) is None
