@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rmw_cyclonedds makes of ROS 2's environment variables."""
 
+import fcntl
 import os
 import re
+import socket
+import struct
 
 from rclpy.exceptions import RCLError
 
 _RANGES = ('SUBNET', 'LOCALHOST', 'OFF', 'SYSTEM_DEFAULT')
+# requests and flags of Linux's netdevice(7)
+_GET_FLAGS, _GET_ADDRESS = 0x8913, 0x8915
+_UP, _LOOPBACK = 0x1, 0x8
 _IMPLEMENTATION = 'rmw_cyclonedds_cpp'
 # an image of 6 MB arrives faster than it is read; what the kernel doesn't give is no error
 _BUFFER = '<Internal><SocketReceiveBufferSize max="10MB"/></Internal>'
@@ -54,6 +60,21 @@ def _names_interfaces(uri: str) -> bool:
     return 'NetworkInterface' in uri
 
 
+def _leads_away() -> bool:
+    """Say whether Cyclone DDS would choose another interface than the loopback by itself."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            request = name.encode().ljust(64, b'\0')  # more than a struct ifreq
+            try:
+                flags, = struct.unpack_from('H', fcntl.ioctl(asked, _GET_FLAGS, request), 16)
+                fcntl.ioctl(asked, _GET_ADDRESS, request)
+            except OSError:
+                continue  # it has no address, or is gone
+            if flags & _UP and not flags & _LOOPBACK:
+                return True
+    return False
+
+
 def configuration(domain: int) -> str:
     """
     Give Cyclone DDS's configuration: ROS 2's own fragment, then the user's CYCLONEDDS_URI.
@@ -75,10 +96,14 @@ def configuration(domain: int) -> str:
     general, discovery = '', ''
     if given in ('LOCALHOST', 'OFF'):
         general = '<AllowMulticast>false</AllowMulticast>'
-    if given == 'LOCALHOST' and not peers and not _names_interfaces(uri):
-        # ROS 2's Cyclone DDS says hello over the loopback, whatever interface it has chosen; this
-        # one hears nothing from an interface that it wasn't told of
-        general += '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
+    if given == 'LOCALHOST' and not _names_interfaces(uri):
+        # ROS 2's Cyclone DDS says hello over the loopback, and hears those who have this computer
+        # among their peers, whatever interface it has chosen; this one hears nothing from an
+        # interface that it wasn't told of. It asks peers from the first one alone, which leads
+        # nowhere from a loopback
+        chosen = '<NetworkInterface autodetermine="true"/>' if _leads_away() else ''
+        last = ' priority="-1"' if peers else ''
+        general += f'<Interfaces><NetworkInterface name="lo"{last}/>{chosen}</Interfaces>'
     if given == 'OFF':
         discovery = ('<ParticipantIndex>none</ParticipantIndex>'
                      f'<Tag>ros_discovery_off_{os.getpid()}</Tag>')
@@ -88,7 +113,8 @@ def configuration(domain: int) -> str:
     if given == 'LOCALHOST':
         peers.insert(0, 'localhost')
     if peers:
-        listed = ''.join(f'<Peer address="{peer}"/>' for peer in peers)
-        discovery += f'<Peers>{listed}</Peers>'
+        # ROS 2's Cyclone DDS asks them every 8 s, as long as it runs; this one but once by itself
+        listed = ''.join(f'<Peer address="{peer}" PruneDelay="inf"/>' for peer in peers)
+        discovery += f'<Peers>{listed}</Peers><SPDPInterval>8 s</SPDPInterval>'
     return (f'<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery>'
             f'{_BUFFER}</Domain></CycloneDDS>,{uri}')

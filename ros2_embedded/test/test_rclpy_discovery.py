@@ -43,14 +43,43 @@ def namespaces():
 
 
 @pytest.mark.skipif(not namespaces(), reason='no right to make a network of its own')
-@pytest.mark.parametrize('scope', ['SUBNET', 'LOCALHOST'])
+@pytest.mark.parametrize('scope', ['SUBNET', 'LOCALHOST', 'LOCALHOST 127.0.0.2'])
 @pytest.mark.parametrize('network', NETWORKS)
 def test_discovery_without_configuration(network, scope):
+    scope, _, peers = scope.partition(' ')
     environment = {name: value for name, value in os.environ.items()
                    if name not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
-    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = scope
+    environment.update(ROS_AUTOMATIC_DISCOVERY_RANGE=scope, ROS_STATIC_PEERS=peers)
     script = f'{NETWORKS[network]}; "$0" -c "$1" & "$0" -c "$2"; kill $! 2>/dev/null; wait'
     done = subprocess.run(
         ['unshare', '--net', 'sh', '-c', script, sys.executable, TALKER, LISTENER],
         env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout == 'found\n', done.stderr
+
+
+# the other computer's name in the environment of one of the two is enough
+TWO_COMPUTERS = '''
+ip link set lo up
+unshare --net sh -c 'ip link set lo up; read -r _ < "$2"; ip addr add 198.51.100.3/24 dev two
+                     ip link set two up; ROS_STATIC_PEERS=198.51.100.2 exec "$0" -c "$1"' \
+    "$0" "$1" "$3" &
+ip link add one type veth peer name two
+ip addr add 198.51.100.2/24 dev one; ip link set one up
+until [ "$(readlink /proc/$!/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do sleep 0.05; done
+ip link set two netns $!
+echo > "$3"
+"$0" -c "$2"
+kill $! 2>/dev/null; wait
+'''
+
+
+@pytest.mark.skipif(not namespaces(), reason='no right to make a network of its own')
+def test_a_computer_is_heard_that_has_this_one_among_its_peers(tmp_path):
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'ROS_STATIC_PEERS')}
+    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.mkfifo(tmp_path / 'go')
+    done = subprocess.run(
+        ['unshare', '--net', 'sh', '-c', TWO_COMPUTERS, sys.executable, TALKER, LISTENER,
+         str(tmp_path / 'go')], env=environment, capture_output=True, text=True, timeout=60)
     assert done.stdout == 'found\n', done.stderr

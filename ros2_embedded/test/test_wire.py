@@ -70,7 +70,8 @@ except (KeyboardInterrupt, ExternalShutdownException):
 
 def ros2(*command, **kwargs):
     """Start a program in ROS 2's environment."""
-    keep = ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'HOME', 'LANG')
+    keep = ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
+            'ROS_STATIC_PEERS', 'HOME', 'LANG')
     environment = {name: os.environ[name] for name in keep if name in os.environ}
     environment.update(PATH='/usr/local/bin:/usr/bin:/bin', PYTHONUNBUFFERED='1')
     script = f'. "{SETUP}" && export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp && exec "$@"'
@@ -226,12 +227,14 @@ def test_it_shows_in_our_commands(peer):
         assert any(line.startswith(expected) for line in done.stdout.splitlines()), done.stdout
 
 
-def test_both_find_each_other_on_this_computer_alone(monkeypatch):
+@pytest.mark.parametrize('peers', ['', '127.0.0.2'])
+def test_both_find_each_other_on_this_computer_alone(monkeypatch, peers):
     """The older one to be there is ours, then ROS 2's: each has to answer a newcomer."""
     domain = int(os.environ['ROS_DOMAIN_ID']) + 100
     monkeypatch.delenv('CYCLONEDDS_URI')
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_STATIC_PEERS', peers)
     context = Context()
     context.init(args=[])
     node = rclpy.create_node('first', context=context)
