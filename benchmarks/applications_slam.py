@@ -30,18 +30,21 @@ NODE, CAMERA = 'fogros2_examples.slam.node', 'fogros2_examples.slam.camera'
 PAPER = (0.68, 0.22, 0.22)
 TOPICS = ('/camera/image', '/camera/right/image')
 WIDTH, HEIGHT = 640, 480
-CODECS = ('raw', 'jpeg', 'h264')
+#: The last one is H.264 of grey images, as most stereo cameras make them.
+CODECS = ('raw', 'jpeg', 'h264', 'grey')
 #: Frames at the beginning that don't count: the first key, libraries that load.
 WARM_UP = 5
 
 
-def walked(environment: dict[str, str], frames: int, ahead: int) -> dict[str, Any]:
+def walked(environment: dict[str, str], frames: int, ahead: int,
+           grey: bool = False) -> dict[str, Any]:
     """Run the camera to its end; return what it measured, ``ahead`` frames under way at once."""
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder, 'results')
-        with running(words(CAMERA, f'frames:={frames}', 'rate:=200.0', f'ahead:={ahead}',
-                           f'results:={results}'), environment, said.append) as camera:
+        camera_words = words(CAMERA, f'frames:={frames}', 'rate:=200.0', f'ahead:={ahead}',
+                             f'grey:={str(grey).lower()}', f'results:={results}')
+        with running(camera_words, environment, said.append) as camera:
             camera.wait(600)
         if not results.exists():
             raise RuntimeError(f'{CAMERA} measured nothing:\n{"".join(said[-20:])}')
@@ -49,7 +52,7 @@ def walked(environment: dict[str, str], frames: int, ahead: int) -> dict[str, An
     return found
 
 
-def here(frames: int, ahead: int, share: Optional[float]) -> dict[str, Any]:
+def here(frames: int, ahead: int, share: Optional[float], grey: bool = False) -> dict[str, Any]:
     """Run all on the robot; SLAM held to a share of a core, None for not."""
     environment = {**os.environ, **ONE_THREAD, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '85',
                    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
@@ -64,7 +67,7 @@ def here(frames: int, ahead: int, share: Optional[float]) -> dict[str, Any]:
                 held.take(node.pid)
 
         node = stack.enter_context(running(words(NODE), environment, hear))
-        return walked(environment, frames, ahead)
+        return walked(environment, frames, ahead, grey)
 
 
 def there(codec: str, frames: int, ahead: int, launch: Any, machine: Any,
@@ -79,7 +82,8 @@ def there(codec: str, frames: int, ahead: int, launch: Any, machine: Any,
 
     def coding(role: str, topic: str) -> list[str]:
         image = topic if role == 'encoder' else f'/there{topic}'
-        return [*words(f'image_transport_h264.{role}', f'codec:={codec}',
+        form = 'h264' if codec == 'grey' else codec
+        return [*words(f'image_transport_h264.{role}', f'codec:={form}',
                        f'stream:={topic}/stream'), '-r', f'image:={image}']
 
     computing = words(NODE)
@@ -97,7 +101,7 @@ def there(codec: str, frames: int, ahead: int, launch: Any, machine: Any,
         encoders += [subprocess.Popen(coding('encoder', topic), env=environment,
                                       stdout=subprocess.DEVNULL) for topic in TOPICS]
         favour(f'from {NODE} import')
-        return walked(environment, frames, ahead)
+        return walked(environment, frames, ahead, codec == 'grey')
     finally:
         for encoder in encoders:
             end(encoder)
@@ -117,14 +121,17 @@ def coded_alone(codec: str) -> tuple[float, float]:
     times, sizes = [], []
     for number, pose in enumerate(trajectory(10)):
         image = room.exact(pose)[0]
+        if codec == 'grey':
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         size = image.nbytes
         begin = time.perf_counter()
         if codec == 'jpeg':
             coded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
             size = len(coded)
             cv2.imdecode(coded, cv2.IMREAD_COLOR)
-        elif codec == 'h264':
-            picture = Picture(WIDTH, HEIGHT, 'bgr8', 3 * WIDTH, memoryview(image.tobytes()))
+        elif codec != 'raw':
+            picture = Picture(WIDTH, HEIGHT, 'mono8' if codec == 'grey' else 'bgr8',
+                              image.nbytes // HEIGHT, memoryview(image.tobytes()))
             packet = coder.encode(picture, seconds=number / 10).data
             size = len(packet)
             decoder.decode(packet)
@@ -144,29 +151,33 @@ def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Res
     frames, held_frames, rooms = (60, 20, 2) if short else (200, 60, 12)
     errors = trajectories.measured(CODECS, rooms, frames)
     ratio = PAPER[0] / PAPER[1]
-    alone = here(held_frames, 1, 1 / ratio)
-    robot = statistics.median(alone['round_trips'][WARM_UP:])
-    hops = statistics.median(_network(here(frames, 1, None)))
-    sent = 0.0
     for codec in CODECS:
+        grey = codec == 'grey'
+        if codec in ('raw', 'grey'):
+            # the robot's own camera is the same however its images would travel
+            robot = statistics.median(
+                here(held_frames, 1, 1 / ratio, grey)['round_trips'][WARM_UP:])
+            hops = statistics.median(_network(here(frames, 1, None, grey)))
         # over the link all frames would take too long as they are
         found = there(codec, 20 if codec == 'raw' else frames, 1, launch, machine, link)
         trips = found['round_trips'][WARM_UP:]
         total, network = statistics.median(trips), statistics.median(_network(found))
         coding, size = coded_alone(codec)
-        sent = PACKETS * size
         yield Result(
             'visual SLAM', 'II', codec, robot, total - network, network, total, robot / total,
             ratio,
             # an image is handed on once more on either side of the link
-            sent * 8 / LINK + coding + 3 * hops,
-            sent, PAPER, len(trips), held_frames - WARM_UP, errors=errors[codec])
-    robot, compute, total = (_pace(found, held_frames) for found in (
-        here(held_frames, 2, 1 / ratio), here(held_frames, 2, None),
-        there('h264', held_frames, 2, launch, machine, link)))
-    yield Result('visual SLAM, two frames under way', 'II', 'h264', robot, compute,
-                 max(0.0, total - compute), total, robot / total, ratio, 0.0, sent, PAPER,
-                 held_frames - WARM_UP, held_frames - WARM_UP)
+            PACKETS * size * 8 / LINK + coding + 3 * hops,
+            PACKETS * size, PAPER, len(trips), held_frames - WARM_UP, errors=errors[codec])
+    for codec in ('h264', 'grey'):
+        grey = codec == 'grey'
+        robot, compute, total = (_pace(found, held_frames) for found in (
+            here(held_frames, 2, 1 / ratio, grey), here(held_frames, 2, None, grey),
+            there(codec, held_frames, 2, launch, machine, link)))
+        yield Result('visual SLAM, two frames under way', 'II', codec, robot, compute,
+                     max(0.0, total - compute), total, robot / total, ratio, 0.0,
+                     PACKETS * coded_alone(codec)[1], PAPER, held_frames - WARM_UP,
+                     held_frames - WARM_UP)
 
 
 def _pace(found: dict[str, Any], frames: int) -> float:

@@ -88,7 +88,8 @@ def _errors(pairs: Iterator[tuple[Any, ...]], poses: Sequence[Any]) -> tuple[flo
 
     slam = Slam(camera(WIDTH, HEIGHT))
     for number, pair in enumerate(pairs):
-        left, right = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in pair)
+        left, right = (image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+                       for image in pair)
         slam.extend(slam.track(number, left, right=right))
     way = slam.trajectory()
     found = accuracy([poses[number] for number, _ in way], [pose for _, pose in way])
@@ -96,7 +97,11 @@ def _errors(pairs: Iterator[tuple[Any, ...]], poses: Sequence[Any]) -> tuple[flo
 
 
 def coded(codec: str, images: Sequence[Any]) -> Iterator[Any]:
-    """Yield images (height, width, 3) of BGR as they come out of a codec."""
+    """
+    Yield images (height, width, 3) of BGR as they come out of a codec.
+
+    :param codec: 'raw', 'jpeg', 'h264', or 'grey' for H.264 of grey images, which come out so.
+    """
     import cv2
     import numpy
 
@@ -107,8 +112,11 @@ def coded(codec: str, images: Sequence[Any]) -> Iterator[Any]:
         if codec == 'jpeg':
             quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
             yield cv2.imdecode(cv2.imencode('.jpg', image, quality)[1], cv2.IMREAD_COLOR)
-        elif codec == 'h264':
-            picture = Picture(WIDTH, HEIGHT, 'bgr8', 3 * WIDTH, memoryview(image.tobytes()))
+        elif codec in ('h264', 'grey'):
+            if codec == 'grey':
+                image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            picture = Picture(WIDTH, HEIGHT, 'mono8' if codec == 'grey' else 'bgr8',
+                              image.nbytes // HEIGHT, memoryview(image.tobytes()))
             shown = decoder.decode(encoder.encode(picture, seconds=number / 10).data)
             assert shown is not None
             yield numpy.frombuffer(shown.data, numpy.uint8).reshape(image.shape)
@@ -117,5 +125,5 @@ def coded(codec: str, images: Sequence[Any]) -> Iterator[Any]:
 
 
 if __name__ == '__main__':
-    for name, errors in measured(('raw', 'jpeg', 'h264'), 12, 200).items():
+    for name, errors in measured(('raw', 'jpeg', 'h264', 'grey'), 12, 200).items():
         print(name, errors)

@@ -14,6 +14,7 @@ def generate_launch_description():
     """Describe the two; a stereo camera in a synthetic room, unless told otherwise."""
     shown = {'dataset': ('', "a folder in TUM's RGB-D format, '' for the synthetic room"),
              'stereo': (True, 'whether the synthetic camera has two eyes, or sees depth'),
+             'grey': (False, "whether its images are grey, as most stereo cameras' are"),
              'width': (640, 'of its images'), 'height': (480, 'of its images'),
              'frames': (200, 'after which the launch ends; 0 for all that a dataset has'),
              'rate': (10.0, 'frames per second, at most'),

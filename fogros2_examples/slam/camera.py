@@ -21,6 +21,7 @@ from pathlib import Path
 import time
 from typing import Optional
 
+import cv2
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 import numpy
@@ -35,7 +36,7 @@ from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
 from fogros2_examples.slam import messages, sources
 from fogros2_examples.slam.evaluation import Accuracy, accuracy
 from fogros2_examples.slam.geometry import Array
-from fogros2_examples.slam.sources import Shot
+from fogros2_examples.slam.sources import Pixels, Shot
 from fogros2_examples.slam.tum import DatasetError
 
 #: Seconds for the last poses, and the path, to come back.
@@ -65,6 +66,7 @@ class SlamCamera(Node):
         stereo = bool(self.declare_parameter('stereo', True).value)
         seed = int(self.declare_parameter('seed', 1).value)
         rate = within(self, 'rate', 10.0, SLOWEST, FASTEST)
+        self.grey = bool(self.declare_parameter('grey', False).value)
         self.patient = bool(self.declare_parameter('wait', True).value)
         self.ahead = within(self, 'ahead', 1, 1)
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
@@ -122,10 +124,10 @@ class SlamCamera(Node):
         if shot.truth is not None:
             self.truth[stamp] = shot.truth
         camera = self.source.camera
-        image = messages.image(header, shot.image, 'bgr8')
+        image = self._image(header, shot.image)
         self.infos.publish(messages.camera_info(header, camera, False))
         if shot.right is not None:
-            right = messages.image(header, shot.right, 'bgr8')
+            right = self._image(header, shot.right)
             self.right_infos.publish(messages.camera_info(header, camera, True))
             self.sent[stamp] = time.perf_counter()
             self.images.publish(image)
@@ -135,6 +137,11 @@ class SlamCamera(Node):
             self.sent[stamp] = time.perf_counter()
             self.images.publish(image)
             self.depths.publish(depth)
+
+    def _image(self, header: Header, pixels: Pixels) -> Image:
+        if not self.grey:
+            return messages.image(header, pixels, 'bgr8')
+        return messages.image(header, cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), 'mono8')
 
     def _take_pose(self, pose: PoseStamped) -> None:
         now = time.perf_counter()

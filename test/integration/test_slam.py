@@ -56,12 +56,13 @@ def launch():
         yield start
 
 
-@pytest.mark.parametrize(('machine', 'stereo'), [('container', 'true'), ('robot', 'false')])
+@pytest.mark.parametrize(('machine', 'stereo', 'grey'), [
+    ('container', 'true', 'false'), ('robot', 'false', 'true')])
 @pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
-def test_the_launch_file(launch, engine, tmp_path, machine, stereo):
+def test_the_launch_file(launch, engine, tmp_path, machine, stereo, grey):
     """Every frame is answered, the way is found, the picture drawn."""
     run = launch('fogros2_examples', 'slam.launch.py', f'machine:={machine}', *SMALL,
-                 f'stereo:={stereo}', f'picture:={tmp_path}/way.png',
+                 f'stereo:={stereo}', f'grey:={grey}', f'picture:={tmp_path}/way.png',
                  f'results:={tmp_path}/results.json')
     assert run.ended() == 0, run.text
     assert run.errors == [], run.text
