@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any, Literal, Optional
+from typing import Any, Literal, Optional, Union
 
 import fcl
 import numpy
@@ -18,9 +18,11 @@ from fogros2_examples.planning.scene import Scene
 
 #: Planners of OMPL's that plan between two poses.
 PLANNERS = ('RRTConnect', 'LBKPIECE1', 'KPIECE1', 'RRT', 'BKPIECE1')
-#: How far the body goes between two checks, as a share of the largest distance there is.
+#: How far a point of the body goes between two checks by the body's way, and by its turn: as a
+#: share of the diagonal of the bounds.
 RESOLUTION = 0.002
 End = Literal['found', 'start', 'goal', 'time']
+Numbers = Union[Floats, tuple[float, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +63,17 @@ class Space:
             bounds.setLow(axis, float(scene.low[axis]))
             bounds.setHigh(axis, float(scene.high[axis]))
         self.states.setBounds(bounds)
+        self.states.setLongestValidSegmentFraction(RESOLUTION)
+        # OMPL takes the same share of the largest turn, of half the angle: as if the body were as
+        # large as the room, and so several times finer than what it takes for the way
+        step = RESOLUTION * float(numpy.linalg.norm(scene.high - scene.low))
+        radius = float(numpy.linalg.norm(scene.body.vertices, axis=1).max())
+        turns = self.states.getSubspace(1)
+        turns.setLongestValidSegmentFraction(
+            step / (2 * max(radius, step) * turns.getMaximumExtent()))
+        self._low, self._high = scene.low.tolist(), scene.high.tolist()
 
-    def touches(self, position: Floats, turn: Floats) -> bool:
+    def touches(self, position: Numbers, turn: Numbers) -> bool:
         """Return whether the body touches anything; ``turn`` is a matrix or w, x, y, z."""
         self.checks += 1
         self._body.setTransform(fcl.Transform(turn, position))
@@ -98,7 +109,6 @@ class Space:
         setup.setStateValidityChecker(self._valid)
         setup.setStartAndGoalStates(self._state(start), self._state(goal))
         space = setup.getSpaceInformation()
-        space.setStateValidityCheckingResolution(RESOLUTION)
         setup.setPlanner(getattr(ompl.geometric, planner)(space))
         asked = 0
 
@@ -120,12 +130,11 @@ class Space:
         return ended('found', numpy.array([_pose(state) for state in found.getStates()]))
 
     def _valid(self, state: Any) -> bool:
-        turn = state.rotation()
-        position = numpy.array([state.getX(), state.getY(), state.getZ()])
-        scene = self.scene
-        if (position < scene.low).any() or (position > scene.high).any():
-            return False
-        return not self.touches(position, numpy.array([turn.w, turn.x, turn.y, turn.z]))
+        # in numbers: arrays of three would take as long as FCL does
+        turn, x, y, z = state.rotation(), state.getX(), state.getY(), state.getZ()
+        (west, south, low), (east, north, high) = self._low, self._high
+        return (west <= x <= east and south <= y <= north and low <= z <= high
+                and not self.touches((x, y, z), (turn.w, turn.x, turn.y, turn.z)))
 
     def _state(self, pose: Floats) -> Any:
         state = self.states.allocState()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy
 import pytest
 
 fcl = pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
-pytest.importorskip('ompl', reason='ompl is in the extra applications')
+base = pytest.importorskip('ompl.base', reason='ompl is in the extra applications')
 
 from fogros2.waiting import wait_until  # noqa: E402 - only where its libraries are
 from fogros2_examples.meshes import (  # noqa: E402
@@ -29,6 +30,7 @@ from fogros2_examples.planning.app_files import BadFile, loaded  # noqa: E402
 from fogros2_examples.planning.picture import between, picture, spaced  # noqa: E402
 from fogros2_examples.planning.racing import Racer  # noqa: E402
 from fogros2_examples.planning.scene import apartment, MADE, pose, Scene  # noqa: E402
+from fogros2_examples.planning.search import Space  # noqa: E402
 
 
 def volume(mesh):
@@ -107,6 +109,25 @@ def box_room(wall):
     return Scene('room', box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), walls, joined([]),
                  numpy.zeros(3), numpy.array([4.0, 2.0, 2.0]), pose(0.5, 0.5, 0.5),
                  pose(3.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize('end, farthest', [
+    (pose(3.5, 0.5, 0.5), 3.0),
+    # a corner of the cube goes along an arc
+    (pose(0.5, 0.5, 0.5, yaw=3.0), 3.0 * 0.2 * math.sqrt(3))])
+def test_way_and_turn_are_looked_at_as_closely(end, farthest):
+    """In steps of a five hundredth of the diagonal for the body's outermost point."""
+    room, looked = box_room(wall=False), itertools.count()
+    states = Space(room).states
+    space = base.SpaceInformation(states)
+    space.setStateValidityChecker(lambda state: next(looked) >= 0)
+    space.setup()
+    motion = [states.allocState() for _ in range(2)]
+    for state, (x, y, z, *turn) in zip(motion, (room.start, end)):
+        state.setXYZ(x, y, z)
+        state.rotation().x, state.rotation().y, state.rotation().z, state.rotation().w = turn
+    assert space.checkMotion(*motion)
+    assert next(looked) == math.ceil(farthest / (math.sqrt(4 ** 2 + 2 ** 2 + 2 ** 2) / 500))
 
 
 @pytest.fixture(scope='module')
