@@ -8,7 +8,7 @@ nobody looks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import dataclasses
 import json
 import threading
@@ -45,6 +45,7 @@ class Live:
     ) -> None:
         self.store = store or Store()
         self._name, self._regions, self._interval, self._more = name, regions, interval, more
+        #: By their keys, see :meth:`_key`.
         self._shown: dict[str, Shown] = {}
         self._launches: dict[str, ShownLaunch] = {}
         self._warnings: list[str] = []
@@ -111,22 +112,22 @@ class Live:
                 lambda: self._version > after or self._stopped.is_set(), timeout)
             return {**self._state, 'now': time.time()}
 
-    def lines(self, name: str, after: int) -> list[LogLine]:
+    def lines(self, key: str, after: int) -> list[LogLine]:
         """Return the newer lines of a machine's log."""
         with self._lock:
-            shown = self._shown.get(name)
+            shown = self._shown.get(key)
         return shown.follower.lines(after) if shown and shown.follower else []
 
-    def delete(self, name: str, *, force: bool = False) -> None:
+    def delete(self, key: str, *, force: bool = False) -> None:
         """
         Begin to end a machine; what comes of it is in the state.
 
-        :raises FogError: there is none of that name, or a launch has it and ``force`` isn't set.
+        :raises FogError: there is none of that key, or a launch has it and ``force`` isn't set.
         """
         with self._lock:
-            shown = self._shown.get(name)
+            shown = self._shown.get(key)
             if shown is None or shown.ended:
-                raise MachineNotFound(name)
+                raise MachineNotFound(key)
             if shown.deleting:
                 return
             endings.check_free(shown.entry, force=force)
@@ -141,7 +142,7 @@ class Live:
             # as its provider knows it now
             for entry in machines.survey(lambda text: None, name=shown.entry.name,
                                          regions=self._regions, store=self.store):
-                if entry.own:
+                if entry.own and shown.is_of(entry):
                     endings.delete(entry, self.store, lambda event: None, force=force)
         except FogError as error:
             shown.trouble = str(error)
@@ -153,7 +154,7 @@ class Live:
     def names(self) -> dict[str, tuple[str, ...]]:
         """Return the names that nodes of the machines that run have in the graph."""
         with self._lock:
-            return {name: shown.follower.names for name, shown in self._shown.items()
+            return {shown.entry.name: shown.follower.names for shown in self._shown.values()
                     if shown.follower is not None}
 
     def running(self) -> list[Record]:
@@ -197,17 +198,16 @@ class Live:
         now = time.time()
         with self._lock:
             self._look_at_launches(now)
-            entries = {entry.name: entry for entry in self._entries
-                       if entry.own and entry.record is None}
-            for record in records.values():
-                entries[record.name] = self._entry(record)
-            for name, entry in entries.items():
-                shown = self._shown.setdefault(name, Shown(entry))
+            there = set()
+            for entry in (*map(self._entry, records.values()), *self._without_record(records)):
+                key = self._key(entry)
+                shown = self._shown.setdefault(key, Shown(entry))
                 shown.entry, shown.ended = entry, 0.0
-            for name, shown in list(self._shown.items()):
-                self._update(shown, now, there=name in entries)
+                there.add(key)
+            for key, shown in list(self._shown.items()):
+                self._update(shown, now, there=key in there)
                 if shown.ended and now - shown.ended > KEPT:
-                    del self._shown[name]
+                    del self._shown[key]
             state = self._make()
         state.update(self._more(self) if self._more is not None else {})
         text = json.dumps(state, sort_keys=True)
@@ -227,6 +227,31 @@ class Live:
                                          and entry.record.machine_id == record.machine_id)
                 return dataclasses.replace(entry, record=record, asked=asked)
         return Entry(record.name, record.provider or '?', None, record, False)
+
+    def _without_record(self, records: Mapping[str, Record]) -> list[Entry]:
+        """Return the machines of this robot that it has no record of."""
+        found = []
+        for entry in self._entries:
+            record = records.get(entry.name)
+            # a record that has no id yet, or has got it since, may be this machine's
+            known = record is not None and record.machine_id in (None, entry.machine_id)
+            if entry.own and entry.record is None and not known:
+                found.append(entry)
+        return found
+
+    def _key(self, entry: Entry) -> str:
+        """
+        Return what a machine is known by as long as it is shown: its name.
+
+        Of several of one name, as in several regions, those that come later have their id besides.
+        """
+        first = self._shown.get(entry.name)
+        for key, shown in self._shown.items():
+            if shown.entry.name == entry.name and not shown.ended and shown.is_of(entry):
+                return key
+        if first is None or first.ended:
+            return entry.name
+        return f'{entry.name} {entry.machine_id}'
 
     def _look_at_launches(self, now: float) -> None:
         folder = self.store.root / 'launches'
@@ -277,5 +302,5 @@ class Live:
                  'steps': [as_json(step) for step in launch.steps if not step.machine]}
                 for name, launch in sorted(
                     self._launches.items(), key=lambda item: item[1].ended or 1e12)],
-            'machines': [machine_json(shown) for _, shown in sorted(self._shown.items())],
+            'machines': [machine_json(key, shown) for key, shown in sorted(self._shown.items())],
         }

@@ -32,6 +32,16 @@ class Shown:
     deleting: bool = False
     trouble: str = ''
 
+    def is_of(self, entry: Entry) -> bool:
+        """
+        Return whether an entry of that name is of this machine.
+
+        A robot has one record of a name. One without an id yet may be of a machine that is known.
+        """
+        recorded = [one for one in (self.entry, entry) if one.record is not None]
+        return (len(recorded) == 2 or any(one.machine_id is None for one in recorded)
+                or self.entry.machine_id == entry.machine_id)
+
 
 @dataclasses.dataclass
 class ShownLaunch:
@@ -65,13 +75,17 @@ class ShownLaunch:
             self.file = None
 
 
-def machine_json(shown: Shown) -> dict[str, Any]:
-    """Return a machine as JSON values: times in seconds since the epoch, money in US dollars."""
+def machine_json(key: str, shown: Shown) -> dict[str, Any]:
+    """
+    Return a machine as JSON values: times in seconds since the epoch, money in US dollars.
+
+    :param key: tells it from others of its name.
+    """
     entry, follower, record = shown.entry, shown.follower, shown.entry.record
     agent = follower.agent if follower is not None else None
     steps = [as_json(step, ended=bool(shown.ended)) for step in shown.steps]
     return {
-        'name': entry.name, 'provider': entry.provider, 'id': entry.machine_id,
+        'key': key, 'name': entry.name, 'provider': entry.provider, 'id': entry.machine_id,
         'state': 'gone' if shown.ended else entry.state, 'phase': _phase(shown),
         'launch': shown.launch,
         'launch_pid': record.pid if record is not None and record.launch_alive else 0,

@@ -52,7 +52,9 @@ def watch(
 
 
 def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
-    found = next((one for one in state.get('machines', []) if one['name'] == name), None)
+    # of several of that name, the one that a launch has
+    found = max((one for one in state.get('machines', []) if one['name'] == name),
+                key=lambda one: bool(one['launch_alive']), default=None)
     return None if found is None else {
         **found, **{key: state[key] for key in ('streams', 'topics') if key in state},
         'problems': [*found['problems'], *state.get('graph_trouble', [])]}
@@ -96,7 +98,7 @@ def _screen(live: Live, name: str, interval: float) -> None:
             if machine is None:
                 shown = [f'{name}: {_WAITING}']
             else:
-                shown = screen.frame(machine, live.lines(name, 0), state['now'],
+                shown = screen.frame(machine, live.lines(machine['key'], 0), state['now'],
                                      columns=columns, rows=rows - 1, paint=paint)
             foot = f'{time.strftime("%H:%M:%S")}, each {interval:g} s; Ctrl-C leaves'
             draw([*shown, *[''] * (rows - 1 - len(shown)), paint(foot[:columns], 'dim')])

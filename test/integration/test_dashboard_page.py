@@ -29,7 +29,7 @@ NOW = 1_800_000_000.0
 
 def machine(name: str, **changes: Any) -> dict[str, Any]:
     return {
-        'name': name, 'provider': 'aws', 'id': 'i-0123456789', 'state': 'running',
+        'key': name, 'name': name, 'provider': 'aws', 'id': 'i-0123456789', 'state': 'running',
         'phase': 'running', 'launch': 'abc123', 'launch_pid': 4711, 'launch_alive': True,
         'created': NOW - 3600, 'expires': NOW + 7200, 'ended': None, 'address': '198.51.100.7',
         'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '0.658',
@@ -206,6 +206,22 @@ def test_who_deletes_is_asked_and_told(story: Story, page: Browser) -> None:
     page.ask('document.getElementById("ask-yes").click()')
     page.until('!document.getElementById("ask").open')
     wait_until(lambda: story.deleted[1:] == [('planner', True)], timeout=10.0, what='the wish')
+    page.complaints.clear()  # the browser counts the refusal as one
+
+
+def test_two_machines_of_one_name_are_two_cards(story: Story, page: Browser) -> None:
+    other = {'key': 'planner i-2', 'id': 'i-2', 'launch_alive': False}
+    story.tell(machines=[machine('planner'), machine('planner', **other)])
+    page.until('[...document.querySelectorAll("article h3")].map(e => e.textContent).join() '
+               '=== "planner (i-0123456789),planner (i-2)"')
+    page.ask('document.querySelectorAll("button.delete")[1].click()')
+    page.until('document.getElementById("ask").open')
+    assert page.ask('document.getElementById("ask-title").innerText') == 'Delete planner (i-2)?'
+    page.ask('document.getElementById("ask-yes").click()')
+    wait_until(lambda: story.deleted == [('planner i-2', False)], timeout=10.0, what='the wish')
+    story.tell(machines=[machine('planner')])
+    page.until('[...document.querySelectorAll("article h3")].map(e => e.textContent).join() '
+               '=== "planner"')
     page.complaints.clear()  # the browser counts the refusal as one
 
 

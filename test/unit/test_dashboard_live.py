@@ -139,6 +139,30 @@ def test_a_machine_that_no_record_names_is_shown_and_one_of_another_robot_is_not
     assert [one['name'] for one in live.state()['machines']] == ['orphan']
 
 
+def test_two_machines_of_one_name_are_two_that_end_by_themselves(live: Live) -> None:
+    """As in two regions, of launches that this robot has forgotten; then a launch has a third."""
+    for number in '12':
+        machine('a')
+        Memory.machines[f'id-{number}'] = dataclasses.replace(
+            Memory.machines.pop('id-a'), id=f'id-{number}', place=f'region-{number}')
+    Store().machine('a').delete()
+
+    def shown() -> dict[str, str]:
+        return {one['key']: one['id'] for one in live.state()['machines'] if not one['ended']}
+
+    wait_until(lambda: len(shown()) == 2, timeout=10.0, what='both')
+    assert shown() == {'a': 'id-1', 'a id-2': 'id-2'}
+    Store().machine('a').save(Record('a', 'memory', MachineSpec('a', 'memory'), **alive()))
+    wait_until(lambda: shown().get('a') is None, timeout=10.0, what='the third')
+    machine('a', **alive())
+    wait_until(lambda: shown() == {'a': 'id-a', 'a id-1': 'id-1', 'a id-2': 'id-2'},
+               timeout=10.0, what='all three')
+    live.delete('a id-2')
+    wait_until(lambda: 'a id-2' not in shown(), timeout=10.0, what='its end')
+    assert set(Memory.machines) == {'id-a', 'id-1'} and live.names() == {}
+    assert shown() == {'a': 'id-a', 'a id-1': 'id-1'}
+
+
 def test_a_launch_that_was_killed_and_a_record_that_is_damaged(live: Live) -> None:
     machine('left', pid=1 << 22, pid_start=1)
     (Store().machine('torn').path).mkdir(parents=True)
