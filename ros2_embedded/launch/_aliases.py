@@ -19,8 +19,9 @@ class _AliasFinder:
         if name.partition('.')[0] not in ('launch', 'launch_ros') or package not in sys.modules:
             return None
         wanted = module.removesuffix('_impl').replace('_', '')
+        # a copy: another thread that imports a module puts it there meanwhile
         if name in _OTHERS or any(wanted == known.replace('_', '').lower() and known != module
-                                  for known in vars(sys.modules[package])):
+                                  for known in list(vars(sys.modules[package]))):
             return ModuleSpec(name, _AliasFinder)  # type: ignore[arg-type]
         return None
 
@@ -31,7 +32,7 @@ class _AliasFinder:
     @staticmethod
     def exec_module(module: ModuleType) -> None:
         package = sys.modules[module.__name__.rpartition('.')[0]]
-        vars(module).update((name, value) for name, value in vars(package).items()
+        vars(module).update((name, value) for name, value in list(vars(package).items())
                             if not name.startswith('__'))
 
 

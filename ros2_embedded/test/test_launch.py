@@ -463,3 +463,21 @@ def test_deep_module_paths():
         assert not hasattr(launch.actions, 'NeverHeardOf')
     ''')
     assert os.spawnl(os.P_WAIT, sys.executable, sys.executable, '-c', code) == 0
+
+
+def test_looking_for_a_module_while_another_thread_imports_one():
+    """As an import would, the name puts another one into the package while it is looked at."""
+    class Importing(str):
+        def replace(self, *args):
+            setattr(launch.actions, f'fogt_{len(seen)}', seen.append(self))
+            return str(self)
+
+    seen = []
+    names = vars(launch.actions)
+    before = set(names)
+    names[Importing('fogt')] = None
+    try:
+        assert importlib.util.find_spec('launch.actions.never_heard_of') is None
+    finally:
+        for name in names.keys() - before:
+            del names[name]
