@@ -32,6 +32,6 @@ def generate_launch_description():
                       {'time': ParameterValue(LaunchConfiguration('time'), value_type=float)}]),
         Node(package='fogros2_examples', executable='planning_client', output='screen',
              parameters=[{name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-                          for name, kind in (('environment', str), ('count', int),
+                          for name, kind in (('environment', str), ('count', int), ('time', float),
                                              ('picture', str))}], on_exit=ended),
     ])

@@ -44,7 +44,8 @@ def loaded(path: Path) -> Scene:
         else:
             low, high = walls.vertices.min(axis=0), walls.vertices.max(axis=0)
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
-        raise BadFile(f"{path} can't be read: {error}") from error
+        why = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+        raise BadFile(f"{path} can't be read: {why}") from error
     except KeyError as error:
         raise BadFile(f'{path} has no {error}: is it a problem of a body in space (SE(3))?'
                       ) from error

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from visualization_msgs.msg import MarkerArray
 
+from fogros2_examples.parameters import BadParameter, within
 from fogros2_examples.planning.messages import BadScene, path_message, pose_of, scene_of
 from fogros2_examples.planning.racing import Racer
 
@@ -38,10 +39,10 @@ class MotionPlanner(Node):
 
     def __init__(self) -> None:
         super().__init__('motion_planner')
-        self.seconds = float(self.declare_parameter('time', 30.0).value)
-        self.seed = int(self.declare_parameter('seed', 1).value)
+        self.seconds = within(self, 'time', 30.0, 0.1)
+        self.seed = within(self, 'seed', 1, 1)
         self.scene = ''
-        self.racer = Racer(int(self.declare_parameter('workers', 0).value),
+        self.racer = Racer(within(self, 'workers', 0, 0),
                            list(self.declare_parameter('planners', ['RRTConnect']).value))
         self.status = self.create_publisher(DiagnosticStatus, 'planning_status', LATCHED)
         self.create_subscription(MarkerArray, 'environment', self.enter, LATCHED)
@@ -111,9 +112,12 @@ class MotionPlanner(Node):
 
 
 def main() -> None:
-    """Run until interrupted."""
+    """Run until interrupted; a parameter that is none ends it at once."""
     rclpy.init()
-    node = MotionPlanner()
+    try:
+        node = MotionPlanner()
+    except BadParameter as error:
+        raise SystemExit(f'motion_planner: {error}') from error
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -30,6 +30,7 @@ from sensor_msgs.msg import Image
 from visualization_msgs.msg import MarkerArray
 
 from fogros2_examples.meshes import Floats
+from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
 from fogros2_examples.planning.app_files import BadFile, loaded
 from fogros2_examples.planning.messages import (
     COLOURS,
@@ -49,18 +50,20 @@ class PlanningClient(Node):
     The client.
 
     Parameters: ``environment``, 'apartment', 'cubicles', or a file of OMPL.app's (``.cfg``);
-    ``count`` of plans, 0 for ever more; ``picture``, a PNG file to write, '' for none; ``wait`` in
-    s, how long an answer may take; ``figures``, a file to which each plan's times go, as a line of
-    JSON.
+    ``count`` of plans, 0 for ever more; ``picture``, a PNG file to write, '' for none; ``time`` in
+    s, after which the planner gives up; ``wait`` in s, how much longer than that its answer may
+    take, and how long it may take to come up; ``figures``, a file to which each plan's times go,
+    as a line of JSON.
     """
 
     def __init__(self) -> None:
         super().__init__('planning_client')
         self.environment = str(self.declare_parameter('environment', 'apartment').value)
-        self.count = int(self.declare_parameter('count', 1).value)
-        self.picture = str(self.declare_parameter('picture', '').value)
-        self.figures = str(self.declare_parameter('figures', '').value)
-        self.wait = float(self.declare_parameter('wait', 120.0).value)
+        self.count = within(self, 'count', 1, 0)
+        self.picture = writable(self, 'picture', PICTURES)
+        self.figures = writable(self, 'figures')
+        self.seconds = within(self, 'time', 30.0, 0.1)
+        self.wait = within(self, 'wait', 120.0, 0.1)
         self.told: Optional[DiagnosticStatus] = None
         self.scenes = self.create_publisher(MarkerArray, 'environment', LATCHED)
         self.paths = self.create_publisher(Path, 'path', LATCHED)
@@ -97,8 +100,8 @@ class PlanningClient(Node):
                 found, path = found + 1, answer
                 if not self.count:
                     self._show(scene, path)
-        if found:
-            self._show(scene, path)
+        if found and not self._show(scene, path):
+            return 1
         return 0 if found == self.count else 1
 
     def _plan(self, scene: Scene, number: int) -> Floats:
@@ -110,7 +113,7 @@ class PlanningClient(Node):
         self.told = None
         begin = time.monotonic()
         future = self.planner.call_async(request)
-        self._until(future.done)
+        self._until(future.done, self.seconds + self.wait)
         total = time.monotonic() - begin
         self._until(lambda: self.told is not None, 5.0)
         response = future.result() if future.done() else None
@@ -123,7 +126,7 @@ class PlanningClient(Node):
             self.get_logger().info(
                 f'{self.told.message}; {total:.3f} s with the way there and back')
         else:
-            self.get_logger().error(f'no answer in {self.wait:g} s')
+            self.get_logger().error(f'no answer in {self.seconds + self.wait:g} s')
         if self.figures:
             with open(self.figures, 'a') as file:
                 file.write(json.dumps(figures) + '\n')
@@ -131,7 +134,8 @@ class PlanningClient(Node):
             self.paths.publish(response.plan)
         return path
 
-    def _show(self, scene: Scene, path: Floats) -> None:
+    def _show(self, scene: Scene, path: Floats) -> bool:
+        """Publish a path and its pictures; return whether it could be drawn into the file."""
         apart = float(numpy.linalg.norm(scene.high - scene.low)) / 14
         self.motions.publish(MarkerArray(markers=[
             mesh_marker(scene.body, 'motion', number, scene.name, pose_message(pose),
@@ -141,11 +145,12 @@ class PlanningClient(Node):
         height, width = drawn.shape[:2]
         self.pictures.publish(Image(height=height, width=width, encoding='bgr8', step=3 * width,
                                     data=array.array('B', drawn.tobytes())))
+        if self.picture and not cv2.imwrite(self.picture, drawn):
+            self.get_logger().error(f'{self.picture} can not be written')
+            return False
         if self.picture:
-            if cv2.imwrite(self.picture, drawn):
-                self.get_logger().info(f'wrote {self.picture}')
-            else:
-                self.get_logger().error(f'{self.picture} can not be written')
+            self.get_logger().info(f'wrote {self.picture}')
+        return True
 
     def _until(self, true: Callable[[], bool], wait: float = 0.0) -> bool:
         """Handle messages until something is true; return whether it came to be in time."""
@@ -158,10 +163,12 @@ class PlanningClient(Node):
 
 
 def main() -> None:
-    """Run until all plans are there."""
+    """Run until all plans are there; a parameter that is none ends it at once."""
     rclpy.init()
     try:
         raise SystemExit(PlanningClient().run())
+    except BadParameter as error:
+        raise SystemExit(f'planning_client: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
     except SystemExit:

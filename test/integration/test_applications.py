@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
@@ -247,6 +248,8 @@ def test_a_planner_of_motions_outlives_bad_questions(launch):
 @pytest.mark.parametrize(('name', 'asked', 'said'), [
     ('planning', 'environment:=attic', "no environment is called 'attic': there are apartment, "),
     ('planning', 'time:=soon', "could not convert string to float: 'soon'"),
+    ('planning', 'time:=0', "motion_planner: 'time' is 0: it has to be 0.1 at least"),
+    ('planning', 'picture:=x.foo', "planning_client: 'picture' is x.foo: it has to end in .png"),
     ('slam', 'rate:=0', "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000"),
     ('slam', 'frames:=-1', "slam_camera: 'frames' is -1: it has to be from 1 to 2330"),
     ('slam', 'width:=0', "slam_camera: 'width' is 0: it has to be from 64 to 4096"),
@@ -266,6 +269,42 @@ def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
     assert run.ended() == 1, run.text
     assert "no environment is called 'attic'" in run.text
     assert 'planner: delete' in run.text
+
+
+def test_a_plan_is_waited_for_as_long_as_it_may_take():
+    """Not for as long as the planner may take to come up."""
+    from nav_msgs.srv import GetPlan
+    import numpy
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from fogros2_examples.planning.messages import path_message
+    from fogros2_examples.planning.planning_client import PlanningClient
+    from fogros2_examples.planning.scene import cubicles
+
+    scene = cubicles()
+    rclpy.init(args=['--ros-args', '-p', 'time:=20.0', '-p', 'wait:=0.2'])
+    client, planner = PlanningClient(), rclpy.create_node('planner')
+    busy = threading.Event()
+
+    def plan(_, response):
+        busy.wait(1.0)
+        response.plan = path_message(numpy.array([scene.start, scene.goal]), scene.name)
+        return response
+
+    planner.create_service(GetPlan, 'plan', plan)
+    executor = SingleThreadedExecutor()
+    executor.add_node(planner)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        assert client.planner.wait_for_service(20)
+        path = client._plan(scene, 0)
+    finally:
+        executor.shutdown()
+        thread.join(10)
+        rclpy.shutdown()
+    assert len(path) == 2
 
 
 def test_a_camera_has_so_many_frames_under_way(tmp_path):
