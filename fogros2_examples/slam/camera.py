@@ -70,6 +70,8 @@ class SlamCamera(Node):
         self.patient = bool(self.declare_parameter('wait', True).value)
         self.ahead = within(self, 'ahead', 1, 1)
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
+        if not self.folder:
+            self.get_logger().info(f'rendering {count} frames of a room')
         self.source = (sources.dataset(Path(self.folder), count) if self.folder
                        else sources.synthetic(width, height, count, stereo, seed))
         self.reader = ThreadPoolExecutor(1)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import json
 from pathlib import Path
 import re
@@ -247,20 +248,45 @@ def test_a_planner_of_motions_outlives_bad_questions(launch):
 
 @pytest.mark.parametrize(('name', 'asked', 'said'), [
     ('planning', 'environment:=attic', "no environment is called 'attic': there are apartment, "),
+    ('planning', 'environment:={}/rgb.cfg', "{}/rgb.cfg can't be read: File contains no section"),
     ('planning', 'time:=soon', "could not convert string to float: 'soon'"),
-    ('planning', 'time:=0', "motion_planner: 'time' is 0: it has to be 0.1 at least"),
-    ('planning', 'picture:=x.foo', "planning_client: 'picture' is x.foo: it has to end in .png"),
+    ('slam', 'dataset:={}', 'slam_camera: {}/rgb.txt: No such file or directory'),
     ('slam', 'rate:=0', "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000"),
-    ('slam', 'frames:=-1', "slam_camera: 'frames' is -1: it has to be from 1 to 2330"),
-    ('slam', 'width:=0', "slam_camera: 'width' is 0: it has to be from 64 to 4096"),
-    ('slam', 'dataset:=/nowhere', 'slam_camera: /nowhere/rgb.txt: No such file or directory'),
-    ('grasp', 'picture:=/nowhere/x.png', 'grasp_camera: .*: there is no folder /nowhere')])
-def test_a_launch_says_what_can_not_be_done_and_fails(name, asked, said, launch):
-    run = launch('fogros2_examples', f'{name}.launch.py', 'machine:=robot', asked)
+    ('grasp', 'picture:={}/no/x.png', 'there is no folder {}/no')])
+def test_a_launch_says_what_can_not_be_done_and_fails(name, asked, said, launch, tmp_path):
+    (tmp_path / 'rgb.cfg').write_text('three\nlines\nof it\n')
+    run = launch('fogros2_examples', f'{name}.launch.py', 'machine:=robot',
+                 asked.format(tmp_path))
     assert run.ended() == 1, run.text
-    assert re.search(said, run.text), run.text
+    assert said.format(tmp_path) in run.text
     # the other node may be interrupted while it starts
     assert not re.search(r'\[(slam_camera|grasp_camera|planning_client)-\d+\] Traceback', run.text)
+
+
+@pytest.mark.parametrize(('node', 'asked', 'said'), [
+    ('slam.camera.SlamCamera', 'frames:=-1', "'frames' is -1: it has to be from 1 to 2330"),
+    ('slam.camera.SlamCamera', 'frames:=99999', "'frames' is 99999: it has to be from 1 to 2330"),
+    ('slam.camera.SlamCamera', 'width:=0', "'width' is 0: it has to be from 64 to 4096"),
+    ('slam.camera.SlamCamera', 'picture:=/no/x.png', "'picture' is /no/x.png: there is no folder"),
+    ('slam.camera.SlamCamera', 'results:=/no/x', "'results' is /no/x: there is no folder /no"),
+    ('slam.camera.SlamCamera', 'picture:=x.txt', "'picture' is x.txt: it has to end in .png, "),
+    ('grasp.grasp_camera.GraspCamera', 'trials:=-1', "'trials' is -1: it has to be 0 at least"),
+    ('grasp.grasp_camera.GraspCamera', 'encoding:=rgb8', "'encoding' is 'rgb8': it has to be 16"),
+    ('planning.planning_client.PlanningClient', 'picture:=/no/x.png', 'there is no folder /no'),
+    ('planning.motion_planner.MotionPlanner', 'time:=0.0', "'time' is 0: it has to be 0.1 at le")])
+def test_a_node_looks_at_its_parameters_first(node, asked, said):
+    import rclpy
+
+    from fogros2_examples.parameters import BadParameter
+
+    module, _, kind = f'fogros2_examples.{node}'.rpartition('.')
+    made = getattr(importlib.import_module(module), kind)
+    rclpy.init(args=['--ros-args', '-p', asked])
+    try:
+        with pytest.raises(BadParameter, match=f'^.*{re.escape(said)}'):
+            made()
+    finally:
+        rclpy.shutdown()
 
 
 def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
