@@ -111,8 +111,10 @@ def _bridge(
     return NodeSpec(
         id=f'foxglove-{where}-{port}', name='foxglove_bridge', package='fogros2',
         executable='bridge', respawn=True, respawn_delay=_RESPAWN,
+        # a stream is called for it as for a machine's nodes: who looks at its images would have
+        # them come from the robot otherwise, raw
         arguments=('--name', where, '--listen', f'127.0.0.1:{port}', *options,
-                   *(word for topic in topics for word in ('--topic', topic))))
+                   *(word for topic in topics for word in ('--topic', topic)), '--ros-args'))
 
 
 def _once_started(process: Carrier, then: Callable[[], None]) -> RegisterEventHandler:

@@ -24,6 +24,7 @@ from fogros2.process import run
 from fogros2.store import Store
 from fogros2.testing import viewer as viewers
 from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -97,6 +98,31 @@ def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = Tru
         connection.sendall(f'GET {target} HTTP/1.1\r\nHost: x\r\n\r\n'.encode())
         return connection.recv(4096)
     return b''
+
+
+def test_an_application_is_watched(nothing_left, engine):
+    """Its topics are there, the streamed image as the planner has it; nothing is complained of."""
+    with launching() as launch:
+        launched = launch('fogros2_examples', 'grasp.launch.py', 'machine:=container',
+                          'foxglove:=true', 'trials:=0')
+        launched.wait_for('in a browser: ros2 fog monitor grasping')
+        launched.wait_for('serving ws://')
+        viewer = viewers.Viewer(CACHE, re.search(r'Foxglove at (ws://\S+?);', launched.text)[1])
+        try:
+            viewer.look('/grasp_status')
+            viewer.look('/camera_info')
+            for topic in ('/depth', '/fogros2/grasping/depth', '/grasps', '/grasp_markers',
+                          '/picture'):
+                viewer.until('channel', topic)
+            assert viewer.message('/camera_info')['width'] == 640
+            wait_until(lambda: 'grasps' in viewer.message('/grasp_status')['message'],
+                       timeout=30.0, what='grasps')
+        finally:
+            viewer.close()
+        launched.interrupt()
+        assert launched.ended() == 0, launched.text
+        assert launched.errors == [], launched.text
+        assert '[WARNING] [fogros2]' not in launched.text
 
 
 def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(

@@ -13,7 +13,7 @@ from launch.substitutions import TextSubstitution
 import pytest
 
 from fogros2 import ContainerInstance, Foxglove
-from fogros2.actions import carriers, foxglove, networks
+from fogros2.actions import carriers, foxglove, networks, streaming
 from fogros2.deploy import Launch, RunningMachine
 from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
@@ -190,8 +190,11 @@ def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, runs, on_robot)
     words = list(made[0].arguments)
     name = 'robot' if on_robot else 'planner'
     assert words[:4] == ['--name', name, '--listen', '127.0.0.1:9000']
-    assert words[-4:] == ['--topic', '/a', '--topic', '/b*']
+    assert words[-5:] == ['--topic', '/a', '--topic', '/b*', '--ros-args']
+    # a stream's images are looked at where they have come to, not fetched once more
+    told = streaming.remapped(made[0], {'/camera': '/fogros2/planner/camera'}).arguments
+    assert told[-2:] == ('-r', '/camera:=/fogros2/planner/camera')
     # the robot's own has neither others nor an application
-    assert words[4:-4] == ([] if on_robot else [
+    assert words[4:-5] == ([] if on_robot else [
         '--vpn', '9000', *(['--image', 'x:1'] if runs else []), '--guarded', '9001',
         '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--allow', *SOURCES])
