@@ -193,9 +193,11 @@ class SlamCamera(Node):
                 **{f'{name}_{error}': getattr(one, error)
                    for name, one in (('live', live), ('final', final)) if one is not None
                    for error in ('ate', 'rpe')}}))
-        if self.picture and final is not None:
+        # another SLAM in this one's place may tell no path
+        drawn = live if final is None else final
+        if self.picture and drawn is not None:
             from fogros2_examples.slam.picture import draw
-            draw(Path(self.picture), final, [1e3 * float(trip) for trip in trips],
+            draw(Path(self.picture), drawn, [1e3 * float(trip) for trip in trips],
                  furnished=not self.folder)
             log.info(f'the trajectory is drawn in {self.picture}')
         return 0

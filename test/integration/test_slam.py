@@ -32,6 +32,7 @@ from std_msgs.msg import Header, String  # noqa: E402
 from fogros2.testing.launched import launching  # noqa: E402
 from fogros2.waiting import wait_until  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
+from fogros2_examples.slam.camera import SlamCamera  # noqa: E402
 from fogros2_examples.slam.node import KEPT, TFMessage  # noqa: E402
 
 pytestmark = [
@@ -108,6 +109,25 @@ def test_another_slam_in_an_image(launch, images, crun, with_python, tmp_path):
     assert found['sent'] == 25
     assert len(found['round_trips']) >= 20, run.text
     assert found['live_ate'] < 0.1
+
+
+@pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
+def test_the_picture_of_a_slam_that_tells_no_path(tmp_path):
+    """It is of the poses as they came."""
+    picture = tmp_path / 'way.png'
+    rclpy.init(args=['--ros-args', '-p', f'picture:={picture}', '-p', 'frames:=1',
+                     '-p', 'width:=320', '-p', 'height:=240'])
+    node = SlamCamera()
+    try:
+        for stamp, pose in enumerate(room.trajectory(20)):
+            node.sent[stamp], node.answered[stamp] = 0.0, 0.1
+            node.truth[stamp] = node.live[stamp] = pose
+        assert node.report() == 0
+        assert cv2.imread(str(picture)).shape[1] > 1000
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 class Side:
