@@ -4,8 +4,9 @@ Folders in the TUM RGB-D format (Sturm et al., IROS 2012).
 
 ``rgb.txt`` and ``depth.txt`` list images by time, ``groundtruth.txt`` poses as time, place and
 quaternion; depth is PNG of 16 bits, 5000 a metre. What the format doesn't have is the camera: it
-is TUM's own where the folder's name says which (freiburg1 to 3), else what ``camera.txt`` says
-(``fx fy cx cy``), else a Kinect's.
+is what ``camera.txt`` says (``fx fy cx cy``, and ``k1 k2 p1 p2 k3`` of Brown's model where there
+is distortion), else TUM's own where the folder's name says which (freiburg1 to 3), else a
+Kinect's. What is distorted is straightened as it is read.
 """
 
 from __future__ import annotations
@@ -26,8 +27,11 @@ Pixels = NDArray[numpy.uint8]
 SCALE = 5000
 #: Seconds between an image and the depth, or the pose, that belong to it.
 APART = 0.02
-_CAMERAS = {'freiburg1': (517.3, 516.5, 318.6, 255.3), 'freiburg2': (520.9, 521.0, 325.1, 249.7),
-            'freiburg3': (535.4, 539.2, 320.1, 247.6)}
+#: From TUM's page; of the third camera the images are straight.
+_CAMERAS: dict[str, tuple[float, ...]] = {
+    'freiburg1': (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    'freiburg2': (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    'freiburg3': (535.4, 539.2, 320.1, 247.6)}
 _KINECT = (525.0, 525.0, 319.5, 239.5)
 
 
@@ -53,12 +57,14 @@ class Dataset:
     """
     What a folder has.
 
+    :param distortion: k1, k2, p1, p2, k3 of the images in the folder, empty where there is none.
     :param pairs: image and depth, by time.
     :param truth: poses by time, empty where there are none.
     """
 
     folder: Path
     camera: Camera
+    distortion: tuple[float, ...]
     pairs: list[tuple[Line, Line]]
     truth: list[tuple[float, Array]]
 
@@ -66,8 +72,13 @@ class Dataset:
         """
         Yield time, image (height, width, 3) of BGR, and depth (height, width), millimetres.
 
+        Both as a camera without distortion sees them, black and unknown where that sees more.
+
         :raises DatasetError: a file is missing, or no image of this size.
         """
+        maps = cv2.initUndistortRectifyMap(
+            self.camera.matrix, numpy.array(self.distortion), None, self.camera.matrix,
+            (self.camera.width, self.camera.height), cv2.CV_32FC1) if self.distortion else None
         for image, deep in self.pairs:
             colours = _image(self.folder, image, cv2.IMREAD_COLOR)
             depth = _image(self.folder, deep, cv2.IMREAD_UNCHANGED)
@@ -78,6 +89,10 @@ class Dataset:
             if depth.shape != size:
                 raise DatasetError(f'{image.where}: {image.rest[0]} is not of the size of the '
                                    'first image')
+            if maps:
+                colours = cv2.remap(colours, *maps, cv2.INTER_LINEAR)
+                # between two depths there is nothing
+                depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
             yield image.time, colours, (depth.astype(int) * 1000 // SCALE).astype(numpy.uint16)
 
 
@@ -101,7 +116,8 @@ def read(folder: Path) -> Dataset:
             except ValueError as error:
                 raise DatasetError(f'{line.where}: {error}') from error
     first = _image(folder, pairs[0][0], cv2.IMREAD_COLOR)
-    return Dataset(folder, _camera(folder, first.shape[1], first.shape[0]), pairs, truth)
+    own = _camera(folder)
+    return Dataset(folder, Camera(first.shape[1], first.shape[0], *own[:4]), own[4:], pairs, truth)
 
 
 def write(folder: Path, camera: Camera,
@@ -174,13 +190,14 @@ def _image(folder: Path, line: Line, how: int) -> NDArray[Any]:
     return numpy.asarray(image)
 
 
-def _camera(folder: Path, width: int, height: int) -> Camera:
+def _camera(folder: Path) -> tuple[float, ...]:
+    """Return fx, fy, cx, cy, and the distortion where there is any."""
     values = next((c for name, c in _CAMERAS.items() if name in folder.resolve().name), _KINECT)
     path = folder / 'camera.txt'
     if path.exists():
         words = path.read_text().split()
-        if len(words) != 4:
-            raise DatasetError(f'{path}:1: {len(words)} words where fx, fy, cx and cy belong')
-        fx, fy, cx, cy = (_number(word, f'{path}:1') for word in words)
-        values = (fx, fy, cx, cy)
-    return Camera(width, height, *values)
+        if len(words) not in (4, 9):
+            raise DatasetError(f'{path}:1: {len(words)} words where fx, fy, cx and cy belong, or '
+                               'these with k1, k2, p1, p2 and k3')
+        values = tuple(_number(word, f'{path}:1') for word in words)
+    return values

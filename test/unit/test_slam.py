@@ -302,6 +302,33 @@ def test_tums_own_cameras(folder: Path) -> None:
     assert tum.read(renamed).camera.fx == 517.3
 
 
+def test_what_a_lens_bends_is_straightened(folder: Path) -> None:
+    """TUM's first camera moves the corners of its images by five pixels and more."""
+    renamed = folder.rename(folder.parent / 'rgbd_dataset_freiburg1_xyz')
+    (renamed / 'camera.txt').unlink()
+    camera = geometry.Camera(640, 480, 517.3, 516.5, 318.6, 255.3)
+    straight = numpy.array([(20.0, 30), (320, 240), (600, 60), (60, 440), (590, 450)])
+    bent = cv2.projectPoints(
+        camera.lift(straight, numpy.ones(5)), numpy.zeros(3), numpy.zeros(3), camera.matrix,
+        numpy.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633]))[0].reshape(-1, 2)
+    assert numpy.abs(bent - straight).max() > 5
+    image = numpy.zeros((480, 640, 3), numpy.uint8)
+    depth = numpy.zeros((480, 640), numpy.uint16)
+    for metres, (x, y) in enumerate(bent.round().astype(int), 1):
+        image[y - 4:y + 5, x - 4:x + 5] = 255
+        depth[y - 4:y + 5, x - 4:x + 5] = 5000 * metres
+    for name, picture in (('rgb', image), ('depth', depth)):
+        cv2.imwrite(str(renamed / f'{name}.png'), picture)
+        (renamed / f'{name}.txt').write_text(f'1.0 {name}.png\n')
+    shot, = sources.dataset(renamed).shots
+    for metres, (x, y) in enumerate(straight, 1):
+        around = shot.image[int(y) - 12:int(y) + 13, int(x) - 12:int(x) + 13, 0].astype(float)
+        rows, columns = numpy.indices(around.shape)
+        assert (columns * around).sum() / around.sum() - 12 == pytest.approx(0, abs=0.8)
+        assert (rows * around).sum() / around.sum() - 12 == pytest.approx(0, abs=0.8)
+        assert shot.depth[int(y), int(x)] == 1000 * metres
+
+
 @pytest.mark.parametrize(('name', 'text', 'said'), [
     ('rgb.txt', None, 'rgb.txt: No such file'),
     ('rgb.txt', '# nothing\n', 'rgb.txt: nothing in it'),
