@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import os
 from pathlib import Path
 import re
 import shutil
@@ -19,6 +20,8 @@ from ament_index_python.packages import get_package_prefix, get_package_share_di
 import pytest
 
 from fogros2.testing.launched import launching
+
+ROOT = Path(__file__).parents[2]
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -286,6 +289,19 @@ def test_a_node_looks_at_its_parameters_first(node, asked, said):
             made()
     finally:
         rclpy.shutdown()
+
+
+@pytest.mark.parametrize(('package', 'executable'), [
+    (path.parts[-3], path.name) for path in sorted(ROOT.glob('*/scripts/*'))
+    if path.is_file() and path.parts[-3] != 'fogros2'])
+def test_a_node_is_interrupted_while_it_starts(package, executable, tmp_path):
+    """As by another one's end: it has nothing to say, and nobody looks for a fault of its."""
+    (tmp_path / 'rclpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
+    done = subprocess.run(
+        [sys.executable, Path(get_package_prefix(package), 'lib', package, executable)],
+        env={**os.environ, 'PYTHONPATH': f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
 def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
