@@ -15,6 +15,7 @@ from launch.launch_description_sources import get_launch_description_from_any_la
 import pytest
 
 from fogros2 import container_scripts, containers
+from fogros2.actions import words
 from fogros2.actions.cloud_node import CloudNode
 from fogros2.actions.machines import ContainerInstance
 from fogros2.containers import Container, parse
@@ -164,14 +165,17 @@ def test_what_an_image_is_told_belongs_to_one(wrong):
         CloudNode(machine='m', package='p', executable='e', **wrong)
 
 
-def test_an_image_is_an_attribute_in_xml(tmp_path):
+@pytest.mark.parametrize('options', ['--gpus=all, --init', '$(var options)'])
+def test_an_image_is_an_attribute_in_xml(tmp_path, options):
     path = tmp_path / 'a.launch.xml'
-    path.write_text("""<launch><cloud_node machine="m" pkg="p" exec="e" image="ros:jazzy"
-        image_options="--gpus=all, --init"/></launch>""")
+    path.write_text(f"""<launch><cloud_node machine="m" pkg="p" exec="e" image="ros:jazzy"
+        image_options="{options}"/></launch>""")
     description: LaunchDescription = get_launch_description_from_any_launch_file(str(path))
     (node,) = description.entities
     assert node._image == 'ros:jazzy'
-    assert node._image_options == ('--gpus=all', '--init')
+    context = LaunchContext()
+    context.launch_configurations['options'] = '--gpus=all, --init'
+    assert words.resolve(context, node._image_options) == ['--gpus=all', '--init']
 
 
 # --- the scripts, with an engine that notes what it is told --------------------------------------
