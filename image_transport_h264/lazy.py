@@ -150,6 +150,15 @@ class Tap:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
+    def ask_for(self, qos: QoSProfile) -> None:
+        """Take messages by another profile from now on; in the executor's thread."""
+        if self._subscription is None or qos.reliability == self._qos.reliability:
+            return
+        # first the new one, so that the topic is subscribed to at any time; some come twice
+        self._qos, old = qos, self._subscription
+        self._subscribe()
+        self._node.destroy_subscription(old)
+
     def _subscribe(self) -> None:
         qos = self._node.fitting(self._topic, self._qos) if self._adapt else self._qos
         self._reliability = qos.reliability

@@ -131,10 +131,8 @@ class VideoReceiver(Receiver):
         self._acknowledged: Optional[Tag] = None
         self._lost = 0
         self._acknowledging = threading.Lock()
-        # what the network loses is repaired by pieces or a new key: waiting for it to come again
-        # would hold up what has come
-        self._tap = Tap(node, CompressedImage, stream, best_effort(STREAM_QOS), self._whole,
-                        adapt=False)
+        # as deep pictures take it, which could never come whole otherwise
+        self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._whole, adapt=False)
         self._pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
                            adapt=False)
 
@@ -152,6 +150,14 @@ class VideoReceiver(Receiver):
         tag = peek(data)
         if tag is not None:
             self._count(tag)
+        if coded.format == 'ffv1':
+            self._tap.ask_for(STREAM_QOS)
+            # the sender waits for the middleware's acknowledgement
+            self._worker.put((coded.header, data, None))
+            return
+        # what the network loses is repaired by pieces or a new key: waiting for it to come again
+        # would hold up what has come
+        self._tap.ask_for(best_effort(STREAM_QOS))
         self._take(coded.header, data, tag)
 
     def _piece(self, piece: UInt8MultiArray) -> None:

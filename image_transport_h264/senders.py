@@ -217,6 +217,10 @@ class VideoSender(Sender):
             with self._lock:
                 self._key_wanted |= key
             return
+        if packet.format == 'ffv1':
+            # large, and worth nothing without any of its parts: decoders have those come again
+            self._node.put_through(self._video, message.compressed(image.header, packet))
+            return
         with self._lock:
             protects = self._control.protects(now)
         again: list[bytes] = []
@@ -236,8 +240,6 @@ class VideoSender(Sender):
 
     def _publish(self, header: Header, packet: Packet) -> None:
         self._node.put_out(self._video, message.compressed(header, packet))
-        if packet.format != 'h264':
-            return
         for publisher, kind, make in self._others:
             if publisher.get_subscription_count():
                 self._node.put_out(publisher, make(kind, header, packet))

@@ -170,6 +170,25 @@ def test_what_goes_in_comes_out(bench: Bench, encoding: str, options: dict[str, 
         assert numpy.abs(a - b).mean() < (0.01 if encoding in ('16UC1', '32FC1') else 4)
 
 
+@pytest.mark.parametrize(('encoding', 'options', 'reliability'), [
+    ('16UC1', {'pixel': 2, 'width': 640, 'height': 480}, ReliabilityPolicy.RELIABLE),
+    ('bgr8', {}, ReliabilityPolicy.BEST_EFFORT)], ids=['deep', 'colours'])
+def test_how_packets_are_taken(
+    bench: Bench, encoding: str, options: dict[str, int], reliability: ReliabilityPolicy,
+) -> None:
+    """A deep picture of hundreds of fragments comes over a link that loses every fifth message."""
+    bench.environment['CYCLONEDDS_URI'] += (
+        ',<CycloneDDS><Domain Id="any"><Internal><Test><XmitLossiness>200</XmitLossiness></Test>'
+        '</Internal></Domain></CycloneDDS>')
+    bench.pair()
+    seen = bench.heard(Image, '/seen/camera')
+    bench.until(lambda: len(seen) >= 3, 'an image', timeout=40,
+                meanwhile=source(bench, encoding=encoding, **options))
+    bench.until(lambda: [info.qos_profile.reliability for info in
+                         bench.node.get_subscriptions_info_by_topic('/camera/h264')
+                         ] == [reliability], 'the subscription', meanwhile=source(bench))
+
+
 @pytest.mark.parametrize('codec', ['jpeg', 'png', 'raw'])
 def test_the_other_codecs(bench: Bench, codec: str) -> None:
     pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
