@@ -9,6 +9,7 @@ see doc/h264.md for all topics and parameters.
 from __future__ import annotations
 
 import functools
+import signal
 from typing import Optional
 
 import rclpy
@@ -58,6 +59,8 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # what causes it shuts rclpy down, in a thread of its own: not twice
     finally:
+        # a second one must not end this halfway
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         failed = node.failed
         node.destroy_node()
     if failed:

@@ -33,7 +33,7 @@ except ImportError:  # it is no part of the smallest ROS 2
     TFMessage = None
 
 #: The newest alone: who is slow is to be late for one image, not for all.
-NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST = QoSProfile(depth=2)
 #: Who comes late gets the last one.
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Images that wait for their other half, and those without one after which that is said.
@@ -41,12 +41,20 @@ WAITING, ALONE = 8, 30
 
 
 class SlamNode(Node):
-    """Parameters: ``features`` per image, ``map_frame``."""
+    """
+    Parameters: ``features`` per image, ``map_frame``.
+
+    ``best_effort``: for cameras that publish so; of a large image too much is lost otherwise.
+    """
 
     def __init__(self) -> None:
         super().__init__('slam')
         self.features = int(self.declare_parameter('features', 1000).value)
         self.map_frame = str(self.declare_parameter('map_frame', 'map').value)
+        newest = NEWEST
+        if self.declare_parameter('best_effort', False).value:
+            newest = QoSProfile(
+                depth=NEWEST.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.slam: Optional[Slam] = None
         self.infos: dict[str, CameraInfo] = {}
         self.halves: dict[str, dict[int, Image]] = {'image': {}, 'depth': {}, 'right': {}}
@@ -61,10 +69,10 @@ class SlamNode(Node):
         self.paths = self.create_publisher(Path, 'path', KEPT)
         self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
         for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
-            self.create_subscription(Image, f'camera/{topic}', self._taker(half), NEWEST)
+            self.create_subscription(Image, f'camera/{topic}', self._taker(half), newest)
         for half, topic in (('image', 'camera_info'), ('right', 'right/camera_info')):
             self.create_subscription(
-                CameraInfo, f'camera/{topic}', self._learner(half), NEWEST)
+                CameraInfo, f'camera/{topic}', self._learner(half), newest)
         self.create_timer(1.0, self._show_map)
         self._say(State.STARTING, 'no image yet')
 

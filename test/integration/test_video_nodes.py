@@ -61,7 +61,8 @@ class Bench:
         process = subprocess.Popen(
             [sys.executable, str(ROOT / f'image_transport_h264/scripts/{role}'), '--ros-args',
              *words], env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True)
+            # of a shell's background the tests themselves have inherited an ignored one
+            text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
         lines: list[str] = []
         assert process.stdout is not None
         reader = threading.Thread(target=lambda: lines.extend(process.stdout or ()), daemon=True)
@@ -406,6 +407,35 @@ def test_a_codec_that_does_not_exist_is_told(bench: Bench) -> None:
     assert process.wait(20) != 0
     bench.until(lambda: any("'vhs' is not one of h264, jpeg, png, raw" in line
                             for line in lines), 'a line that says so')
+
+
+def test_a_second_interrupt_while_it_ends_changes_nothing(bench: Bench) -> None:
+    """Launch interrupts once more what a terminal has interrupted already."""
+    lines, _ = bench.pair(codec='raw')
+    encoder, decoder = (process for process, _, _ in bench.processes)
+    seen = bench.heard(Image, '/seen/camera')
+    publish = source(bench, width=640, height=480)
+    bench.until(lambda: seen, 'an image', meanwhile=publish)
+    decoder.send_signal(signal.SIGSTOP)
+    try:
+        # what it doesn't acknowledge the encoder waits for, two seconds long
+        for _ in range(5):
+            publish()
+        encoder.send_signal(signal.SIGINT)
+        bench.until(lambda: ignores_interrupts(encoder.pid), 'the beginning of the end')
+        encoder.send_signal(signal.SIGINT)
+        assert encoder.wait(10) == 0, lines
+    finally:
+        decoder.send_signal(signal.SIGCONT)
+
+
+def ignores_interrupts(process: int) -> bool:
+    """Return whether a process that runs ignores SIGINT; see proc(5)."""
+    for line in Path(f'/proc/{process}/status').read_text().splitlines():
+        name, _, value = line.partition(':')
+        if name == 'SigIgn':
+            return bool(int(value, 16) & 1 << signal.SIGINT - 1)
+    raise AssertionError('the process has ended')
 
 
 def test_pictures_are_not_copied_on_their_way() -> None:

@@ -106,6 +106,17 @@ def test_lossless_is_identical(encoding: str, size: tuple[int, int], big: bool) 
         assert bytes(got.data) == sent.data
 
 
+def test_texture_is_kept_as_well_as_what_is_smooth() -> None:
+    """Those who look for features look there: no bits go from texture to smooth walls."""
+    random = numpy.random.default_rng(5)
+    rows = smooth(320, 240)[:, :, 0].copy()
+    rows[:, 160:] = random.integers(60, 200, (240, 160))
+    sent = Picture(320, 240, 'mono8', 320, rows.tobytes())
+    got = shown(Decoder(), Encoder(Settings(bitrate=100_000_000)).encode(sent).data).rows()
+    error = numpy.abs(got.astype(int) - rows)
+    assert error[:, 160:].mean() < 3
+
+
 @pytest.mark.parametrize('encoding', DEEP)
 def test_depth_never_loses_a_bit(encoding: str) -> None:
     """Also with lossy settings, not-a-number, infinity and padded rows."""
