@@ -79,14 +79,16 @@ class LazyNode(Node):
                 return
             self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
 
-    def put_through(self, publisher: Publisher, message: Any) -> None:
+    def put_through(self, publisher: Publisher, message: Any, large: int = LARGE) -> None:
         """
         Publish a message; if it is a large one, when it is its turn, and wait until it is there.
 
         Large images in quick succession leave a slow link no room for what it lost of them: none
         would ever be whole. What comes meanwhile is left out, but for the newest.
+
+        :param large: bytes from which on it is one.
         """
-        if len(message.data) < LARGE:
+        if len(message.data) < large:
             self.put_out(publisher, message)
             return
         with self._turns.taken(LONGEST):

@@ -218,8 +218,9 @@ class VideoSender(Sender):
                 self._key_wanted |= key
             return
         if packet.format == 'ffv1':
-            # large, and worth nothing without any of its parts: decoders have those come again
-            self._node.put_through(self._video, message.compressed(image.header, packet))
+            # worth nothing without any of its parts: decoders have those come again, and by that
+            # it goes at the link's rate
+            self._node.put_through(self._video, message.compressed(image.header, packet), 0)
             return
         with self._lock:
             protects = self._control.protects(now)
