@@ -46,8 +46,10 @@ class LineStream:
         """Send to its standard input."""
         try:
             self._channel.sendall(data)
-        except OSError as error:
-            raise ConnectError(f"the connection to '{self._name}' is gone: {error}") from error
+        except (OSError, EOFError) as error:
+            # paramiko says so, without a word, of one that ends meanwhile
+            why = str(error) or 'it ended'
+            raise ConnectError(f"the connection to '{self._name}' is gone: {why}") from error
 
     def readline(self) -> bytes:
         """Return its next line of output with the newline, b'' at the end."""

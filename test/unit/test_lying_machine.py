@@ -12,7 +12,7 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 
 from fogros2.actions.session import Session
 from fogros2.deploy import RunningMachine
-from fogros2.errors import AgentError
+from fogros2.errors import AgentError, ConnectError
 from fogros2.model import MachineSpec
 from fogros2.shell import lines
 
@@ -46,6 +46,17 @@ class Told:
 
     def subscribe(self, callback, since):
         self.callback, self.since = callback, since
+
+
+@pytest.mark.parametrize(('error', 'why'), [
+    (EOFError(), 'it ended'), (OSError('Socket is closed'), 'Socket is closed')])
+def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
+    def sendall(data):
+        raise error
+
+    stream = lines.LineStream(SimpleNamespace(sendall=sendall), 'planner', bytes)
+    with pytest.raises(ConnectError, match=f"the connection to 'planner' is gone: {why}"):
+        stream.write(b'line')
 
 
 def test_that_it_is_gone_is_its_provider_s_to_say():
