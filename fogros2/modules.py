@@ -87,7 +87,7 @@ def version(module, names):
         except metadata.PackageNotFoundError:
             pass
     return ''
-missing = []
+missing = {}
 for name, names, oldest, package in json.loads(sys.argv[1]):
     if package and any(
             os.path.exists(prefix + '/share/ament_index/resource_index/packages/' + package)
@@ -97,9 +97,10 @@ for name, names, oldest, package in json.loads(sys.argv[1]):
         module = importlib.import_module(name)
         if oldest and [int(n) for n in re.findall(
                 '[0-9]+', version(module, names))[:len(oldest)]] < oldest:
-            missing.append(name)
-    except Exception:
-        missing.append(name)
+            missing[name] = ''
+    except Exception as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name == name
+        missing[name] = '' if absent else str(error)[:200]
 libc = ' '.join(platform.libc_ver())
 print(json.dumps([sys.version_info[:2], platform.machine(), libc, missing]))
 """
@@ -126,25 +127,26 @@ class Answer:
     :param architecture: as ``uname -m`` has it.
     :param libc: such as ``glibc 2.36``.
     :param missing: names of modules that it can't import, or that are too old.
+    :param broken: why the import of an installed module fails, such as a library that it lacks.
     """
 
     python: tuple[int, int]
     architecture: str
     libc: str
     missing: tuple[str, ...]
+    broken: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Copy:
     """
-    What of this computer runs on a machine as it is.
+    Modules of this computer that run on a machine as they are.
 
-    :param folder: holds the modules, ``entries`` names those of its entries that belong to them.
+    :param entries: per folder that holds modules: the names of its entries that belong to them.
     :param versions: of the distributions, each with its name.
     """
 
-    folder: str
-    entries: tuple[str, ...]
+    entries: Mapping[str, tuple[str, ...]]
     versions: tuple[str, ...]
 
 
@@ -195,8 +197,8 @@ def answer(output: str) -> Answer:
     try:
         python, architecture, libc, missing = json.loads(output.strip().splitlines()[-1])
         return Answer((int(python[0]), int(python[1])), str(architecture), str(libc),
-                      tuple(map(str, missing)))
-    except (ValueError, LookupError, TypeError) as error:
+                      tuple(map(str, missing)), tuple(filter(None, map(str, missing.values()))))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise PrerequisiteError(
             f'no Python there says what it has: {output[-200:]!r}',
             'is its python3 at least 3.10, and does a login there print nothing?') from error
@@ -206,18 +208,18 @@ def copy(there: Answer) -> Optional[Copy]:
     """Return what a machine lacks, from this Python; None where it wouldn't run there."""
     if there.architecture != platform.machine():
         return None
-    folder, entries, versions = '', set(), []
+    entries: dict[str, set[str]] = {}
+    versions = []
     for name in there.missing:
         found = next(filter(None, map(_installed, MODULES[name].distributions)), None)
         if found is None or not _runs(found, there):
             return None
-        if folder not in ('', str(found.locate_file(''))):
-            return None
-        folder = str(found.locate_file(''))
         # the rest are programs, in a bin beside it
-        entries |= {file.parts[0] for file in found.files or () if file.parts[0] != '..'}
+        entries.setdefault(str(found.locate_file('')), set()).update(
+            file.parts[0] for file in found.files or () if file.parts[0] != '..')
         versions.append(f'{found.name} {found.version}')
-    return Copy(folder, tuple(sorted(entries)), tuple(versions))
+    return Copy({folder: tuple(sorted(names)) for folder, names in entries.items()},
+                tuple(versions))
 
 
 def _installed(name: str) -> Optional[metadata.Distribution]:

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-import dataclasses
 from pathlib import Path
+import re
+import sys
 import threading
 from typing import Optional
 
@@ -14,6 +15,10 @@ from fogros2.deploy.job import Job
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, NodeSpec
 from fogros2.shell import Shell
+
+#: Debian's packages of libraries that OpenCV's and PyAV's wheels expect of the system.
+_PACKAGES = {'libGL.so.1': 'libgl1', 'libglib-2.0.so.0': 'libglib2.0-0',
+             'libgthread-2.0.so.0': 'libglib2.0-0', 'libxcb.so.1': 'libxcb1'}
 
 
 class Equipment:
@@ -72,20 +77,23 @@ class Equipment:
     ) -> None:
         """Put what is missing into a folder there."""
         if copy is not None:
-            self._shell.sync(
-                Path(copy.folder), f'{target}/site', excludes=('/*',),
-                includes=[f'/{entry}' for entry in copy.entries],
-                timeout=self._job.timeouts.install, cancel=self._job.cancel)
+            for folder, entries in copy.entries.items():
+                # what is excluded is not deleted: the parts add up
+                self._shell.sync(
+                    Path(folder), f'{target}/site', excludes=('/*',),
+                    includes=[f'/{entry}' for entry in entries],
+                    timeout=self._job.timeouts.install, cancel=self._job.cancel)
         else:
             try:
                 self._run(modules.install(
                     self._environment, self._setup, target, there.missing))
             except CommandError as error:
                 raise self._without(there, str(error)) from error
-        left = self._ask(there.missing, f'{target}/site').missing
-        if left:
-            raise self._without(dataclasses.replace(there, missing=left),
-                                'they were installed, and can not be imported')
+        left = self._ask(there.missing, f'{target}/site')
+        if left.missing:
+            self._run(Command(('rm', '-rf', target), what='delete modules that fail'))
+            raise self._without(left, ': '.join(
+                ['they were installed, and cannot be imported', *left.broken]))
         self._run(Command(('touch', f'{target}/complete'), what='note what is there'))
 
     def _has(self, target: str) -> bool:
@@ -104,9 +112,18 @@ class Equipment:
 
     def _without(self, there: modules.Answer, why: str) -> PrerequisiteError:
         names = ' '.join(modules.MODULES[name].distributions[0] for name in there.missing)
-        version = '.'.join(map(str, there.python))
+        library = re.search(r'(\S+\.so[.\d]*): cannot open shared object file', why)
+        if library:
+            package = _PACKAGES.get(library[1])
+            hint = (f'install {package} there with apt' if package else
+                    f'install the package there that has it: apt-file search {library[1]}')
+        elif there.python != sys.version_info[:2]:
+            version = '.'.join(map(str, there.python))
+            hint = (f'take an image with them (pip install {names}), or a robot with Python '
+                    f'{version} as there, whose modules can be sent')
+        else:
+            hint = (f'install them on the robot with pip, so that they can be sent, or use a '
+                    f'machine that has them: pip install {names}')
         return PrerequisiteError(
             f"'{self._job.name}' can't get {', '.join(there.missing)}, which programs there "
-            f'import: {why}',
-            f'take an image with them (pip install {names}), or a robot with Python {version} as '
-            'there, whose modules can be sent')
+            f'import: {why}', hint)

@@ -105,7 +105,7 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
     _import()
     import paramiko
 
-    known = _known_keys(endpoint)
+    known = known_keys(endpoint)
     transport = paramiko.Transport(_dial(endpoint, name, timeout))
     try:
         transport.daemon = True
@@ -162,8 +162,12 @@ def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
         options.key_types = first + [n for n in options.key_types if n not in first]
 
 
-def _known_keys(endpoint: Endpoint) -> list[str]:
-    """Return the host keys to accept (``type base64``): the pinned one or known_hosts' ones."""
+def known_keys(endpoint: Endpoint) -> list[str]:
+    """
+    Return the host keys to accept (``type base64``): the pinned one or known_hosts' ones.
+
+    :raises HostKeyError: the pinned key is no key, or known_hosts cannot be read.
+    """
     import paramiko
     if endpoint.host_key is not None:
         words = endpoint.host_key.split()

@@ -25,6 +25,7 @@ from fogros2.errors import (
     CommandError,
     ConnectError,
     FogError,
+    HostKeyError,
     PrerequisiteError,
     ShellError,
     WorkspaceError,
@@ -241,6 +242,9 @@ def explained(result: Result, source: Path, where: str) -> FogError:
                           'make room there, or leave more out')
     if 'command not found' in text or 'remote command not found' in text:
         return missing_there(where)
+    if 'Host key verification failed' in text:
+        return HostKeyError(f'the host key of {where} has changed, so {source} was not sent',
+                            'another machine may answer at its address')
     if result.returncode in _LOST:
         return ConnectError(f'the connection to {where} was lost while {source} was sent',
                             "check the robot's network")
@@ -256,6 +260,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[str]:
     """
     Yield the value of rsync's ``-e`` for a connection of OpenSSH's, pinned as ours is.
 
+    :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the host key can't be handed over.
     """
     words = [
@@ -270,21 +275,18 @@ def open_ssh(endpoint: Endpoint) -> Iterator[str]:
     ]
     if endpoint.key_file is not None:
         words += ['-o', 'IdentitiesOnly=yes', '-i', os.path.expanduser(endpoint.key_file)]
-    with contextlib.ExitStack() as undo:
-        if endpoint.host_key is not None:
-            try:
-                known = undo.enter_context(
-                    tempfile.NamedTemporaryFile('w', prefix='fogros2-', suffix='.hosts'))
-            except OSError as error:
-                raise PrerequisiteError(
-                    f'no temporary file can be made: {error.strerror}',
-                    'is there room in /tmp? TMPDIR names another folder') from error
-            known.write(f'machine {endpoint.host_key}\n')
-            known.flush()
-            words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
-                      '-o', 'GlobalKnownHostsFile=/dev/null']
-        else:
-            words += ['-o', f'HostKeyAlias={ssh_connection.host_label(endpoint)}']
+    # OpenSSH reads known_hosts of the account's home, Python that of $HOME: one answer for both
+    try:
+        known = tempfile.NamedTemporaryFile('w', prefix='fogros2-', suffix='.hosts')
+    except OSError as error:
+        raise PrerequisiteError(
+            f'no temporary file can be made: {error.strerror}',
+            'is there room in /tmp? TMPDIR names another folder') from error
+    with known:
+        known.writelines(f'machine {key}\n' for key in ssh_connection.known_keys(endpoint))
+        known.flush()
+        words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
+                  '-o', 'GlobalKnownHostsFile=/dev/null']
         yield ' '.join(_word(word) for word in words)
 
 

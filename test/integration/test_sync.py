@@ -13,7 +13,14 @@ import threading
 import pytest
 
 from fogros2 import process
-from fogros2.errors import Cancelled, CommandError, ConnectError, PrerequisiteError, ShellError
+from fogros2.errors import (
+    Cancelled,
+    CommandError,
+    ConnectError,
+    HostKeyError,
+    PrerequisiteError,
+    ShellError,
+)
 from fogros2.model import Command
 from fogros2.shell import relay, sync
 from fogros2.shell.ssh import SSHShell
@@ -110,7 +117,7 @@ def test_a_wrong_host_key_stops_openssh_too(server, shell, source, tmp_path, mon
     shell.endpoint = server.endpoint.__class__(**{
         **vars(shell.endpoint), 'host_key': 'ssh-ed25519 '
         'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9'})
-    with pytest.raises(ConnectError):
+    with pytest.raises(HostKeyError):
         shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
     assert not list((tmp_path / 'sync-target').iterdir())
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import metadata
 import os
 from pathlib import Path
 import platform
@@ -62,11 +63,22 @@ def test_nodes_that_need_them_find_them_first_and_no_other_does(tmp_path: Path) 
 def test_what_is_here_can_be_copied_where_it_runs() -> None:
     copy = modules.copy(HERE)
     assert copy is not None
-    assert {'numpy', 'av', 'cv2', 'av.libs'} <= set(copy.entries)
-    assert not {'..', 'bin', 'fogros2'} & set(copy.entries)
-    assert Path(copy.folder, 'av', '__init__.py').is_file()
+    ((folder, entries),) = copy.entries.items()
+    assert {'numpy', 'av', 'cv2', 'av.libs'} <= set(entries)
+    assert not {'..', 'bin', 'fogros2'} & set(entries)
+    assert Path(folder, 'av', '__init__.py').is_file()
     some = modules.copy(dataclasses.replace(HERE, missing=('av',)))
-    assert some is not None and 'av' in some.entries and 'cv2' not in some.entries
+    assert some is not None and 'av' in some.entries[folder] and 'cv2' not in some.entries[folder]
+
+
+def installed_in(folder: Path, name: str, module: str) -> None:
+    """Lay a pure Python distribution into a folder, as pip does."""
+    info = folder / f'{name.replace("-", "_")}-99.dist-info'
+    info.mkdir(parents=True)
+    (folder / f'{module}.py').write_text(f"__version__ = '99'\nFOLDER = {str(folder)!r}\n")
+    (info / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 99\n')
+    (info / 'WHEEL').write_text('Wheel-Version: 1.0\nTag: py3-none-any\n')
+    (info / 'RECORD').write_text(f'{module}.py,,\n{info.name}/METADATA,,\n')
 
 
 def test_what_is_compiled_for_later_pythons_too_can_be_copied_to_those() -> None:
@@ -191,8 +203,34 @@ def test_a_machine_that_can_not_have_them_says_what_to_do(
         equipped(machine)
     assert 'pip install av' in caught.value.hint
     wheel(machine.index, '99.0', 'import a_library_that_is_not_there\n')
-    with pytest.raises(PrerequisiteError, match='can not be imported'):
+    with pytest.raises(PrerequisiteError, match="cannot be imported: No module named 'a_lib"):
         equipped(machine)
-    # and it isn't taken for complete by the next launch
-    with pytest.raises(PrerequisiteError, match='can not be imported'):
+    assert not list(machine.home.glob('.local/share/fogros2/*')), 'it left what is of no use'
+
+
+def test_modules_of_several_folders_are_sent_together(
+    machine: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    (machine.broken / 'cv2.py').write_text("raise OSError('no libGL')\n")
+    for name, module in (('av', 'av'), ('opencv-python', 'cv2')):
+        installed_in(tmp_path / name, name, module)
+    monkeypatch.setattr(modules, '_installed', lambda name: next(iter(
+        metadata.distributions(name=name, path=[str(tmp_path / name)])), None))
+    _node, said = equipped(machine)
+    assert said == 'av, cv2 sent'
+    (place,) = machine.home.glob('.local/share/fogros2/modules-*/site')
+    assert {path.name for path in place.glob('*.py')} == {'av.py', 'cv2.py'}
+
+
+@pytest.mark.parametrize('fault, hint', [
+    ('libGL.so.1: cannot open shared object file: No such file', 'libgl1'),
+    ('libodd.so.7: cannot open shared object file: No such file', 'apt-file search libodd.so.7'),
+    ('odd', 'install them on the robot with pip')])
+def test_import_that_fails_names_reason_and_remedy(
+    machine: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, fault: str, hint: str,
+) -> None:
+    monkeypatch.setattr(modules, 'copy', lambda there: None)
+    wheel(machine.index, '99.0', f'raise ImportError({fault!r})\n')
+    with pytest.raises(PrerequisiteError, match=fault.split(':')[0]) as caught:
         equipped(machine)
+    assert hint in caught.value.hint

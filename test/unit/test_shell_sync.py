@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import paramiko
 import pytest
 
 from fogros2.errors import CommandError, ConnectError, ShellError
@@ -37,11 +38,17 @@ def test_openssh_is_pinned_as_we_are():
     assert not known.exists()
 
 
-def test_openssh_without_a_pinned_key_asks_known_hosts():
+def test_openssh_accepts_the_known_hosts_of_home(tmp_path, monkeypatch):
+    # OpenSSH itself would read those of the account's home
+    monkeypatch.setenv('HOME', str(tmp_path))
+    (tmp_path / '.ssh').mkdir()
+    key = f'ecdsa-sha2-nistp256 {paramiko.ECDSAKey.generate().get_base64()}'
+    (tmp_path / '.ssh/known_hosts').write_text(f'[host.example]:2222 {key}\n')
     with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as rsh:
-        assert 'HostKeyAlias=[host.example]:2222' in rsh
-        assert 'UserKnownHostsFile' not in rsh
-        assert 'StrictHostKeyChecking=yes' in rsh
+        assert 'HostKeyAlias=machine' in rsh and 'StrictHostKeyChecking=yes' in rsh
+        known, = (Path(w.partition('=')[2]) for w in rsh.split()
+                  if w.startswith('UserKnownHostsFile='))
+        assert known.read_text() == f'machine {key}\n'
 
 
 def test_progress_narrows_the_total_down():
