@@ -32,3 +32,6 @@ root_ready() { [ "$(id -u)" = 0 ] || { command -v sudo && sudo -n true; } >/dev/
 
 # Looks into the sbin folders too, which are not on a user's path in Debian.
 have() { PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin" command -v "$1" >/dev/null 2>&1; }
+
+# Whether a program is there and needs no shared library, as an image that holds it alone requires.
+have_static() { have "$1" && ! ldd "$(command -v "$1")" 2>/dev/null | grep -q '=>'; }

@@ -34,11 +34,11 @@ runc runc
 debootstrap debootstrap
 iptables iptables
 conntrack conntrack
-busybox busybox-static
 docker-registry docker-registry
 ip iproute2
 unshare util-linux
 LIST
+    have_static busybox || echo busybox-static
     [ -d "$(folder)" ] || while read -r program package; do
         have "$program" || echo "$package"
     done <<LIST

@@ -18,6 +18,7 @@ import uuid
 
 import pytest
 
+from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
 from fogros2.provider import container_root
@@ -112,12 +113,13 @@ def nobody(engine: str, cloud_network: str) -> str:
 @pytest.fixture(scope='session')
 def busybox(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a layer that holds busybox alone."""
-    program = shutil.which('busybox')
-    if program is None:
-        pytest.skip('needs busybox')
+    try:
+        program = cluster_images.static_busybox()
+    except PrerequisiteError as error:
+        pytest.skip(str(error))
     path = tmp_path_factory.mktemp('busybox') / 'layer.tar'
     archive = container_root.Archive()
-    archive.file('bin/busybox', Path(program).read_bytes(), 0o755)
+    archive.file('bin/busybox', program.read_bytes(), 0o755)
     archive.link('bin/sh', 'busybox')
     path.write_bytes(archive.data())
     return path

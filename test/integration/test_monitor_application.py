@@ -15,7 +15,6 @@ import os
 from pathlib import Path
 import queue
 import secrets
-import shutil
 import socket
 import subprocess
 import sys
@@ -32,15 +31,11 @@ from ros2fog_cli.api.monitor import has_application
 
 
 @pytest.fixture(scope='module')
-def image(engine: str) -> Iterator[str]:
+def image(engine: str, busybox: Path) -> Iterator[str]:
     """Import an image whose busybox serves a page at port 8080, as Lichtblick's."""
-    busybox = shutil.which('busybox')
-    if busybox is None:
-        pytest.skip('needs busybox')
     name = f'localhost/fogt-{secrets.token_hex(4)}:1'
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode='w') as archive:
-        archive.add(busybox, 'bin/busybox')
+    packed = io.BytesIO(busybox.read_bytes())
+    with tarfile.open(fileobj=packed, mode='a') as archive:
         text = tarfile.TarInfo('www/index.html')
         text.size = len(b'the application')
         archive.addfile(text, io.BytesIO(b'the application'))

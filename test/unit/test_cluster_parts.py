@@ -6,11 +6,17 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from pathlib import Path
 import socket
 import ssl
+import subprocess
 import tarfile
 import threading
 
+import pytest
+
+from fogros2 import process
+from fogros2.errors import PrerequisiteError
 from fogros2.testing.cluster import images, node, services
 from fogros2.testing.cluster.certificates import Authority, rsa_key
 from fogros2.testing.cluster.images import Image
@@ -78,6 +84,53 @@ def test_an_archive_is_an_image_layout(tmp_path):
     assert config['rootfs']['diff_ids'] == [layer['digest'] for layer in two['layers']]
     there = ['blobs/' + layer['digest'].replace(':', '/') in files for layer in two['layers']]
     assert there == [True, False], 'the upper layer was to be left out'
+
+
+@pytest.fixture
+def busybox(tmp_path, monkeypatch):
+    """Return the only busybox on PATH, as a link to any program."""
+    path = tmp_path / 'busybox'
+    for name in ('grep', 'ldd'):
+        path.with_name(name).symlink_to(f'/usr/bin/{name}')
+    monkeypatch.setattr(process, '_ENVIRONMENT', {'PATH': str(tmp_path)})
+    return path
+
+
+#: needs libraries, needs none
+DYNAMIC, STATIC = '/bin/sh', '/sbin/ldconfig'
+
+
+def test_image_takes_only_a_static_busybox(busybox):
+    with pytest.raises(PrerequisiteError, match='not found'):
+        images.static_busybox()
+    busybox.symlink_to(DYNAMIC)
+    with pytest.raises(PrerequisiteError, match='shared libraries'):
+        images.static_busybox()
+    busybox.unlink()
+    busybox.symlink_to(STATIC)
+    assert images.static_busybox() == busybox
+
+
+@pytest.mark.parametrize('program, wanted', [(None, True), (DYNAMIC, True), (STATIC, False)])
+def test_set_up_demands_a_static_busybox(busybox, program, wanted):
+    if program:
+        busybox.symlink_to(program)
+    common = Path(__file__).parents[2] / 'tools' / 'common.sh'
+    done = subprocess.run(['/bin/sh', '-c', f'. {common}; have_static busybox'],
+                          env={'PATH': str(busybox.parent)})
+    assert (done.returncode != 0) == wanted
+
+
+def test_changed_content_makes_new_images(tmp_path):
+    busybox, packages = tmp_path / 'busybox', tmp_path / 'root/var/lib/dpkg/status'
+    packages.parent.mkdir(parents=True)
+    keys = set()
+    for text in ('dynamic', 'static', 'dynamic'):
+        for path, other in ((busybox, packages), (packages, busybox)):
+            path.write_text(text)
+            other.write_text('same')
+            keys.add(images.system_key(tmp_path / 'root', busybox))
+    assert len(keys) == 4
 
 
 def test_a_certificate_proves_its_host(tmp_path):

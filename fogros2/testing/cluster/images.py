@@ -38,6 +38,7 @@ READY = 'fogros2.test/machine:ready'
 #: ``READY`` under the name that ``KubeInstance()`` asks for if nothing else is said.
 DEFAULT = IMAGE
 SANDBOX = 'fogros2.test/sandbox:1'
+_SANDBOX_CONFIG = {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']}
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
             'rsync', 'wireguard-go', 'wireguard-tools')
@@ -173,7 +174,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     its = None if packed.embedded else ros.prefix()
     with alone(cache):
         root = base(cache, say)
-        system = cache / f'system-{_checksum(f"1 {root.name}")}'
+        system = cache / f'system-{system_key(root, static_busybox())}'
         has = f'{packed.key} {its} {ros.key(its)}' if its else packed.key
         target = cache / f'images-{_checksum(f"4 {system.name} {has}")}'
         for path in (system, target):
@@ -210,11 +211,10 @@ def _make(
         upper.mkdir()
         _tar(layers[0], root)
         if not system.is_dir():
-            sandbox_layer(layers[2])
+            sandbox_layer(layers[2], static_busybox())
             write_archive(archive, [
                 Image(BARE, (layers[0],), _CONFIG),
-                Image(SANDBOX, (layers[2],),
-                      {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']})])
+                Image(SANDBOX, (layers[2],), _SANDBOX_CONFIG)])
             _unpack(archive, system, binaries)
         shell = RootShell(root, upper)
         shell.run(Command(('useradd', '-m', '-s', '/bin/bash', '-u', str(UID), USER), sudo=True,
@@ -274,11 +274,36 @@ def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> 
     return ''
 
 
-def sandbox_layer(target: Path) -> None:
-    """Write the layer of the image that does nothing: one program that needs no library."""
-    busybox = process.which('busybox')
-    if busybox is None:
+def static_busybox() -> Path:
+    """
+    Return a busybox that needs no shared library: it is the only program of some images.
+
+    :raises PrerequisiteError: this computer has none, or one that needs libraries.
+    """
+    found = process.which('busybox')
+    if found is None:
         raise PrerequisiteError('busybox not found', 'sudo apt-get install busybox-static')
+    # ldd fails for a static program, and has no arrow for a static one that can be relocated
+    libraries = process.run(Command(('ldd', found)), timeout=10.0, check=False).stdout
+    if '=>' in libraries:
+        raise PrerequisiteError(
+            f'{found} needs shared libraries, which an image with busybox alone does not have',
+            'sudo apt-get install busybox-static')
+    return Path(found)
+
+
+def system_key(root: Path, busybox: Path) -> str:
+    """
+    Return a checksum of what the images of a system without ROS are made of.
+
+    :param root: the system, with dpkg's list of packages and versions.
+    """
+    packages = _digest(root / 'var/lib/dpkg/status')
+    return _checksum(f'2 {root.name} {packages} {_digest(busybox)} {_CONFIG} {_SANDBOX_CONFIG}')
+
+
+def sandbox_layer(target: Path, busybox: Path) -> None:
+    """Write the layer of the image that keeps a pod's namespaces."""
     with tarfile.open(target, 'w') as layer:
         layer.add(busybox, 'busybox', filter=_root_owned)
 

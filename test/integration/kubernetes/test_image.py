@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import io
 import os
-from pathlib import Path
 import shutil
 import socket
 import subprocess
@@ -22,6 +21,7 @@ from fogros2.process import run
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.testing import request_for
 from fogros2.testing.cluster import services
+from fogros2.testing.cluster.images import static_busybox
 from fogros2.testing.launched import ros2
 from fogros2.waiting import wait_until
 
@@ -46,7 +46,7 @@ def base_layer(target):
                 setattr(info, key, value)
             layer.addfile(info, io.BytesIO(data))
 
-        put('bin/busybox', Path(shutil.which('busybox')).read_bytes())
+        put('bin/busybox', static_busybox().read_bytes())
         for name in APPLETS:
             put(f'bin/{name}', b'', type=tarfile.SYMTYPE, linkname='busybox')
         put('bin/apt-get', APT.encode())
