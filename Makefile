@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning test test-kubernetes test-minimum lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning test test-fast test-kubernetes test-minimum lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -24,6 +24,12 @@ test:
 	@tools/setup.sh test
 	@tools/test.sh $(ARGS)
 
+## test-fast   the tests that make no machine, on the embedded default, in less than 90 s
+test-fast:
+	@tools/setup.sh test
+	@tools/run.sh embedded -- pytest -n 2 --dist loadgroup --no-loadscope-reorder \
+		test/unit test/contract test/launch $(ARGS)
+
 ## test-kubernetes   the tests with a real Kubernetes cluster, built first if it isn't there
 test-kubernetes:
 	@tools/setup.sh test
@@ -34,8 +40,7 @@ test-kubernetes:
 test-minimum: export FOGROS2_VENV = $(CURDIR)/.venv-minimum
 test-minimum:
 	@PIP_CONSTRAINT=$(CURDIR)/packaging/noble.txt tools/setup.sh lint
-	@tools/run.sh embedded -- pytest --ignore=test/unit/test_linters.py \
-		test/unit test/contract test/launch ros2_embedded/test $(ARGS)
+	@tools/run.sh embedded -- pytest test/unit test/contract test/launch ros2_embedded/test $(ARGS)
 
 ## lint   ruff and mypy
 lint:
