@@ -18,13 +18,13 @@ if TYPE_CHECKING:
         find_nearest_aws_region,
     )
     from fogros2.actions.cloud_group import CloudGroup
-    from fogros2.actions.cloud_node import CloudNode
     from fogros2.actions.fog_machine import FogMachine
     from fogros2.actions.foxglove import Foxglove
     from fogros2.actions.interruption import MachineInterrupted
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.machines import CloudInstance, ContainerInstance, SSHInstance
     from fogros2.actions.machines_cloud import AWSCloudInstance, KubeInstance
+    from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
     from fogros2.errors import FogError
     from fogros2.image_transport.streams import StreamTopic
 
@@ -33,13 +33,16 @@ __all__ = [
     'CloudGroup',
     'CloudInstance',
     'CloudNode',
+    'ComposableNodeContainer',
     'ContainerInstance',
     'FogError',
     'FogMachine',
     'FogROSLaunchDescription',
     'Foxglove',
     'KubeInstance',
+    'LifecycleNode',
     'MachineInterrupted',
+    'Node',
     'SSHInstance',
     'StreamTopic',
     'ec2_instance_type_selection',
@@ -53,14 +56,17 @@ _MODULES = {
     'AWSCloudInstance': 'fogros2.actions.machines_cloud',
     'CloudGroup': 'fogros2.actions.cloud_group',
     'CloudInstance': 'fogros2.actions.machines',
-    'CloudNode': 'fogros2.actions.cloud_node',
+    'CloudNode': 'fogros2.actions.nodes',
+    'ComposableNodeContainer': 'fogros2.actions.nodes',
     'ContainerInstance': 'fogros2.actions.machines',
     'FogError': 'fogros2.errors',
     'FogMachine': 'fogros2.actions.fog_machine',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
     'Foxglove': 'fogros2.actions.foxglove',
     'KubeInstance': 'fogros2.actions.machines_cloud',
+    'LifecycleNode': 'fogros2.actions.nodes',
     'MachineInterrupted': 'fogros2.actions.interruption',
+    'Node': 'fogros2.actions.nodes',
     'SSHInstance': 'fogros2.actions.machines',
     'StreamTopic': 'fogros2.image_transport.streams',
     'find_cheapest': 'fogros2.actions.choices',

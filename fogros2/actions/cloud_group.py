@@ -4,23 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-import functools
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.actions import components, streaming, words
+from fogros2.actions import components, streaming
 from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
-from fogros2.actions.machines import CloudInstance
-from fogros2.actions.remote import carriers_here, carriers_of, RemoteProcess, send
+from fogros2.actions.machines import checked
+from fogros2.actions.remote import RemoteProcess, send
 from fogros2.actions.wrapping import wrap
-from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from launch import SomeSubstitutionsType
-
+    from fogros2.actions.coordinator import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 
@@ -31,7 +28,7 @@ class CloudGroup(GroupAction):
     Nodes, lifecycle nodes, component containers and ExecuteProcess of its content run there, at
     any depth and whenever they come: from an included file, a timer, an OpaqueFunction, an event
     handler. All other actions run here, so configurations, namespaces, parameters and service
-    calls work as in any group. A CloudNode, or another CloudGroup, keeps its own machine.
+    calls work as in any group. A node with ``machine=``, or another CloudGroup, keeps its own.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param actions: the content.
@@ -39,15 +36,11 @@ class CloudGroup(GroupAction):
     """
 
     def __init__(
-        self, machine: Union[CloudInstance, SomeSubstitutionsType],
-        actions: Iterable[Action], *, stream_topics: Sequence[Entry] = (), **kwargs: Any,
+        self, machine: SomeMachine, actions: Iterable[Action], *,
+        stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(list(actions), **kwargs)
-        if not isinstance(machine, CloudInstance) and not words.is_text(machine):
-            raise ConfigurationError(
-                f'machine={machine!r} is no machine',
-                'pass one such as ContainerInstance(), or the name of one')
-        self.machine = machine
+        self.machine = checked(machine)
         self.stream_topics = list(stream_topics)
         self._streams: Sequence[Entry] = ()
 
@@ -74,11 +67,5 @@ class CloudGroup(GroupAction):
             if not coordinator.on_robot(self._resolved):
                 coordinator.engage()
             send(entity, self._resolved, self._streams)
-        elif isinstance(entity, Action) and components.are_loaded_by(entity):
-            coordinator = Coordinator.of(context)
-            if coordinator.on_robot(self._resolved):
-                components.tell(entity, dict, functools.partial(carriers_here, self._streams))
-            else:
-                session = coordinator.session(self._resolved)
-                components.tell(entity, session.told_to_components, functools.partial(
-                    carriers_of, self._streams, session=session))
+        else:
+            components.send(entity, self._resolved, self._streams, context)

@@ -5,12 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
-from typing import Optional
+import functools
+from typing import Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
 from fogros2.actions import private
+from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.remote import carriers_here, carriers_of
+
+if TYPE_CHECKING:
+    from fogros2.actions.coordinator import SomeMachine
+    from fogros2.image_transport.streams import Entry
 
 #: Where launch_ros keeps the remappings of SetRemap and of groups.
 _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
@@ -20,6 +27,26 @@ def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
     """Return whether an entity loads components."""
     # by name: importing it takes longer than most launches have use for
     return any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__)
+
+
+def send(
+    entity: LaunchDescriptionEntity, machine: SomeMachine, streams: Sequence[Entry],
+    context: LaunchContext,
+) -> None:
+    """
+    Have components that an entity loads into a container on a machine use the streams there.
+
+    :param entity: any other entity stays unchanged.
+    """
+    if not (isinstance(entity, Action) and are_loaded_by(entity)):
+        return
+    coordinator = Coordinator.of(context)
+    if coordinator.on_robot(machine):
+        tell(entity, dict, functools.partial(carriers_here, streams))
+    else:
+        session = coordinator.session(machine)
+        tell(entity, session.told_to_components, functools.partial(
+            carriers_of, streams, session=session))
 
 
 def tell(

@@ -350,9 +350,9 @@ class Coordinator:
                 return instance
         near = difflib.get_close_matches(name, self._instances, n=1)
         raise ConfigurationError(
-            f"no machine of this launch is called '{name}'",
+            f"this launch has no machine named '{name}'",
             f"did you mean '{near[0]}'?" if near else
-            'name one that is used before, or pass the machine itself')
+            'name one that the launch file describes before, or pass the machine itself')
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()

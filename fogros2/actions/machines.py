@@ -28,6 +28,7 @@ from fogros2.workspace import find_workspace
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType
 
+    from fogros2.actions.coordinator import SomeMachine
     from fogros2.deploy import RunningMachine
 
     Value = Union[SomeSubstitutionsType, int, float]
@@ -336,6 +337,19 @@ class SSHInstance(CloudInstance):
         super().__init__(options={
             'host': host, 'user': user, 'port': port, 'key': key, 'host_key': host_key,
         }, **common)
+
+
+def checked(machine: SomeMachine) -> SomeMachine:
+    """
+    Return a machine, or the name of one, as launch files pass it.
+
+    :raises ConfigurationError: it is neither.
+    """
+    if not isinstance(machine, CloudInstance) and not words.is_text(machine):
+        raise ConfigurationError(
+            f'machine={machine!r} is no machine',
+            'pass one such as ContainerInstance(), or the name of one')
+    return machine
 
 
 def parse_duration(what: str, value: Union[str, int, float]) -> float:

@@ -18,9 +18,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 import dataclasses
+import functools
 from typing import Any, Optional
 
-from launch import LaunchContext
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource
 from launch.actions import ExecuteLocal, TimerAction
 from launch.utilities import AsyncSafeSignalManager
 
@@ -107,6 +108,19 @@ def wait_to_fire(timer: TimerAction) -> Waiting:
     """Return the bound method that waits for the timer's period."""
     bound: Waiting = getattr(timer, WAIT_TO_FIRE)
     return bound
+
+
+def replace_reader(
+    source: LaunchDescriptionSource,
+    reader: Callable[[Callable[[str], LaunchDescription], str], LaunchDescription],
+) -> None:
+    """
+    Have a source of a launch description read its launch file with a function.
+
+    :param reader: called with the function that read the file before, and the file's path.
+    """
+    vars(source)['_get_launch_description'] = functools.partial(
+        reader, source._get_launch_description)
 
 
 def components(action: Any) -> list[Any]:

@@ -147,7 +147,7 @@ def test_a_machine_can_be_named(run, fake, planner):
 
 def test_an_unknown_name(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner), talker('planer')])) == 1
-    assert "no machine of this launch is called 'planer' (did you mean 'planner'?)" in (
+    assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
         capfd.readouterr().out)
     assert not fake.noted('up')
 

@@ -305,7 +305,7 @@ def test_from_machine_to_machine(run, fake, planner, mapper, first, kind):
 def test_a_source_that_is_no_machine_of_the_launch(run, fake, planner, capfd):
     assert run(LaunchDescription([
         talker(planner, stream_topics=[StreamTopic('/map', source='mapper')])])) == 1
-    assert "no machine of this launch is called 'mapper'" in capfd.readouterr().out
+    assert "this launch has no machine named 'mapper'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 

@@ -16,8 +16,8 @@ import pytest
 
 from fogros2 import container_scripts, containers
 from fogros2.actions import words
-from fogros2.actions.cloud_node import CloudNode
 from fogros2.actions.machines import ContainerInstance
+from fogros2.actions.nodes import CloudNode
 from fogros2.containers import Container, parse
 from fogros2.deploy import Launch
 from fogros2.deploy.beside import Containers

@@ -7,11 +7,9 @@ from typing import Any, TYPE_CHECKING
 
 from launch import Action
 from launch.actions import GroupAction
-from launch_ros.actions import Node
 
 from fogros2.actions import keywords, words
 from fogros2.actions.cloud_group import CloudGroup
-from fogros2.actions.cloud_node import CloudNode
 from fogros2.actions.fog_machine import FogMachine
 from fogros2.actions.frontend.actions import FogROSLaunch, instead_of, StreamTopicEverywhere
 from fogros2.actions.frontend.entity import (
@@ -22,6 +20,8 @@ from fogros2.actions.frontend.entity import (
     text,
     value,
 )
+from fogros2.actions.frontend.scope import scoped
+from fogros2.actions.nodes import CloudNode, Node
 from fogros2.containers import described
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.streams import StreamTopic
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
     from fogros2.actions.frontend import Parsed
 
-#: What launch_ros reads of ``<node>``.
+#: What launch_ros reads of ``<node>`` and ``<node_container>``.
 _NODE = (
-    'additional_env', 'args', 'cwd', 'emulate_tty', 'env', 'exec', 'exec_name', 'launch-prefix',
-    'name', 'namespace', 'on_exit', 'output', 'output_format', 'param', 'pkg', 'remap',
-    'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args', 'shell', 'sigkill_timeout',
-    'sigterm_timeout')
+    'additional_env', 'args', 'composable_node', 'cwd', 'emulate_tty', 'env', 'exec', 'exec_name',
+    'launch-prefix', 'name', 'namespace', 'on_exit', 'output', 'output_format', 'param', 'pkg',
+    'remap', 'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args', 'shell',
+    'sigkill_timeout', 'sigterm_timeout')
 _GROUP = ('forwarding', 'keep', 'scoped')
 _STREAM = ('topic', 'transport', 'direction', 'source')
 
@@ -89,7 +89,12 @@ def _loads(provider: str) -> bool:
 
 def cloud_node(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<cloud_node machine="planner" pkg="demo" exec="talker">``, else as ``<node>``."""
-    _, kwargs = Node.parse(entity, parser)
+    return node(entity, parser, CloudNode)
+
+
+def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
+    """Read an element as launch_ros reads that of ``cls``, and the keywords of a machine."""
+    _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
     known = {'image': keywords.Keyword('image', 'text'),
              'image_options': keywords.Keyword('image_options', 'list')}
@@ -99,7 +104,7 @@ def cloud_node(entity: Entity, parser: Parser) -> Parsed:
     streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
     _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
     complete(entity, ('machine', 'stream_topic', *known, *_NODE, *CONDITIONS))
-    return CloudNode, kwargs
+    return cls, kwargs
 
 
 def cloud_group(entity: Entity, parser: Parser) -> Parsed:
@@ -150,7 +155,8 @@ def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
         value = entity.get_attr(name, optional=True)
         if value is not None:
             kwargs[name] = text(parser, value)
+    below = scoped(parser)
     kwargs['actions'], kwargs['stream_topics'] = instead_of(
-        parser.parse_action(child) for child in entity.children)
+        below.parse_action(child) for child in entity.children)
     complete(entity, ('robot_nodes', 'dds', *CONDITIONS))
     return FogROSLaunch, kwargs

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS nodes of a launch that may run on a machine: launch_ros's actions with ``machine=``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext, LaunchDescriptionEntity
+import launch_ros.actions
+
+from fogros2 import containers
+from fogros2.actions import components, streaming, words
+from fogros2.actions.coordinator import Coordinator
+from fogros2.actions.machines import checked, CloudInstance
+from fogros2.actions.remote import RemoteProcess, send
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType, Substitution
+
+    from fogros2.actions.coordinator import SomeMachine
+    from fogros2.image_transport.streams import Entry
+
+
+class Node(launch_ros.actions.Node):
+    """
+    A :class:`launch_ros.actions.Node` that runs on a machine if it has a ``machine``.
+
+    It takes everything that launch_ros's Node takes. Without a machine it is that Node. With one,
+    conditions, ``respawn``, ``on_exit``, OnProcessStart, OnProcessExit and the like see the
+    machine's process as if it ran here, wherever in the launch the action stands.
+
+    :param machine: the machine, or the name of one that the launch mentions elsewhere; None for
+        the robot, or for the machine of a CloudGroup around it.
+    :param stream_topics: image topics that cross the VPN encoded: ``(topic, transport)`` pairs for
+        those that the robot publishes and the machine reads, or StreamTopic.
+    :param image: container image that the node runs in on the machine, such as
+        'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
+    :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
+        has them separated by commas.
+    :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
+    """
+
+    #: Whether the machine is this action's own, and not that of a CloudGroup around it.
+    _fogros2_own_machine = False
+
+    def __init__(
+        self, *, machine: Optional[SomeMachine] = None, stream_topics: Sequence[Entry] = (),
+        image: Optional[SomeSubstitutionsType] = None,
+        image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (), **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        if isinstance(image_options, str) or image_options and image is None:
+            raise ConfigurationError(
+                f'image_options={image_options!r} is no list of options for an image',
+                "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
+        if machine is None:
+            if image is not None or stream_topics:
+                given = 'stream_topics' if image is None else 'image'
+                raise ConfigurationError(
+                    f'{given}= of a node is for a machine, and this node has none',
+                    f'add machine=, or leave {given}= out')
+            return
+        self.stream_topics = list(stream_topics)
+        self._image = image
+        self._image_options = words.items(image_options)
+        self._fogros2_own_machine = True
+        if image is not None and isinstance(machine, CloudInstance):
+            machine.takes_containers()
+        send(self, checked(machine))
+
+    def prepare(self, context: LaunchContext) -> None:
+        """Resolve the action, its streams too, whose relative names are in its namespace."""
+        if self._fogros2_own_machine and self._image is not None:
+            self._use_image(context)
+        super().prepare(context)
+        if self._fogros2_own_machine:
+            namespace = self.expanded_node_namespace
+            if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
+                namespace = '/'
+            self._fogros2_streams = streaming.resolve(context, self.stream_topics, namespace)
+            streaming.check(self._fogros2_streams)
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Execute the action; components that it loads know the topics of its machine."""
+        if context.is_shutdown or not self._fogros2_own_machine:
+            executed: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
+            return executed
+        assert isinstance(self, RemoteProcess)
+        coordinator = Coordinator.of(context)
+        if not coordinator.on_robot(self.machine):
+            # before a lifecycle node or a container makes a ROS node in this process
+            coordinator.engage()
+        entities: list[LaunchDescriptionEntity] = super().execute(context) or []
+        for entity in entities:
+            components.send(entity, self.machine, self._fogros2_streams, context)
+        return entities
+
+    def _use_image(self, context: LaunchContext) -> None:
+        assert isinstance(self, RemoteProcess)
+        image = words.resolve(context, self._image)
+        options = words.resolve(context, self._image_options)
+        containers.node_container(image, options)
+        if self.shell:
+            raise ConfigurationError(
+                f"a node in the image '{image}' can't run in a shell of the machine",
+                'leave shell= out')
+        if Coordinator.of(context).on_robot(self.machine):
+            raise ConfigurationError(
+                f"the image '{image}' is for a machine, and the robot runs this node itself",
+                'leave image= out for the robot, or choose another machine')
+        self._fogros2_image, self._fogros2_image_options = image, options
+
+
+class LifecycleNode(Node, launch_ros.actions.LifecycleNode):
+    """A :class:`launch_ros.actions.LifecycleNode` that takes ``machine`` as Node does."""
+
+
+class ComposableNodeContainer(Node, launch_ros.actions.ComposableNodeContainer):
+    """
+    A :class:`launch_ros.actions.ComposableNodeContainer` that takes ``machine`` as Node does.
+
+    The components in its ``composable_node_descriptions`` are loaded on the machine.
+    """
+
+
+class CloudNode(Node):
+    """A Node that always has a machine."""
+
+    def __init__(self, machine: SomeMachine, **kwargs: Any) -> None:
+        super().__init__(machine=checked(machine), **kwargs)

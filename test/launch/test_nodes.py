@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``machine=`` on launch_ros's nodes: in Python, and below ``<fogros_launch>``."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+import io
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    IncludeLaunchDescription,
+    RegisterEventHandler,
+)
+from launch.conditions import IfCondition
+from launch.event_handlers import OnProcessStart
+from launch.events import matches_action
+from launch.events.process import ShutdownProcess
+from launch.frontend import expose, Parser
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+import launch_ros.actions
+from launch_ros.descriptions import ComposableNode
+import pytest
+
+from fogros2 import (
+    CloudGroup,
+    CloudNode,
+    ComposableNodeContainer,
+    ContainerInstance,
+    FogROSLaunchDescription,
+    LifecycleNode,
+    Node,
+)
+from fogros2.actions.launch_description import has_machine
+from fogros2.actions.override import OverrideMachines, Overrides
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.h264 import H264
+from fogros2.testing.plugins import instead
+
+KINDS = [Node, LifecycleNode, ComposableNodeContainer]
+
+
+class Harmless(H264):
+    """H.264's decisions, carried out by a program that only sleeps."""
+
+    def encoder(self, stream):
+        return dataclasses.replace(super().encoder(stream), package='demo', executable='talker')
+
+    decoder = encoder
+
+
+@pytest.fixture
+def streams(monkeypatch):
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='')
+
+
+def node(cls=Node, **kwargs):
+    if cls is not Node:
+        kwargs = {'name': 'arm', 'namespace': '', **kwargs}
+    return cls(package='demo', executable='talker', **kwargs)
+
+
+def ends(machine, node):
+    machine.say('exited', node, returncode=0, respawns=False)
+
+
+def started(fake):
+    """Return machine and process of what was started on machines."""
+    return sorted((machine, name.rpartition('-')[0] or name)
+                  for machine, name in fake.noted('start'))
+
+
+def stops(action):
+    """Return an event handler that ends a process as soon as it runs."""
+    return RegisterEventHandler(OnProcessStart(target_action=action, on_start=[
+        EmitEvent(event=ShutdownProcess(process_matcher=matches_action(action)))]))
+
+
+# -- without a machine ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize('cls', KINDS)
+@pytest.mark.parametrize('none', [{}, {'machine': None}])
+def test_a_node_without_machine_is_launch_ros_s(run, fake, cls, none):
+    plain = node(cls, **none)
+    assert isinstance(plain, getattr(launch_ros.actions, cls.__name__))
+    assert not has_machine(plain)
+    assert run(LaunchDescription([plain, stops(plain)])) == 0
+    assert plain.return_code == -2
+    assert fake.notes == [] and fake.report is None
+    assert 'fogros2' not in str(plain.process_details['env'].get('CYCLONEDDS_URI'))
+
+
+@pytest.mark.parametrize('option', [
+    {'image': 'ros:jazzy'}, {'stream_topics': [('/camera', 'h264')]}])
+def test_options_of_a_machine_need_one(option):
+    with pytest.raises(ConfigurationError, match=f'{next(iter(option))}= of a node is for a mach'):
+        node(**option)
+
+
+def test_a_node_without_machine_goes_with_its_group(run, fake, planner):
+    fake.on_start = ends
+    assert run(LaunchDescription([CloudGroup(planner, [node()])])) == 0
+    assert started(fake) == [('planner', 'talker')]
+
+
+# -- with one ------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('cls', KINDS)
+def test_a_node_with_machine_runs_there(run, fake, planner, cls):
+    fake.on_start = ends
+    away = node(cls, machine=planner)
+    assert isinstance(away, cls)
+    assert isinstance(away, getattr(launch_ros.actions, cls.__name__))
+    seen = []
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessStart(
+            target_action=away, on_start=lambda event, context: seen.append(event.pid))),
+        away])) == 0
+    assert started(fake) == [('planner', 'talker')] and seen == [4001]
+    assert run.context.environment['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+
+
+@pytest.mark.parametrize('name', [
+    'planner', LaunchConfiguration('which'), ['plan', LaunchConfiguration('half')]])
+def test_a_machine_is_named_by_text_or_substitution(run, fake, planner, name):
+    fake.on_start = ends
+    assert run(FogROSLaunchDescription([
+        DeclareLaunchArgument('which', default_value='planner'),
+        DeclareLaunchArgument('half', default_value='ner'),
+        CloudNode(machine=planner, package='demo', executable='talker'),
+        node(machine=name, exec_name='named')])) == 0
+    assert started(fake) == [('planner', 'named'), ('planner', 'talker')]
+
+
+def test_a_false_condition_makes_no_machine(run, fake, planner):
+    assert run(LaunchDescription([node(machine=planner, condition=IfCondition('0'))])) == 0
+    assert fake.notes == []
+
+
+def test_a_node_keeps_its_machine_inside_a_group(run, fake, planner):
+    fake.on_start = ends
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(LaunchDescription([CloudGroup(other, [node(machine=planner), node()])])) == 0
+    assert started(fake) == [('other', 'talker'), ('planner', 'talker')]
+
+
+@pytest.mark.parametrize('cls', KINDS)
+def test_a_machine_overridden_by_the_robot_is_none(run, fake, planner, cls):
+    here = node(cls, machine=planner)
+    assert run(LaunchDescription([OverrideMachines(
+        Overrides(['planner=robot']), [here, stops(here)])])) == 0
+    assert here.return_code == -2
+    assert fake.noted('up') == []
+
+
+def test_components_of_a_container_know_the_streams(
+        run, fake, planner, monkeypatch, streams):
+    loaded = []
+
+    def execute(loading, context):
+        (component,) = vars(loading)['_LoadComposableNodes__composable_node_descriptions']
+        loaded.extend((old[0].text, new[0].text) for old, new in component.remappings)
+
+    monkeypatch.setattr(launch_ros.actions.LoadComposableNodes, 'execute', execute)
+    fake.on_start = ends
+    view = ComposableNode(package='demo', plugin='demo::View', name='view', namespace='',
+                          remappings=[('image', '/map')])
+    assert run(LaunchDescription([ComposableNodeContainer(
+        machine=planner, package='demo', executable='talker', name='box', namespace='',
+        composable_node_descriptions=[view], stream_topics=[('/map', 'h264')],
+        exec_name='box')])) == 0
+    assert ('image', '/fogros2/planner/map') in loaded
+    assert ('planner', 'box') in started(fake)
+
+
+def test_a_machine_of_another_type_is_refused():
+    for cls in (Node, CloudNode):
+        with pytest.raises(ConfigurationError, match='machine=7 is no machine'):
+            node(machine=7) if cls is Node else cls(7, package='demo', executable='talker')
+    with pytest.raises(ConfigurationError, match='machine=None is no machine'):
+        CloudNode(machine=None, package='demo', executable='talker')
+
+
+# -- XML and YAML --------------------------------------------------------------------------------
+
+MACHINE = '<fog_machine name="planner" provider="container" ros_workspace=""/>'
+TALKER = '<node machine="planner" pkg="demo" exec="talker" exec_name="{}"/>'
+
+
+def load(text, name='test.launch.xml'):
+    source = io.StringIO(text)
+    source.name = name
+    entity, parser = Parser.load(source)
+    return parser.parse_description(entity)
+
+
+def fogros_launch(text):
+    return load(f'<launch><fogros_launch>{MACHINE}{text}</fogros_launch></launch>')
+
+
+@pytest.mark.parametrize('text', [
+    TALKER.format('one'),
+    f'<group>{TALKER.format("one")}</group>',
+    f'<group if="true"><group>{TALKER.format("one")}</group></group>',
+    f'<timer period="0.01">{TALKER.format("one")}</timer>',
+    f'<cloud_group machine="other">{TALKER.format("one")}</cloud_group>',
+    f'<fogros_launch>{TALKER.format("one")}</fogros_launch>',
+    '<let name="which" value="planner"/>'
+    '<node machine="$(var which)" pkg="demo" exec="talker" exec_name="one"/>',
+    '<node machine="planner" pkg="demo" exec="talker" exec_name="zero" if="false"/>'
+    '<node machine="planner" pkg="demo" exec="talker" exec_name="one" unless="false"/>',
+    '<node_container machine="planner" pkg="demo" exec="talker" exec_name="one" name="box" '
+    'namespace=""><composable_node pkg="demo" plugin="demo::View" name="view" if="false"/>'
+    '</node_container>',
+])
+def test_machine_on_an_element_anywhere_below(run, fake, text):
+    fake.on_start = ends
+    assert run(fogros_launch(text)) == 0
+    assert started(fake) == [('planner', 'one')]
+
+
+def test_machine_on_a_node_in_yaml(run, fake):
+    fake.on_start = ends
+    assert run(load('''
+launch:
+- fogros_launch:
+  - fog_machine: {name: planner, provider: container, ros_workspace: ''}
+  - group:
+    - node:
+        machine: planner
+        pkg: demo
+        exec: talker
+        exec_name: one
+        param: [{name: rate, value: 3}]
+''', 'test.launch.yaml')) == 0
+    assert started(fake) == [('planner', 'one')]
+
+
+def test_a_node_in_xml_takes_what_a_cloud_node_takes(run, fake, streams):
+    fake.on_start = ends
+    assert run(fogros_launch('''
+      <node machine="planner" pkg="demo" exec="talker" exec_name="one" image="ros:jazzy"
+            image_options="--gpus=all, --ipc=host">
+        <stream_topic topic="/map" transport="h264"/>
+        <param name="rate" value="3"/>
+      </node>''')) == 0
+    (spec,) = [spec for spec in fake.machines['planner'].all if spec.image]
+    assert spec.image == 'ros:jazzy' and spec.image_options == ('--gpus=all', '--ipc=host')
+    assert '/map:=/fogros2/planner/map' in spec.arguments
+
+
+@pytest.mark.parametrize('where', ['xml', 'yaml', 'xml in xml', 'xml in python'])
+def test_included_files_take_machine_on_a_node(run, fake, tmp_path, where):
+    fake.on_start = ends
+    (tmp_path / 'inner.launch.xml').write_text(f'<launch>{TALKER.format("one")}</launch>')
+    (tmp_path / 'inner.launch.yaml').write_text(
+        'launch: [{node: {machine: planner, pkg: demo, exec: talker, exec_name: one}}]')
+    (tmp_path / 'middle.launch.xml').write_text(
+        '<launch><group><include file="$(dirname)/inner.launch.xml"/></group></launch>')
+    (tmp_path / 'middle.launch.py').write_text('''
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.conditions import IfCondition
+
+
+def generate_launch_description():
+    inner = str(Path(__file__).with_name('inner.launch.xml'))
+    return LaunchDescription([GroupAction(
+        [IncludeLaunchDescription(inner)], condition=IfCondition('true'))])
+''')
+    name = {'xml': 'inner.launch.xml', 'yaml': 'inner.launch.yaml',
+            'xml in xml': 'middle.launch.xml', 'xml in python': 'middle.launch.py'}[where]
+    assert run(fogros_launch(f'<group><include file="{tmp_path}/{name}"/></group>')) == 0
+    assert started(fake) == [('planner', 'one')]
+
+
+def test_arguments_of_included_files_stay_visible(tmp_path):
+    (tmp_path / 'inner.launch.xml').write_text(
+        f'<launch><arg name="rate" default="1"/>{TALKER.format("one")}</launch>')
+    description = fogros_launch(f'<include file="{tmp_path}/inner.launch.xml"/>')
+    assert [argument.name for argument in description.get_launch_arguments()] == ['rate']
+
+
+def test_an_unknown_machine_gets_the_nearest_name(run, fake, capfd):
+    assert run(fogros_launch('<node machine="planer" pkg="demo" exec="talker"/>')) == 1
+    assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
+        capfd.readouterr().out)
+    assert fake.noted('up') == []
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('<node machine="" pkg="demo" exec="talker"/>', 'a node needs a machine'),
+    ('<node machine="planner" pkg="demo" exec="talker" imag="a"/>', "did you mean 'image'?"),
+])
+def test_a_wrong_attribute_is_refused_when_read(text, said):
+    with pytest.raises(ConfigurationError) as error:
+        fogros_launch(text)
+    assert said in str(error.value)
+
+
+def test_a_node_without_machine_stays_launch_ros_s_in_xml():
+    (description,) = load(
+        '<launch><fogros_launch><node pkg="demo" exec="talker"/></fogros_launch></launch>',
+    ).entities
+    (plain,) = description.get_sub_entities()
+    assert type(plain) is launch_ros.actions.Node
+
+
+# -- other launch files --------------------------------------------------------------------------
+
+def fails(text):
+    with pytest.raises(Exception, match='machine'):
+        load(f'<launch>{text}</launch>')
+
+
+@pytest.fixture
+def registry():
+    """Hold launch's table of elements against what it was before the test."""
+    Parser.load_launch_extensions()
+    before = dict(expose.action_parse_methods)
+    yield
+    assert expose.action_parse_methods == before
+    assert expose.action_parse_methods['node'].__wrapped__ == launch_ros.actions.Node.parse
+
+
+def test_machine_is_for_fogros_launch_alone(registry, tmp_path):
+    talker = TALKER.format('one')
+    fails(talker)
+    fogros_launch(talker)
+    fails(talker)
+    # beside it in one file, too
+    fails(f'<fogros_launch>{MACHINE}{talker}</fogros_launch>{talker}')
+    # and in a file that is included elsewhere
+    (tmp_path / 'inner.launch.xml').write_text(f'<launch>{talker}</launch>')
+    source = AnyLaunchDescriptionSource(str(tmp_path / 'inner.launch.xml'))
+    IncludeLaunchDescription(source)
+    with pytest.raises(Exception, match='machine'):
+        source.get_launch_description(LaunchContext())
+
+
+@pytest.mark.parametrize('wrong', [
+    '<node machine="planner" pkg="demo"/>', '<nod machine="planner"/>', '<fog_machine/>'])
+def test_a_file_that_cannot_be_read_changes_nothing(registry, wrong):
+    with pytest.raises(Exception, match='.'):
+        fogros_launch(wrong)
+    fails(TALKER.format('one'))
+
+
+def test_files_are_read_in_several_threads(registry):
+    talker = TALKER.format('one')
+    with ThreadPoolExecutor(8) as pool:
+        for each in [pool.submit(read, talker) for read in 50 * (fogros_launch, fails)]:
+            each.result()
+
+
+def test_fogros2_adds_elements_and_replaces_none(registry):
+    assert {name for name, parse in expose.action_parse_methods.items()
+            if parse.__module__.startswith('fogros2')} == {
+                'fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'fogros_launch'}
