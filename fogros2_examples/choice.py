@@ -9,9 +9,8 @@ from launch import LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import EqualsSubstitution, LaunchConfiguration
-from launch_ros.actions import Node
 
-from fogros2 import CloudNode, ContainerInstance, SSHInstance
+from fogros2 import ContainerInstance, Node, SSHInstance
 
 #: What begins the names of the arguments for the second machine alone.
 SECOND = 'second_'
@@ -76,7 +75,7 @@ def node(executable: str, *, which: str = '', **kwargs: Any) -> list[LaunchDescr
     program: dict[str, Any] = {'package': 'fogros2_examples', 'executable': executable,
                                'output': 'screen', **kwargs}
     return [
-        CloudNode(machine=container, condition=chosen('container'), **program),
-        CloudNode(machine=computer, condition=chosen('ssh'), **program),
+        Node(machine=container, condition=chosen('container'), **program),
+        Node(machine=computer, condition=chosen('ssh'), **program),
         Node(condition=chosen('local'), **program),
     ]

@@ -32,7 +32,7 @@ class CloudGroup(GroupAction):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param actions: the content.
-    :param stream_topics: image topics that cross the VPN encoded, as at CloudNode.
+    :param stream_topics: image topics that cross the VPN encoded, as at Node.
     """
 
     def __init__(

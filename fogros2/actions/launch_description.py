@@ -50,7 +50,7 @@ class FogROSLaunchDescription(LaunchDescription):
     :param robot_nodes: 'after_cloud' starts the processes and timers of the robot when the
         machines are up and their nodes run; 'immediately' starts them at once. Everything is
         executed in its order either way: only the start of a process waits.
-    :param stream_topics: image topics that cross the VPN encoded, as at CloudNode, between the
+    :param stream_topics: image topics that cross the VPN encoded, as at Node, between the
         robot and every machine of the launch.
     :param dds: the middleware of all nodes, such as 'fastdds', in RMW_IMPLEMENTATION's place.
     """

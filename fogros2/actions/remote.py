@@ -26,9 +26,9 @@ class RemoteProcess(ExecuteLocal):
     """
     A process action whose process is on a machine.
 
-    A base to stand behind the action proper (``class CloudNode(Node, RemoteProcess)``): the
-    method resolution order then has it between Node and ExecuteLocal, whose execution it keeps
-    but for the start of the process.
+    A base to stand behind the action proper, as :func:`send` has it: the method resolution order
+    of ``class Away(Node, RemoteProcess)`` has it between Node and ExecuteLocal, whose execution it
+    keeps but for the start of the process.
     """
 
     _fogros2_machine: SomeMachine

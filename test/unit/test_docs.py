@@ -14,7 +14,6 @@ import sys
 
 from launch import LaunchDescription
 from launch.frontend import Parser
-from launch_ros.actions import Node
 import pytest
 
 import fogros2
@@ -54,8 +53,7 @@ def test_python(text, tmp_path):
         machines = {name: fogros2.ContainerInstance(name=name)
                     for name in ('machine', 'mapper', 'planner')}
         runpy.run_path(str(path), {
-            **{name: getattr(fogros2, name) for name in fogros2.__all__}, 'Node': Node,
-            **machines})
+            **{name: getattr(fogros2, name) for name in fogros2.__all__}, **machines})
 
 
 @pytest.mark.parametrize('text', [*blocks('xml'), *blocks('yaml')])

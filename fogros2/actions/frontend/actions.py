@@ -24,7 +24,7 @@ class StreamTopicEverywhere(Action):
     """
     A topic that crosses the VPN encoded, between the robot and every machine of the launch.
 
-    Below a CloudNode or a CloudGroup it is that one's alone: these take ``entry`` from it.
+    Below a node or a CloudGroup it is that one's alone: these take ``entry`` from it.
     """
 
     def __init__(self, entry: StreamTopic, **kwargs: Any) -> None:
