@@ -21,7 +21,8 @@ podman ps -q >/dev/null 2>&1 || apt-get install -q -y --no-install-recommends cr
 """
 # Prints what the engine knows the image as. An image of ROS without the launch's middleware (those
 # that are published have Fast DDS alone) gets a layer with it, once; not by 'build', which takes
-# control groups.
+# control groups. The layer keeps the image's command and user, which a commit takes from the
+# container that made it.
 IMAGE = ENGINE + """\
 image=$1 rmw=$3
 there() { $as_root $engine image inspect "$1" >/dev/null 2>&1; }
@@ -53,12 +54,16 @@ if [ -n "$rmw" ]; then
         $as_root $engine rm -f "$looking" >/dev/null
         if [ -n "$lacks" ]; then
             adding=fogros2-adding-$$
+            install='apt-get update -q; apt-get install -q -y --no-install-recommends "$0"'
             trap '$as_root $engine rm -f $adding >/dev/null 2>&1' EXIT
             $as_root $engine run --name $adding --user 0:0 --network host --log-driver none \\
-                -e DEBIAN_FRONTEND=noninteractive "$image" sh -ec \\
-                'apt-get update -q; apt-get install -q -y --no-install-recommends "$0"' \\
+                "$image" sh -ec "export DEBIAN_FRONTEND=noninteractive; $install" \\
                 "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
-            $as_root $engine commit $adding "$with" >/dev/null
+            command=$($as_root $engine image inspect -f '{{json .Config.Cmd}}' "$image")
+            user=$($as_root $engine image inspect -f '{{.Config.User}}' "$image")
+            [ "$command" != null ] || command='[]'
+            $as_root $engine commit --change "CMD $command" --change "USER ${user:-0}" \\
+                $adding "$with" >/dev/null
             image=$with
         fi
     fi
@@ -141,18 +146,11 @@ for each in @VARIABLES@; do
     esac
     [ -z "$given" ] || printf '%s=%s\\n' "$each" "$value"
 done >"$list"
-set -f; IFS=,
-for each in $CYCLONEDDS_URI $FASTDDS_DEFAULT_PROFILES_FILE $FASTRTPS_DEFAULT_PROFILES_FILE \\
-        $ZENOH_SESSION_CONFIG_URI; do
-    each=${each#file://}
-    case $each in /*) [ ! -f "$each" ] || set -- -v "$each:$each:ro" "$@" ;; esac
-done
-set +f; unset IFS
 [ ! -d "$workspace" ] || set -- -v "$workspace:$workspace:ro" "$@"
 set -- -v "$inside:$inside:ro" "$@"
 """ + GPUS + """\
 $as_root $engine rm -f "$name" >/dev/null 2>&1
-$as_root $engine create --pull never --name "$name" --network host --ipc host --log-driver none \\
+$as_root $engine create --pull never --name "$name" --log-driver none \\
     --user "$(id -u):$(id -g)" --env-file "$list" -e HOME=/tmp "$@" >/dev/null
 status=$?
 rm -f "$list"

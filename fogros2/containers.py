@@ -6,6 +6,7 @@ Pure: what ``docker run`` lines mean, and the commands by which podman or docker
 runs them. Each container is started before the nodes; a process of the agent follows it, so that
 it is seen in ``ros2 fog status``, what it says in ``ros2 fog logs``, and it ends with the nodes.
 A node in an image is a process of the agent's, too, which has the node as its container.
+Both take part in the launch's DDS: see ``dds_options`` and ``dds_variables``.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import shlex
 from typing import Any, Union
 
 from fogros2 import container_scripts as scripts
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, DdsError
 from fogros2.model import Command, NodeSpec, Text
 
 #: The program in the agent's folder that follows a container, with the container's name and when
@@ -39,14 +40,26 @@ _ENGINES = ('podman', 'docker')
 #: What the scripts are called that travel with a process.
 _OUTER, _INNER = 'container', 'in-container'
 _VARIABLE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
-#: Variables that a node in an image gets as the machine's own nodes have them.
-_VARIABLES = (
-    'CYCLONEDDS_URI', 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE', 'LANG',
-    'RCUTILS_COLORIZED_OUTPUT', 'RCUTILS_CONSOLE_OUTPUT_FORMAT', 'RCUTILS_LOGGING_BUFFERED_STREAM',
-    'RCUTILS_LOGGING_USE_STDOUT', 'RMW_FASTRTPS_USE_QOS_FROM_XML', 'RMW_IMPLEMENTATION',
-    'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_DOMAIN_ID', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS',
-    'ZENOH_CONFIG_OVERRIDE', 'ZENOH_ROUTER_CHECK_ATTEMPTS', 'ZENOH_SESSION_CONFIG_URI',
+#: Variables that decide which nodes hear each other. Every container on the machine's network gets
+#: them as the machine's own nodes have them.
+_DDS_VARIABLES = (
+    'CYCLONEDDS_URI', 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE',
+    'RMW_FASTRTPS_USE_QOS_FROM_XML', 'RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
+    'ROS_DOMAIN_ID', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ZENOH_CONFIG_OVERRIDE',
+    'ZENOH_ROUTER_CHECK_ATTEMPTS', 'ZENOH_SESSION_CONFIG_URI',
 )
+#: Variables that only a node in an image gets, as the machine's own nodes have them.
+_NODE_VARIABLES = (
+    'LANG', 'RCUTILS_COLORIZED_OUTPUT', 'RCUTILS_CONSOLE_OUTPUT_FORMAT',
+    'RCUTILS_LOGGING_BUFFERED_STREAM', 'RCUTILS_LOGGING_USE_STDOUT',
+)
+#: Options that give a container another network than the machine's, whatever their value.
+_OWN_NETWORK = {'--ip', '--ip6', '--link', '--mac-address', '--network-alias', '--pod',
+                '--publish', '--publish-all', '-P', '-p'}
+#: Where FogROS2's launch files mount the configuration of Cyclone DDS from.
+FOGROS2_FILE = '/home/ubuntu/cyclonedds.xml'
+_MOUNTS = ('-v', '--volume', '--mount')
+_FOGROS2_SOURCE = re.compile(rf'(^|\b(?:source|src)=){FOGROS2_FILE}(?=[:,]|$)')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +161,79 @@ def parse(line: str) -> Container:
                      found['--name'], found['--restart'])
 
 
+def on_machine_network(container: Container) -> bool:
+    """Return whether a container has the machine's network: it does unless an option says not."""
+    networks = [value for name, value in _pairs(container) if name in ('--network', '--net')]
+    if networks:
+        return networks == ['host']
+    return not _OWN_NETWORK & {word.partition('=')[0] for word in container.options}
+
+
+def sets(container: Container, variable: str) -> bool:
+    """Return whether an option of a container sets a variable; files of variables aside."""
+    return any(name in ('-e', '--env') and value.partition('=')[0] == variable
+               for name, value in _pairs(container))
+
+
+def check(container: Container, rmw: str) -> None:
+    """
+    Refuse a container that expects Cyclone DDS's configuration from another middleware.
+
+    :param rmw: the launch's.
+    :raises DdsError: it mounts ``FOGROS2_FILE``.
+    """
+    if rmw != 'rmw_cyclonedds_cpp' and any(
+            name in _MOUNTS and _FOGROS2_SOURCE.search(value)
+            for name, value in _pairs(container)):
+        raise DdsError(
+            f"the container '{container.image}' mounts {FOGROS2_FILE} for rmw_cyclonedds_cpp, and"
+            f" the launch's nodes have {rmw}: they would not hear each other",
+            'unset RMW_IMPLEMENTATION, or leave the mount out')
+
+
+def _pairs(container: Container) -> Iterable[tuple[str, str]]:
+    return zip(container.options, container.options[1:])
+
+
+def dds_options(
+    container: Container, configuration: str, variables: str = '',
+) -> tuple[str, ...]:
+    """
+    Return a container's options, and those that let its nodes meet the machine's.
+
+    These come first, so that the launch file's own options win: the engine lets ``-e`` override
+    all files of variables, and a later file an earlier one. The shared memory is the machine's,
+    too: nodes that find themselves on one host use it. A mount of ``FOGROS2_FILE`` becomes one of
+    the launch's configuration. A container with a network of its own is out of the machine's DDS.
+
+    :param configuration: path of the middleware's configuration on the machine.
+    :param variables: path of a file there with ``dds_variables``, '' where they come another way.
+    """
+    own = list(container.options)
+    for at, (name, value) in enumerate(_pairs(container), 1):
+        if name in _MOUNTS:
+            own[at] = _FOGROS2_SOURCE.sub(rf'\g<1>{configuration}', value)
+    if not on_machine_network(container):
+        return tuple(own)
+    words = ['--env-file', variables] if variables else []
+    names = {word.partition('=')[0] for word in own}
+    if not names & {'--network', '--net'}:
+        words += ['--network', 'host']
+    if not names & {'--ipc', '--shm-size'}:
+        words += ['--ipc', 'host']
+    return (*words, '-v', f'{configuration}:{configuration}:ro', *own)
+
+
+def dds_variables(environment: Mapping[str, str]) -> str:
+    """
+    Return the file of variables that a container beside the nodes takes.
+
+    :param environment: of the machine's nodes. The file's format has no values of several lines.
+    """
+    return ''.join(f'{name}={environment[name]}\n' for name in _DDS_VARIABLES
+                   if '\n' not in environment.get(name, '\n'))
+
+
 def called(container: Container, number: int, launch: str) -> str:
     """Return how the engine calls a container; each launch's differ, on one computer too."""
     what = container.name or posixpath.basename(container.image).partition('@')[0]
@@ -208,16 +294,21 @@ def fetch(image: str, rmw: str = '') -> Command:
                    what=f"get the image '{image}'")
 
 
-def run(container: Container, number: int, launch: str, image: str) -> Command:
+def run(
+    container: Container, number: int, launch: str, image: str, configuration: str,
+    variables: str,
+) -> Command:
     """
     Return what starts a container.
 
     :param image: what ``fetch`` printed.
+    :param configuration: see ``dds_options``, as for ``variables``.
     """
+    options = dds_options(container, configuration, variables)
     name = called(container, number, launch)
     return Command(
         ('sh', '-ec', scripts.RUN, 'sh', name, container.gpus,
-         '--label', f'{LABEL}={launch}', *container.options, image, *container.command),
+         '--label', f'{LABEL}={launch}', *options, image, *container.command),
         what=f"start the container '{container.image}'")
 
 
@@ -231,19 +322,22 @@ def follow(container: Container, number: int, launch: str) -> NodeSpec:
 
 
 def inside(
-    node: NodeSpec, image: str, launch: str, workspace: str, variables: Iterable[str] = (),
+    node: NodeSpec, image: str, launch: str, workspace: str, configuration: str,
+    variables: Iterable[str] = (),
 ) -> NodeSpec:
     """
     Return the process that runs a node in its image.
 
     :param image: what ``fetch`` printed.
     :param workspace: the one that travels, '' for none; it is at the same place in there.
+    :param configuration: see ``dds_options``.
     :param variables: names of those that the machine's nodes have by the launch file.
     """
     container = node_container(node.image, node.image_options)
-    names = sorted(name for name in {*_VARIABLES, *variables, *node.environment}
-                   if _VARIABLE.fullmatch(name))
-    options: list[Text] = ['--label', f'{LABEL}={launch}', *container.options]
+    known = {*_DDS_VARIABLES, *_NODE_VARIABLES, *variables, *node.environment}
+    names = sorted(name for name in known if _VARIABLE.fullmatch(name))
+    options: list[Text] = [
+        '--label', f'{LABEL}={launch}', *dds_options(container, configuration)]
     for key in node.files:
         options += ['-v', ({'file': key}, ':', {'file': key}, ':ro')]
     options += ['-w', node.cwd] if node.cwd else []

@@ -188,6 +188,9 @@ class CloudInstance:
         """
         Run a container on the machine from before its nodes start until they have ended.
 
+        Its nodes hear the launch's: unless the options say otherwise it has the machine's network
+        and the variables and configuration of the middleware.
+
         :param cmd: a ``docker run`` command line.
         :param image: instead of that, the container's image, with any of ``command``, ``ports``,
             ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import threading
 
 from fogros2 import container_scripts, containers
@@ -18,23 +18,27 @@ class Containers:
     What one machine has of containers; thread-safe.
 
     :param directory: of the machine's agent.
+    :param configuration: path of the middleware's configuration there.
     """
 
-    def __init__(self, job: Job, shell: Shell, directory: str) -> None:
+    def __init__(self, job: Job, shell: Shell, directory: str, configuration: str) -> None:
         self._job = job
         self._shell = shell
         self._directory = directory
+        self._configuration = configuration
         self._lock = threading.Lock()
         self._engine = False
         #: What the engine knows images as, by what the launch file calls them.
         self._images: dict[tuple[str, str], str] = {}
 
-    def start(self) -> None:
+    def start(self, environment: Callable[[], Mapping[str, str]]) -> None:
         """
         Start a machine's containers, before its nodes, and get the images that those run in.
 
         An engine is installed where there is none.
 
+        :param environment: waits for the VPN's interface and the middleware's configuration, which
+            a node reads as it starts; returns the variables of the machine's nodes.
         :raises CommandError: a container doesn't start.
         :raises PrerequisiteError: the machine can't have an engine, or an image.
         """
@@ -42,21 +46,32 @@ class Containers:
         # here, as nodes in images come later and are to be stopped before
         job.undoing('containers', self._remove)
         if job.spec.containers:
-            self._start_containers()
+            self._start_containers(environment)
         self._get(job.launch.images(job.name))
 
-    def _start_containers(self) -> None:
+    def _start_containers(self, environment: Callable[[], Mapping[str, str]]) -> None:
         job, launch = self._job, self._job.launch.id
+        variables = f'{self._directory}/container-variables'
+        lines = [containers.parse(line) for line in job.spec.containers]
         with self._lock, job.step('containers') as detail:
-            self._shell.put(
-                container_scripts.FOLLOW.encode(), f'{self._directory}/{containers.FOLLOWER}',
-                mode=0o600, timeout=job.timeouts.command)
-            for number, line in enumerate(job.spec.containers):
-                container = containers.parse(line)
-                image = self._image(container.image)
-                self._shell.run(containers.run(container, number, launch, image),
-                                timeout=job.timeouts.install, cancel=job.cancel)
-            detail.append(f'{len(job.spec.containers)}')
+            images = [self._image(each.image, self._lacking(each)) for each in lines]
+            for text, path in (
+                    (container_scripts.FOLLOW, f'{self._directory}/{containers.FOLLOWER}'),
+                    (containers.dds_variables(environment()), variables)):
+                self._shell.put(text.encode(), path, mode=0o600, timeout=job.timeouts.command)
+            for number, (container, image) in enumerate(zip(lines, images)):
+                self._shell.run(
+                    containers.run(container, number, launch, image, self._configuration,
+                                   variables),
+                    timeout=job.timeouts.install, cancel=job.cancel)
+            detail.append(f'{len(lines)}')
+
+    def _lacking(self, container: containers.Container) -> str:
+        """Return the middleware that a container's image has to have, '' for any."""
+        if not containers.on_machine_network(container) \
+                or containers.sets(container, 'RMW_IMPLEMENTATION'):
+            return ''
+        return self._job.launch.dds().rmw
 
     def inside(self, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
         """
@@ -68,7 +83,8 @@ class Containers:
         images = self._get(node.image for node in nodes if node.image)
         return [node if not node.image else containers.inside(
             node, images[node.image], self._job.launch.id,
-            self._job.spec.workspace or '', self._job.spec.environment) for node in nodes]
+            self._job.spec.workspace or '', self._configuration, self._job.spec.environment)
+            for node in nodes]
 
     def _get(self, images: Iterable[str]) -> dict[str, str]:
         """Return what the engine knows images as that nodes run in."""

@@ -71,8 +71,13 @@ class Deployment:
                 configuring = pool.submit(self.configure_dds, shell, interface)
                 equipment = Equipment(job, shell, ros)
                 equipping = pool.submit(_after, installing, self.equip, equipment)
-                containers = Containers(job, shell, self.guard.directory)
-                starting = pool.submit(_after, installing, containers.start)
+                containers = Containers(job, shell, self.guard.directory, self.configuration)
+
+                def environment() -> dict[str, str]:
+                    joining.result()
+                    return {**ros.environment, **configuring.result(), **job.spec.environment}
+
+                starting = pool.submit(_after, installing, containers.start, environment)
                 self._all_of(
                     installing, joining, syncing, configuring, equipping, starting)
                 public_key = joining.result().place.peer.public_key
@@ -135,16 +140,22 @@ class Deployment:
                     Progress(job.name, 'workspace', done, total)))
             detail.append(note)
 
+    @property
+    def configuration(self) -> str:
+        """The path of the middleware's configuration on the machine."""
+        return f'{self.guard.directory}/{self.launch.dds().file_name}'
+
     def configure_dds(self, shell: Shell, interface: VpnInterface) -> dict[str, str]:
         """Write the DDS configuration there; return the variables that nodes need."""
         vendor = self.launch.dds()
         # the robot hears of a machine by multicast, machines of each other by asking
         peers = self.launch.addresses_but(self.job.name)
-        path = f'{self.guard.directory}/{vendor.file_name}'
+        path = self.configuration
         shell.put(
             vendor.render(vendor.machine_interfaces(
                 interface.address if vendor.by_address else interface.name), peers).encode(),
-            path, mode=0o600, timeout=self.job.timeouts.command)
+            # for the users of containers, too; the folder lets nobody else in
+            path, mode=0o644, timeout=self.job.timeouts.command)
         return dict(vendor.environment(path, {}))
 
     def start_router(self, agent: AgentClient, interface: VpnInterface) -> None:

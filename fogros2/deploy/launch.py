@@ -110,7 +110,7 @@ class Launch:
                     f"'{spec.name}' is a computer that exists already: no launch switches it off",
                     "use on_exit='delete' to leave nothing there, or 'keep'")
             for line in spec.containers:
-                containers.parse(line)
+                containers.check(containers.parse(line), self._rmw)
             if spec.containers or images.get(spec.name):
                 machines.check_containers(spec)
             if spec.workspace is not None:

@@ -11,14 +11,15 @@ import os
 from pathlib import Path
 import re
 import secrets
+import shlex
 import signal
 import subprocess
 
 import pytest
 
-from fogros2 import container_scripts, containers
+from fogros2 import container_scripts, containers, plan
 from fogros2.containers import Container
-from fogros2.errors import CommandError
+from fogros2.errors import CommandError, DdsError
 from fogros2.model import Command, CreateRequest, Endpoint, MachineSpec, NodeSpec
 from fogros2.process import run, which
 from fogros2.provider import container_engine
@@ -47,6 +48,17 @@ def launch(engine: str) -> Iterator[str]:
     assert there(name) == []
 
 
+#: What a launch tells containers of its DDS.
+VARIABLES = 'RMW_IMPLEMENTATION=rmw\nROS_DOMAIN_ID=7\nROS_STATIC_PEERS=a b\n'
+
+
+def settings(folder: Path) -> Path:
+    """Write a middleware's configuration."""
+    path = folder / 'dds.xml'
+    path.write_text('settings of DDS\n')
+    return path
+
+
 def there(launch: str) -> list[str]:
     return run(Command(('podman', 'ps', '-a', '--format', '{{.Names}} {{.State}}', '--filter',
                         f'label={containers.LABEL}={launch}'), sudo=True), timeout=60,
@@ -65,7 +77,9 @@ def started(container: Container, launch: str, folder: Path) -> subprocess.Popen
     shell = LocalShell(Endpoint('local'), name='here')
     assert shell.run(containers.find(), timeout=60).stdout.strip() == 'podman'
     image = shell.run(containers.fetch(container.image), timeout=60).stdout.strip()
-    shell.run(containers.run(container, 0, launch, image), timeout=60)
+    (folder / 'variables').write_text(VARIABLES)
+    shell.run(containers.run(container, 0, launch, image, str(settings(folder)),
+                             str(folder / 'variables')), timeout=60)
     (folder / containers.FOLLOWER).write_text(container_scripts.FOLLOW)
     words = containers.follow(container, 0, launch).arguments
     return begun([str(word) for word in words], folder)
@@ -82,7 +96,7 @@ def node(image: str, launch: str, folder: Path, *command: str, **variables: str,
     made = containers.inside(
         NodeSpec('1', 'n-1', arguments=command, image=image, sigkill_timeout=1.5,
                  image_options=container_engine.limits()),
-        image, launch, str(folder), ('COLOUR',))
+        image, launch, str(folder), str(settings(folder)), ('COLOUR',))
     for key, text in made.files.items():
         (folder / key).write_text(str(text))
     return begun([word if isinstance(word, str) else str(folder / word[0]['file'])
@@ -155,18 +169,40 @@ def test_one_that_somebody_else_removes_is_not_waited_for(image, launch, tmp_pat
     assert follower.returncode != 0
 
 
+def test_container_has_machine_s_network_and_dds(image, launch, tmp_path):
+    mine = tmp_path / 'mine'
+    mine.write_text('ROS_DOMAIN_ID=8\n')
+    options = (*container_engine.limits(), '--user', '1234', '--env-file', str(mine),
+               '-e', 'RMW_IMPLEMENTATION=mine')
+    follower = started(Container(image, options, (
+        'sh', '-c', 'echo $RMW_IMPLEMENTATION $ROS_DOMAIN_ID "$ROS_STATIC_PEERS"; '
+        f'busybox cat {tmp_path}/dds.xml; busybox ls -L /proc/self/ns/net -i')), launch, tmp_path)
+    said = follower.communicate(timeout=60)[0].splitlines()
+    # the launch file's own come first, from a file as from an option
+    assert said[:2] == ['mine 8 a b', 'settings of DDS']
+    assert said[2].split()[0] == str(os.stat('/proc/self/ns/net').st_ino)
+
+
+@pytest.mark.parametrize('options', [('--network', 'none'), ('-p', '127.0.0.1::80')])
+def test_container_with_own_network_is_left_alone(image, launch, tmp_path, options):
+    follower = started(Container(image, (*container_engine.limits(), *options), (
+        'sh', '-c', 'echo ${RMW_IMPLEMENTATION-none}; busybox ls -L /proc/self/ns/net -i')),
+        launch, tmp_path)
+    said = follower.communicate(timeout=60)[0].splitlines()
+    assert said[0] == 'none'
+    assert said[1].split()[0] != str(os.stat('/proc/self/ns/net').st_ino)
+
+
 # --- nodes in images -----------------------------------------------------------------------------
 
 def test_a_node_in_an_image_has_the_machine_s_variables_files_and_user(image, launch, tmp_path):
-    settings = tmp_path / 'dds.xml'
-    settings.write_text('settings of DDS\n')
     process = node(
         image, launch, tmp_path, 'sh', '-c',
         'echo $RMW_IMPLEMENTATION "$COLOUR" $HOME ${SECRET-none}; '
         'busybox cat ${CYCLONEDDS_URI##*file://}; busybox id -u; busybox hostname; '
         f'busybox touch {tmp_path}/dds.xml; exit 5',
-        CYCLONEDDS_URI=f'<a/>,file://{settings}', RMW_IMPLEMENTATION='rmw', COLOUR='dark red',
-        SECRET='s')
+        CYCLONEDDS_URI=f'<a/>,file://{settings(tmp_path)}', RMW_IMPLEMENTATION='rmw',
+        COLOUR='dark red', SECRET='s')
     said = process.communicate(timeout=60)[0].splitlines()
     assert said[:4] == [
         'rmw dark red /tmp none', 'settings of DDS', str(os.geteuid()), os.uname().nodename]
@@ -230,6 +266,82 @@ def generate_launch_description():
                   respawn=True, output='screen'),
         Node(package='fogros2_examples', executable='listener', output='screen')])
 """
+
+#: Stands for the programs in the images of FogROS2's examples: answers what it hears.
+ANSWERING = """
+import sys
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from std_msgs.msg import String
+
+rclpy.init()
+node = rclpy.create_node(sys.argv[1])
+answers = node.create_publisher(String, 'answers', 10)
+node.create_subscription(String, 'chatter', lambda message: answers.publish(
+    String(data=f'{sys.argv[1]} answers {message.data}')), 10)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+"""
+ANSWERING_FILE = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name={name!r}, network={network!r}, mounts={mounts!r})
+    for line in {lines!r}:
+        machine.add_docker_container(line)
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  remappings=[('chatter', 'elsewhere')]),
+        Node(package='fogros2_examples', executable='talker'),
+        Node(package='fogros2_examples', executable='listener', output='screen',
+             remappings=[('chatter', 'answers')])], dds={dds!r})
+"""
+#: The lines of BerkeleyAutomation/fogros2-examples (gqcnn, vslam) but for image and command. The
+#: third one's image (mpt) has Cyclone DDS set by its entry point, and no line of its own.
+LINES = {
+    'gqcnn': 'sudo docker run --net=host --env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp '
+             '--env CYCLONEDDS_URI=file:///tmp/cyclonedds.xml '
+             '-v /home/ubuntu/cyclonedds.xml:/tmp/cyclonedds.xml --rm -it ',
+    'vslam': 'sudo docker run --net=host --env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp '
+             '--env CYCLONEDDS_URI=file:///tmp/cyclonedds.xml '
+             '-v /home/ubuntu/cyclonedds.xml:/tmp/cyclonedds.xml --rm -it ',
+    'mpt': 'docker run ',
+}
+
+
+@pytest.mark.timeout(150)
+@pytest.mark.usefixtures('nothing_left')
+@pytest.mark.skipif(which('ros2') is None, reason='needs ros2 on PATH')
+@pytest.mark.parametrize(('rmw', 'names'), [
+    ('rmw_cyclonedds_cpp', ['gqcnn', 'vslam', 'mpt']),
+    ('rmw_fastrtps_cpp', ['mpt']), ('rmw_zenoh_cpp', ['mpt'])])
+def test_container_s_node_and_robot_hear_each_other(
+        images, crun, with_python, cloud_network, tmp_path, monkeypatch, rmw, names):
+    try:
+        plan.check_rmw(rmw, plan.ament_prefixes(os.environ), ())
+    except DdsError as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    program = tmp_path / 'answering.py'
+    program.write_text(ANSWERING)
+    lines = [LINES[name] + shlex.join([
+        *with_python, '-v', f'{program}:/answering.py', f'oci-archive:{images}/system.tar',
+        'python3', '/answering.py', name]) for name in names]
+    path = tmp_path / 'answering.launch.py'
+    path.write_text(ANSWERING_FILE.format(
+        name=f'boxes-{secrets.token_hex(3)}', network=cloud_network, lines=lines, dds=rmw,
+        mounts=[str(images), str(program), *crun]))
+    with launching() as start:
+        launched = start(str(path))
+        for name in names:
+            launched.wait_for(f'I heard: [{name} answers Hello World from ')
+        launched.interrupt()
+        assert launched.ended() == 0, launched.text
+
 
 def volumes() -> set[str]:
     listed = run(Command(('podman', 'volume', 'ls', '-q'), sudo=True), timeout=30).stdout

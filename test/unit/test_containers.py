@@ -19,9 +19,12 @@ from fogros2.actions import words
 from fogros2.actions.machines import ContainerInstance
 from fogros2.actions.nodes import CloudNode
 from fogros2.containers import Container, parse
+from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.dds.fastdds import FastDds
+from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch
 from fogros2.deploy.beside import Containers
-from fogros2.errors import ConfigurationError, PrerequisiteError, Unsupported
+from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider.container import ContainerProvider
 from fogros2.report import step
@@ -114,14 +117,15 @@ def test_a_node_in_an_image_is_a_process_with_the_node_s_words_in_it():
         prefix=('nice', '-n', '5'), files={'p': 'a: 1'},
         environment={'COLOUR': 'red', 'no-name': ''}, cwd='/data', respawn=True, image='demo:1',
         image_options=('--gpus=all', '-v', '/a:/b'))
-    made = containers.inside(node, 'demo:1', 'abcdef', '/ws', {'MORE': '1'})
+    made = containers.inside(node, 'demo:1', 'abcdef', '/ws', '/run/dds.xml', {'MORE': '1'})
     assert (made.package, made.executable, made.image) == ('', '', '')
     assert (made.cwd, made.prefix) == (None, ())
     assert (made.respawn, made.environment) == (True, node.environment)
     outer, inner = made.arguments[1], made.arguments[6]
     assert made.arguments == (
         'sh', outer, 'fogros2-abcdef-eyes-1', 'all', '/ws', '4', inner,
-        '--label', 'fogros2-launch=abcdef', '-v', '/a:/b',
+        '--label', 'fogros2-launch=abcdef', '--network', 'host', '--ipc', 'host',
+        '-v', '/run/dds.xml:/run/dds.xml:ro', '-v', '/a:/b',
         '-v', ({'file': 'p'}, ':', {'file': 'p'}, ':ro'), '-w', '/data',
         'demo:1', 'sh', inner, '/ws', 'demo', 'talker', 'nice -n 5',
         '--ros-args', '--params-file', ({'file': 'p'},))
@@ -178,6 +182,108 @@ def test_an_image_is_an_attribute_in_xml(tmp_path, options):
     assert words.resolve(context, node._image_options) == ['--gpus=all', '--init']
 
 
+# --- DDS -----------------------------------------------------------------------------------------
+
+FILE = ('-v', '/run/dds.xml:/run/dds.xml:ro')
+#: As BerkeleyAutomation/fogros2-examples has them, for grasp planning and for SLAM; its motion
+#: planner runs as a node, in an image like these.
+GQCNN = ('sudo docker run --net=host --env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp --env '
+         'CYCLONEDDS_URI=file:///tmp/cyclonedds.xml -v /home/ubuntu/cyclonedds.xml:'
+         '/tmp/cyclonedds.xml --rm -it keplerc/gqcnn_ros:pj ros2 launch gqcnn_ros '
+         'planner.launch.py')
+
+
+@pytest.mark.parametrize(('options', 'became'), [
+    ('', ('--env-file', '/run/v', '--network', 'host', '--ipc', 'host', *FILE)),
+    ('-e ROS_DOMAIN_ID=3 --env-file mine', (
+        '--env-file', '/run/v', '--network', 'host', '--ipc', 'host', *FILE,
+        '-e', 'ROS_DOMAIN_ID=3', '--env-file', 'mine')),
+    ('--net=host --ipc=private', (
+        '--env-file', '/run/v', *FILE, '--net', 'host', '--ipc', 'private')),
+    ('--network host --shm-size=1g', (
+        '--env-file', '/run/v', *FILE, '--network', 'host', '--shm-size', '1g')),
+    # a network of its own
+    ('--network none', ('--network', 'none')), ('--net=mine', ('--net', 'mine')),
+    ('-p 80:8080', ('-p', '80:8080')), ('-P', ('-P',)),
+    ('--publish-all=true', ('--publish-all=true',)), ('--ip=10.0.0.7', ('--ip', '10.0.0.7')),
+])
+def test_container_on_machine_network_joins_its_dds(options, became):
+    container = parse(f'docker run {options} image')
+    assert containers.dds_options(container, '/run/dds.xml', '/run/v') == became
+    assert containers.on_machine_network(container) == ('--env-file' in became)
+
+
+@pytest.mark.parametrize(('written', 'became'), [
+    ('-v /home/ubuntu/cyclonedds.xml:/tmp/c.xml', ('-v', '/run/dds.xml:/tmp/c.xml')),
+    ('-v/home/ubuntu/cyclonedds.xml:/tmp/c.xml:ro', ('-v', '/run/dds.xml:/tmp/c.xml:ro')),
+    ('--volume=/home/ubuntu/cyclonedds.xml:/home/ubuntu/cyclonedds.xml',
+     ('--volume', '/run/dds.xml:/home/ubuntu/cyclonedds.xml')),
+    ('--mount type=bind,src=/home/ubuntu/cyclonedds.xml,dst=/c.xml,readonly',
+     ('--mount', 'type=bind,src=/run/dds.xml,dst=/c.xml,readonly')),
+    # these are the user's
+    ('-v /home/ubuntu/cyclonedds.xml.1:/c.xml', ('-v', '/home/ubuntu/cyclonedds.xml.1:/c.xml')),
+    ('-v /d:/home/ubuntu/cyclonedds.xml', ('-v', '/d:/home/ubuntu/cyclonedds.xml')),
+    ('-e A=/home/ubuntu/cyclonedds.xml', ('-e', 'A=/home/ubuntu/cyclonedds.xml')),
+])
+def test_mount_of_fogros2_s_file_is_the_launch_s(written, became):
+    container = parse(f'docker run {written} image')
+    assert containers.dds_options(container, '/run/dds.xml')[-2:] == became
+
+
+def test_line_of_fogros2_examples_reads_launch_s_file():
+    made = containers.run(parse(GQCNN), 0, 'abc', 'gqcnn', '/run/dds.xml', '/run/v').argv
+    assert made[made.index('--label'):] == (
+        '--label', 'fogros2-launch=abc', '--env-file', '/run/v', '--ipc', 'host', *FILE,
+        '--net', 'host', '--env', 'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp',
+        '--env', 'CYCLONEDDS_URI=file:///tmp/cyclonedds.xml',
+        '-v', '/run/dds.xml:/tmp/cyclonedds.xml', 'gqcnn', 'ros2', 'launch', 'gqcnn_ros',
+        'planner.launch.py')
+
+
+def test_fogros2_s_file_needs_cyclone_dds():
+    containers.check(parse(GQCNN), 'rmw_cyclonedds_cpp')
+    containers.check(parse('docker run image'), 'rmw_zenoh_cpp')
+    for rmw in ('rmw_fastrtps_cpp', 'rmw_zenoh_cpp'):
+        with pytest.raises(DdsError, match=f'keplerc/gqcnn_ros:pj.*have {rmw}'):
+            containers.check(parse(GQCNN), rmw)
+
+
+@pytest.mark.parametrize(('vendor', 'variables'), [
+    (CycloneDds, 'CYCLONEDDS_URI=file:///run/dds.xml\n'
+                 'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp\nROS_DOMAIN_ID=7\n'),
+    (FastDds, 'FASTRTPS_DEFAULT_PROFILES_FILE=/run/dds.xml\nRMW_IMPLEMENTATION=rmw_fastrtps_cpp\n'
+              'ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT\nROS_DOMAIN_ID=7\n'),
+    (Zenoh, 'RMW_IMPLEMENTATION=rmw_zenoh_cpp\nROS_DOMAIN_ID=7\n'
+            'ZENOH_SESSION_CONFIG_URI=/run/dds.xml\n'),
+])
+def test_container_gets_variables_of_the_middleware(vendor, variables):
+    environment = {'ROS_DOMAIN_ID': '7', 'PATH': '/bin', 'ROS_STATIC_PEERS': 'a\nb',
+                   **vendor(7).environment('/run/dds.xml', {})}
+    assert containers.dds_variables(environment) == variables
+
+
+def test_containers_start_once_their_configuration_is_there(engine, monkeypatch):
+    monkeypatch.setenv('THERE', 'ros:jazzy web')
+    shell = FakeShell(handlers={'sh': here})
+    there = beside(shell, 'docker run ros:jazzy', 'docker run -p 80:80 web')
+
+    def environment() -> dict[str, str]:
+        assert not any(' run ' in line for line in notes()), 'a container runs already'
+        assert [line for line in notes() if 'create' in line], 'its image could be fetched before'
+        return {'ROS_DOMAIN_ID': '7'}
+
+    there.start(environment)
+    assert shell.files['/run/fogros2/container-variables'] == (
+        b'ROS_DOMAIN_ID=7\n', 0o600)
+    first, second = (line for line in notes() if ' run ' in line)
+    assert first.endswith(
+        ' --label fogros2-launch=abc --env-file /run/fogros2/container-variables --network host'
+        ' --ipc host -v /run/fogros2/dds.xml:/run/fogros2/dds.xml:ro ros:jazzy')
+    assert second.endswith(' --label fogros2-launch=abc -p 80:80 web')
+    # no middleware is brought to an image that has a network, or a middleware, of its own
+    assert sum(' create ' in line for line in notes()) == 1
+
+
 # --- the scripts, with an engine that notes what it is told --------------------------------------
 
 ENGINE = r"""#!/bin/sh
@@ -185,7 +291,12 @@ printf '%s\n' "$0 $*" >> "$NOTES"
 case $1-$2 in
     image-inspect) for last; do :; done
         case " $THERE " in *" $last "*) ;; *) exit 1 ;; esac
-        case $4 in *Env*) echo "ROS_DISTRO=$DISTRO" ;; *) echo sha256:0123456789abcdef ;; esac ;;
+        case $4 in
+            *Env*) echo "ROS_DISTRO=$DISTRO" ;;
+            *Cmd*) echo "$COMMAND" ;;
+            *User*) echo "$OWNER" ;;
+            *) echo sha256:0123456789abcdef ;;
+        esac ;;
     pull-*) [ "$3" != "$WRONG" ] || { echo "Error: $3: manifest unknown" >&2; exit 125; }
         echo "$3" ;;
     create-*) echo looking ;;
@@ -214,11 +325,17 @@ def engine(request, tmp_path, monkeypatch):
 
 def done(command: Command, **variables: str) -> tuple[str, list[str]]:
     """Run a command here; return what it printed and what the engine was told."""
-    notes = Path(os.environ['NOTES'])
-    notes.unlink(missing_ok=True)
+    Path(os.environ['NOTES']).unlink(missing_ok=True)
     said = subprocess.run(command.argv, env={**os.environ, **variables}, text=True, check=True,
                           stdout=subprocess.PIPE).stdout
-    return said.strip(), [line.rpartition('/bin/')[2] for line in notes.read_text().splitlines()]
+    return said.strip(), notes()
+
+
+def notes() -> list[str]:
+    """Return what the engine was told so far."""
+    path = Path(os.environ['NOTES'])
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [line.rpartition('/bin/')[2] for line in lines]
 
 
 def test_an_image_that_is_there_is_not_downloaded(engine):
@@ -240,16 +357,26 @@ def test_an_image_without_the_middleware_gets_it_once(engine):
     assert name == made
     (run,) = (line for line in told if ' run ' in line)
     assert run.endswith(' ros-rolling-rmw-cyclonedds-cpp')
-    assert ' --user 0:0 ' in run and ' ros:rolling sh -ec apt-get update' in run
+    assert ' --user 0:0 ' in run and '; apt-get update -q; apt-get install ' in run
     adding = run.split()[3]
-    assert told[-2:] == [f'{engine} commit {adding} {made}', f'{engine} rm -f {adding}']
+    assert told[-1] == f'{engine} rm -f {adding}'
     name, told = done(fetch, THERE=f'ros:rolling {made}', DISTRO='rolling', HAS=set_up)
     assert name == made and not any(' run ' in line for line in told)
 
 
+@pytest.mark.parametrize(('command', 'user', 'kept'), [
+    ('["bash"]', 'ros', 'CMD ["bash"] --change USER ros'), ('null', '', 'CMD [] --change USER 0')])
+def test_layer_keeps_command_and_user_of_image(engine, command, user, kept):
+    told = done(containers.fetch('ros:rolling', 'rmw_cyclonedds_cpp'), THERE='ros:rolling',
+                DISTRO='rolling', HAS='/opt/ros/rolling/setup.sh', COMMAND=command, OWNER=user)[1]
+    (commit,) = (line for line in told if ' commit ' in line)
+    assert f'commit --change {kept} fogros2-adding-' in commit
+    assert commit.endswith(' localhost/fogros2-rmw_cyclonedds_cpp:0123456789ab')
+
+
 def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path):
     node = NodeSpec('1', 'eyes', 'demo', 'talker', image='demo:1', image_options=('--gpus=1',))
-    made = containers.inside(node, 'demo:1', 'abc', str(tmp_path))
+    made = containers.inside(node, 'demo:1', 'abc', str(tmp_path), '/run/dds.xml')
     for key, script in made.files.items():
         (tmp_path / key).write_text(str(script))
     words = [word if isinstance(word, str) else str(tmp_path / word[0]['file'])
@@ -268,7 +395,7 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
 
 def test_gpus_are_told_in_the_engine_s_words(engine):
     container = parse('docker run --gpus 1 -p 80:80 image run')
-    told = done(containers.run(container, 0, 'abc', 'image'))[1]
+    told = done(containers.run(container, 0, 'abc', 'image', '/run/dds.xml', '/run/variables'))[1]
     gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
     assert told[-1] == (f'{engine} run -d --name fogros2-abc-0-image {gpus} '
                         '--label fogros2-launch=abc -p 80:80 image run')
@@ -289,7 +416,7 @@ def beside(
         undoing=lambda name, undo: None, survives=True, launch=SimpleNamespace(
             id='abc', images=lambda name: images,
             dds=lambda: SimpleNamespace(rmw='rmw_cyclonedds_cpp')))
-    return Containers(job, shell, '/run/fogros2')
+    return Containers(job, shell, '/run/fogros2', '/run/fogros2/dds.xml')
 
 
 def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
@@ -306,7 +433,7 @@ def test_images_that_nodes_will_run_in_are_fetched_before_and_once(engine, monke
     monkeypatch.setenv('THERE', 'localhost/a:1')
     shell = FakeShell(handlers={'sh': here})
     containers_there = beside(shell, images=['localhost/a:1'])
-    containers_there.start()
+    containers_there.start(dict)
     asked = len(shell.commands)
     (node,) = containers_there.inside([NodeSpec('1', 'n', 'p', 'e', image='localhost/a:1')])
     assert 'localhost/a:1' in node.arguments and len(shell.commands) == asked
@@ -326,7 +453,7 @@ def test_a_machine_without_an_engine_and_without_apt_says_so():
     shell = FakeShell(handlers={'sh': lambda command: Result(
         127 if 'apt-get' in command.argv[-1] else 0, '\n', 'sh: 2: apt-get: not found')})
     with pytest.raises(PrerequisiteError, match="'m' has neither podman nor docker.*apt-get"):
-        beside(shell, 'docker run image').start()
+        beside(shell, 'docker run image').start(dict)
 
 
 @pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])
@@ -336,7 +463,7 @@ def test_a_computer_that_stays_keeps_no_container(survives, used):
     there._job.survives = survives
     there._job.undoing = lambda name, undo: undos.append(undo)
     there._job.tidy = lambda shell, commands: tidied.extend(commands)
-    there.start()
+    there.start(dict)
     if used:
         there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
     (undo,) = undos
