@@ -44,6 +44,11 @@ Json = dict[str, Any]
 Text = Union[str, Sequence[Union[str, Mapping[str, str]]]]
 #: Characters of one output event at the most.
 CHUNK = 1 << 16
+#: What a user reads who starts the launch file.
+BY_HAND = (
+    'cloud.launch.py is for the agent of a cloud machine, which starts it there to run the nodes '
+    "of that machine. To start a machine, launch a file that has a CloudNode: 'ros2 launch "
+    "fogros2_examples talker.container.launch.py'")
 
 
 class RefusedNode(Exception):
@@ -56,9 +61,16 @@ class RefusedNode(Exception):
 
 def generate_launch_description() -> LaunchDescription:
     """Return a launch description that does what the agent says, until the agent goes."""
+    if 'FOGROS2_AGENT_FD' not in os.environ:
+        # raised when launch executes it: an error while launch loads a file gets lines about syntax
+        return LaunchDescription([OpaqueFunction(function=_refuse_start_by_hand)])
     fd = int(os.environ.pop('FOGROS2_AGENT_FD'))
     directory = os.environ.get('FOGROS2_AGENT_DIRECTORY')
     return LaunchDescription([ObeyAgent(socket.socket(fileno=fd), directory)])
+
+
+def _refuse_start_by_hand(context: LaunchContext) -> None:
+    raise RuntimeError(BY_HAND)
 
 
 class Node:

@@ -163,3 +163,16 @@ def test_a_full_disk_refuses_the_node_and_nothing_else(prefix, obey, monkeypatch
     obey._start(None, {'id': '1', 'name': 'n', 'arguments': ['true'], 'files': {'k': 'text'}})
     (event, data), = told
     assert event == 'refused' and 'No space left' in data['error']
+
+
+def test_start_by_hand_says_what_the_file_is_for():
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
+    environment.pop('FOGROS2_AGENT_FD', None)
+    done = subprocess.run(
+        [sys.executable, '-m', 'fogros2.cloud_launch'], env=environment, capture_output=True,
+        text=True, timeout=60)
+    assert done.returncode == 1
+    (line,) = [line for line in (done.stdout + done.stderr).splitlines() if 'ERROR' in line]
+    assert 'cloud.launch.py is for the agent of a cloud machine' in line
+    assert 'talker.container.launch.py' in line
+    assert 'Traceback' not in done.stderr and 'KeyError' not in done.stderr
