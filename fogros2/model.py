@@ -110,6 +110,9 @@ class Machine:
     :param inner_host: the machine's address in it, '' without one.
     :param place: region, context and namespace, engine: for people to read.
     :param kind: what it is, such as an instance type: for people to read.
+    :param image: the image that it started from, '' where there is none or none is known.
+    :param key: the provider's name of its login key, likewise.
+    :param disk_gb: size of its disk, None where unknown.
     :param owned: False for a computer that existed before and outlives the launch.
     :param end_command: what the agent runs as root on the machine to end it; empty where it
         must not be ended.
@@ -130,6 +133,9 @@ class Machine:
     inner_host: str = ''
     place: str = ''
     kind: str = ''
+    image: str = ''
+    key: str = ''
+    disk_gb: Optional[int] = None
     tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
     owned: bool = True
     end_command: tuple[str, ...] = ()

@@ -177,7 +177,11 @@ class Entry:
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address, 'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
-            'place': self.place, 'kind': self.kind, 'monitor': self.monitor or None,
+            'place': self.place, 'kind': self.kind,
+            'image': self.machine.image or None if self.machine is not None else None,
+            'key': self.machine.key or None if self.machine is not None else None,
+            'disk_gb': self.machine.disk_gb if self.machine is not None else None,
+            'monitor': self.monitor or None,
             'monitor_open': self.record.monitor_open or None
             if self.record is not None and self.monitor else None,
             'cost_per_hour': None if self.cost is None else str(self.cost),

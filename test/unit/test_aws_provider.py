@@ -118,7 +118,7 @@ def test_a_machine_is_asked_for_as_it_has_to_be():
     attempt = instances.attempt_of(TOKEN)
     tags = {'Name': 'planner', 'fogros2-launch': 'l1', 'fogros2-name': 'planner',
             'fogros2-attempt': attempt, 'fogros2-user': 'ubuntu',
-            'fogros2-dependencies': 'abcd'}
+            'fogros2-dependencies': 'abcd', 'fogros2-disk-gb': '40'}
     listed = [{'Key': key, 'Value': value} for key, value in tags.items()]
     assert words == {
         'ImageId': 'ami-1', 'InstanceType': 't3.medium', 'MinCount': 1, 'MaxCount': 1,
@@ -172,10 +172,10 @@ def test_a_filter_takes_a_tag_by_its_letters():
 def instance(state='running', **more):
     tags = {'fogros2-name': 'planner', 'fogros2-attempt': '0123456789abcdef',
             'fogros2-host-key': 'ssh-ed25519 AAAA', 'fogros2-user': 'ubuntu',
-            'fogros2-price-per-hour': '0.0416'}
+            'fogros2-price-per-hour': '0.0416', 'fogros2-disk-gb': '30'}
     return {
         'InstanceId': 'i-0abc', 'State': {'Name': state}, 'InstanceType': 't3.medium',
-        'ImageId': 'ami-1', 'PublicIpAddress': '198.51.100.9', 'PrivateIpAddress': '10.0.0.9',
+        'ImageId': 'ami-1', 'KeyName': 'fogros2-0123', 'PublicIpAddress': '198.51.100.9', 'PrivateIpAddress': '10.0.0.9',
         'VpcId': 'vpc-1', 'LaunchTime': datetime.datetime(
             2026, 1, 1, tzinfo=datetime.timezone.utc),
         'Tags': instances.tag_list(tags), **more}
@@ -192,7 +192,7 @@ def test_an_instance_becomes_a_machine():
         '198.51.100.9', 'aws:vpc-1', '10.0.0.9')
     assert machine.cost_per_hour == Decimal('0.0416')
     assert machine.created == 1767225600.0
-    assert machine.tags['fogros2-image'] == 'ami-1'
+    assert (machine.image, machine.key, machine.disk_gb) == ('ami-1', 'fogros2-0123', 30)
     assert machine.end_command == ('shutdown', '-h', 'now')
 
 

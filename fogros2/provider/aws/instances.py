@@ -22,7 +22,7 @@ PROVIDER = 'aws'
 TAG_ATTEMPT = 'fogros2-attempt'
 TAG_HOST_KEY = 'fogros2-host-key'
 TAG_USER = 'fogros2-user'
-TAG_IMAGE = 'fogros2-image'
+TAG_DISK = 'fogros2-disk-gb'
 TAG_PRICE = 'fogros2-price-per-hour'
 TAG_SSH_FROM = 'fogros2-ssh-from'
 #: On groups and keys alone: seconds since the epoch at which they were made.
@@ -142,6 +142,7 @@ def run_request(
     """
     device = str(image.get('RootDeviceName') or '/dev/sda1')
     groups = [group, *options.security_groups]
+    disk = max(options.disk_size, _root_size(image, device))
     words: dict[str, Any] = {
         'ImageId': image['ImageId'],
         'InstanceType': place.kind,
@@ -155,10 +156,10 @@ def run_request(
         'MetadataOptions': {'HttpTokens': 'required', 'HttpEndpoint': 'enabled',
                             'HttpPutResponseHopLimit': 1},
         'BlockDeviceMappings': [{'DeviceName': device, 'Ebs': {
-            'VolumeSize': max(options.disk_size, _root_size(image, device)),
+            'VolumeSize': disk,
             'VolumeType': 'gp3', 'Encrypted': True, 'DeleteOnTermination': True}}],
         'TagSpecifications': [
-            {'ResourceType': kind, 'Tags': tag_list(tags)}
+            {'ResourceType': kind, 'Tags': tag_list({**tags, TAG_DISK: str(disk)})}
             for kind in ('instance', 'volume', 'network-interface',
                          *(('spot-instances-request',) if options.spot else ()))],
     }
@@ -219,7 +220,9 @@ def machine_of(region: str, instance: Mapping[str, Any]) -> Machine:
         inner_network=f'aws:{instance["VpcId"]}' if instance.get('VpcId') else '',
         inner_host=str(instance.get('PrivateIpAddress') or ''), place=region,
         kind=f'{kind}{_SPOT}' if instance.get('InstanceLifecycle') == 'spot' else kind,
-        tags={**tags, TAG_IMAGE: str(instance.get('ImageId', ''))}, end_command=END_COMMAND,
+        image=str(instance.get('ImageId', '')), key=str(instance.get('KeyName', '')),
+        disk_gb=int(disk) if (disk := tags.get(TAG_DISK, '')).isdigit() else None,
+        tags=tags, end_command=END_COMMAND,
         cost_per_hour=_price(tags.get(TAG_PRICE, '')),
         stopped=_stopped(instance) if state is MachineState.STOPPED else None)
 

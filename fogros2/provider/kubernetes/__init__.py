@@ -317,6 +317,7 @@ class KubernetesProvider(Provider):
             robot_host=ways.robot_host(api, job),
             inner_network=f'kubernetes {api.server}', inner_host=address,
             place=f'{where.context}/{where.namespace}'.lstrip('/'), kind=kind_of(job),
+            image=str(container_of(job)['image']),
             tags=tags, end_command=boot.END_COMMAND,
             note='' if exposure is None else exposure.words())
 
@@ -329,9 +330,15 @@ def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
     return {**job, 'metadata': {**meta, 'annotations': notes}}
 
 
+def container_of(job: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the first container of a machine's pod, as the Job describes it."""
+    container: Mapping[str, Any] = job['spec']['template']['spec']['containers'][0]
+    return container
+
+
 def kind_of(job: Mapping[str, Any]) -> str:
     """Return what a machine is in a few words: what it may use, and its image."""
-    container = job['spec']['template']['spec']['containers'][0]
+    container = container_of(job)
     limits = (container.get('resources') or {}).get('limits') or {}
     words = [f'{value} {name}' for name, value in sorted(limits.items())]
     return ', '.join([*words, str(container['image']).rpartition('/')[2]])

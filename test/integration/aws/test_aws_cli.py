@@ -39,6 +39,8 @@ def test_beside_a_launch_the_way_in_is_the_vpn(robot, box, name):
     (entry,) = [e for e in json.loads(fog(robot, 'list', '--json')) if e['name'] == name]
     assert (entry['place'], entry['kind'], entry['state']) == ('us-east-1', 't3.medium', 'running')
     assert Decimal(entry['cost_per_hour']) == Decimal('0.0416') and entry['launch_alive']
+    assert entry['image'].startswith('ami-') and entry['key'].startswith('fogros2-')
+    assert entry['disk_gb'] == 30
     assert 0 < Decimal(entry['cost']) < Decimal('0.01')
     shown = fog(robot, 'list')
     assert '$0.0416 an hour, $0.00 so far' in shown and 'us-east-1' in shown
