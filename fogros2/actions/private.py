@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What is used of launch's private parts, all in this module, and why.
+Give the other modules access to private parts of launch, and say why each is needed.
 
 launch has no seam for "start the process elsewhere": ``ExecuteLocal.execute`` resolves the
 action, registers its handlers and then creates a task from its private method
@@ -8,6 +8,11 @@ action, registers its handlers and then creates a task from its private method
 ``_subprocess_transport`` and ``_subprocess_protocol``; a robot process that waits for the cloud
 runs it later. All the rest (substitutions, handlers, output, ``on_exit``, signals) stays launch's
 own code. The options that the method reads have no getters.
+
+Three other modules use private parts directly: ``remote`` and ``carriers`` override
+``_ExecuteLocal__execute_process``, ``remote`` also ``_shutdown_process``, in classes derived from
+ExecuteLocal; ``census`` goes through the event handlers of the context. ``wrapping`` and
+``components`` replace public methods of single objects.
 
 The names are those of Jazzy (launch 3.4) and the same in its embedded default;
 ``test/unit/test_actions_private.py`` looks for each.

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import inspect
+from pathlib import Path
 
 from launch import LaunchContext, LaunchService
 from launch.actions import ExecuteLocal, ExecuteProcess, TimerAction
@@ -93,3 +95,16 @@ def test_remappings_of_components():
     assert node.remappings is None
     private.set_remappings(node, before)
     assert node.remappings is before
+
+
+def test_other_users_of_private_parts_are_named():
+    objects = (LaunchContext(), ExecuteProcess(cmd=['true']), TimerAction(period=1.0, actions=[]))
+    parts = {name for thing in objects for name in dir(thing)
+             if name.startswith('_') and not name.startswith('__')}
+    users = set()
+    for path in Path(private.__file__).parent.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if {getattr(node, 'attr', None), getattr(node, 'name', None)} & parts:
+                users.add(path.stem)
+    assert users == {'private', 'remote', 'carriers', 'census'}
+    assert all(f'``{user}``' in private.__doc__ for user in users - {'private'})
