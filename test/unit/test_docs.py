@@ -140,3 +140,23 @@ def test_the_site_is_built_without_a_warning():
     page = re.sub('<[^>]*>', '', (ROOT / '.cache/docs/reference/command_line.html').read_text())
     for verb in plugin_system.names('fogros2.verb'):
         assert f'ros2 fog {verb}' in page
+
+
+def test_files_that_stand_for_the_paper_exist():
+    named = re.findall(r'`([\w./]+/[\w.]*)`', (ROOT / 'doc' / 'paper.md').read_text())
+    assert len(named) > 50
+    assert [name for name in named if not name.startswith('.cache') and not (ROOT / name).exists()
+            ] == []
+
+
+def test_providers_import_what_their_page_says():
+    page = (ROOT / 'doc' / 'providers.md').read_text()
+    own = ('aws', 'container', 'kubernetes', 'ssh')
+    for path in (ROOT / 'fogros2' / 'provider').rglob('*.py'):
+        for first, second, names in re.findall(
+                r'^ *from fogros2\.?(\w*)\.?(\w*)\S* import (.*)', path.read_text(), re.MULTILINE):
+            if first == 'provider' and not second or second.startswith(own):
+                continue
+            for name in [first] if first else names.split(', '):
+                module = f'fogros2.{name}' + (f'.{second}' if name == 'provider' else '')
+                assert f'`{module}`' in page, f'{path}: {module}'
