@@ -139,11 +139,13 @@ finally:
 
 @pytest.mark.parametrize(('there', 'back', 'options'), [
     ('republished_compressed', 'theora', {'jpeg_quality': 60}),
-    ('theora', 'republished_compressed', {'out.theora.quality': 20})])
+    ('theora', 'republished_compressed', {'out.theora.quality': 20}),
+    ('ffmpeg', 'ffmpeg', {})])
 def test_images_cross_by_image_transport(
     tmp_path: Path, cloud_network: str, there: str, back: str, options: dict[str, int],
 ) -> None:
-    needs('image_transport', 'compressed_image_transport', 'theora_image_transport')
+    needs('image_transport', *(f'{name.removeprefix("republished_")}_image_transport'
+                               for name in (there, back)))
     viewer = tmp_path / 'viewer.py'
     viewer.write_text(VIEWER)
     path = tmp_path / 'stream.launch.py'

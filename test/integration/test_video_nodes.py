@@ -58,9 +58,14 @@ class Bench:
 
     def start(self, role: str, *words: str) -> list[str]:
         """Start an encoder or decoder; return the lines that it writes, which grow."""
+        return self.run(
+            sys.executable, str(ROOT / f'image_transport_h264/scripts/{role}'), '--ros-args',
+            *words)
+
+    def run(self, *command: str) -> list[str]:
+        """Start a node; return the lines that it writes, which grow."""
         process = subprocess.Popen(
-            [sys.executable, str(ROOT / f'image_transport_h264/scripts/{role}'), '--ros-args',
-             *words], env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             # of a shell's background the tests themselves have inherited an ignored one
             text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
         lines: list[str] = []
@@ -267,6 +272,28 @@ def test_the_same_packets_as_others_know_them(bench: Bench) -> None:
     assert first.encoding.split(';')[-1] == 'rgb8'
     assert [packet.pts for packet in packets] == list(range(first.pts, first.pts + len(packets)))
     assert annexb.IDR in annexb.kinds(bytes(first.data))
+
+
+def test_ffmpeg_image_transport_decodes_our_packets(bench: Bench) -> None:
+    """What rviz does for an Image display with the transport 'ffmpeg', in republish."""
+    from ament_index_python.packages import get_package_prefix, PackageNotFoundError
+
+    try:
+        prefix, _ = map(get_package_prefix, ('image_transport', 'ffmpeg_image_transport'))
+    except PackageNotFoundError:
+        pytest.skip('ffmpeg_image_transport is not installed')
+    bench.start('encoder', '-r', 'image:=/camera')
+    bench.run(f'{prefix}/lib/image_transport/republish', '--ros-args',
+              '-p', 'in_transport:=ffmpeg', '-p', 'out_transport:=raw',
+              '-r', 'in/ffmpeg:=/camera/ffmpeg', '-r', 'out:=/shown')
+    shown = bench.heard(Image, '/shown')
+    bench.until(lambda: len(shown) >= 5, 'an image', meanwhile=source(bench, encoding='rgb8'))
+    for got in shown:
+        sent = image(got.header.stamp.sec - 1000, 'rgb8')
+        assert got.header == sent.header
+        assert (got.height, got.width, got.encoding) == (HEIGHT, WIDTH, 'rgb8')
+        a, b = (numpy.frombuffer(m.data, numpy.uint8).astype(int) for m in (got, sent))
+        assert numpy.abs(a - b).mean() < 8
 
 
 def test_after_a_loss_nothing_is_shown_until_a_key(bench: Bench) -> None:
