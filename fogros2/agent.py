@@ -40,6 +40,9 @@ Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "e
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
 ``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where
 the nodes' launch process ended without having been told to; ``said`` is how its log ends then.
+
+Heartbeats are UDP datagrams from the robot's VPN address, a JSON object with ``launch``. The agent
+sends each back with ``clock`` added: its time in seconds since the epoch.
 """
 
 from __future__ import annotations
@@ -1427,11 +1430,12 @@ class Agent:
             data, peer = heart.recvfrom(2048)
             if peer[0] != self.config['heartbeat']['peer']:
                 return
-            if json.loads(data)['launch'] != self.config['launch']:
+            beat = json.loads(data)
+            if beat['launch'] != self.config['launch']:
                 return
             self.watchdog.beat(self.clock())
-            heart.sendto(data, peer)
-        except (OSError, KeyError, TypeError, ValueError):
+            heart.sendto(dump({**beat, 'clock': time.time()}), peer)
+        except (OSError, KeyError, TypeError, ValueError, RecursionError):
             return  # the VPN is down, or somebody sends nonsense
 
     def _guard(self, now: float) -> None:

@@ -13,6 +13,7 @@ import threading
 import time
 from typing import Any, Optional
 
+from fogros2.clock import ClockOffset, OffsetFilter
 from fogros2.errors import (
     AgentAbsent,
     AgentError,
@@ -399,7 +400,7 @@ class AgentClient:
 
 class Heartbeat:
     """
-    Tells a machine over the VPN that the launch lives, and measures the round trip.
+    Tells a machine over the VPN that the launch lives; measures the round trip and its clock.
 
     Begins at once. Datagrams get lost, and the VPN may be down for a while: no errors here.
 
@@ -418,6 +419,8 @@ class Heartbeat:
         self._stopped = threading.Event()
         self._answered_at: Optional[float] = None
         self._round_trip: Optional[float] = None
+        self._offsets = OffsetFilter()
+        self._offset: Optional[ClockOffset] = None
         self._thread = threading.Thread(target=self._run, name='fogros2-heartbeat', daemon=True)
         self._thread.start()
 
@@ -425,6 +428,11 @@ class Heartbeat:
     def round_trip(self) -> Optional[float]:
         """Seconds that the last answered heartbeat took there and back, None before one was."""
         return self._round_trip
+
+    @property
+    def clock_offset(self) -> Optional[ClockOffset]:
+        """The best of the last measurements, None before one and where the agent is an older one."""
+        return self._offset
 
     @property
     def age(self) -> Optional[float]:
@@ -471,5 +479,11 @@ class Heartbeat:
                 if peer == self._target and answer['launch'] == self._launch_id:
                     self._round_trip = now - float(answer['t'])
                     self._answered_at = now
+                    self._compare(self._round_trip, answer.get('clock'))
             except (KeyError, TypeError, ValueError, RecursionError):
                 continue
+
+    def _compare(self, round_trip: float, clock: Any) -> None:
+        """Take the machine's time out of an answer, if it is one."""
+        if type(clock) in (int, float) and abs(clock) < 1e11 and 0 <= round_trip < SILENCE:
+            self._offset = self._offsets.add(round_trip, time.time(), clock)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The steps of a launch, kept in its folder while it runs, so that other programs can show them.
+A launch's steps and clock offsets, kept in its folder while it runs for other programs to show.
 
 A file of JSON lines, one for each event. It goes with the folder when the launch ends.
 """
@@ -16,7 +16,16 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2.report import Event, Progress, Reporter, StepDone, StepFailed, StepStarted
+from fogros2.clock import ClockOffset
+from fogros2.report import (
+    ClockMeasured,
+    Event,
+    Progress,
+    Reporter,
+    StepDone,
+    StepFailed,
+    StepStarted,
+)
 
 #: The file's name in the launch's folder.
 FILE = 'steps.jsonl'
@@ -77,6 +86,10 @@ class Journal:
 
     def _line(self, event: Event, now: float) -> Optional[str]:
         about: dict[str, Any]
+        if isinstance(event, ClockMeasured):
+            return json.dumps({
+                'time': round(now, 3), 'machine': event.machine, 'event': 'clock',
+                **dataclasses.asdict(event.offset)}) + '\n'
         if isinstance(event, StepStarted):
             about = {'event': 'started'}
         elif isinstance(event, StepDone):
@@ -150,3 +163,25 @@ def steps(lines: list[str]) -> list[Step]:
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
     return found
+
+
+def clocks(lines: list[str]) -> dict[str, ClockOffset]:
+    """Return the last offset of each machine's clock in a journal."""
+    found: dict[str, ClockOffset] = {}
+    for line in lines:
+        try:
+            event = json.loads(line)
+            if event['event'] == 'clock':
+                found[str(event['machine'])] = ClockOffset(
+                    float(event['seconds']), float(event['uncertainty']))
+        except (ValueError, TypeError, KeyError, RecursionError):
+            continue
+    return found
+
+
+def read_clocks(folder: Path) -> dict[str, ClockOffset]:
+    """Return the offsets in the journal of a launch's folder, none where there is no journal."""
+    try:
+        return clocks((folder / FILE).read_text(errors='replace').splitlines())
+    except OSError:
+        return {}

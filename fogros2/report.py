@@ -9,6 +9,8 @@ import dataclasses
 import time
 from typing import Union
 
+from fogros2.clock import ClockOffset
+
 
 @dataclasses.dataclass(frozen=True)
 class StepStarted:
@@ -61,7 +63,16 @@ class OutputLine:
     line: str
 
 
-Event = Union[StepStarted, StepDone, StepFailed, Progress, OutputLine]
+@dataclasses.dataclass(frozen=True)
+class ClockMeasured:
+    """The offset of a machine's clock changed; ``warn`` once it is above the limit."""
+
+    machine: str
+    offset: ClockOffset
+    warn: bool = False
+
+
+Event = Union[StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured]
 Reporter = Callable[[Event], None]
 
 

@@ -10,7 +10,15 @@ from typing import Optional, TextIO
 
 import launch.logging
 
-from fogros2.report import Event, OutputLine, Progress, StepDone, StepFailed, StepStarted
+from fogros2.report import (
+    ClockMeasured,
+    Event,
+    OutputLine,
+    Progress,
+    StepDone,
+    StepFailed,
+    StepStarted,
+)
 
 _WIDTH = 24
 
@@ -58,6 +66,11 @@ class Console:
                 self._running[event.machine, event.step] = _bar(event)
             elif isinstance(event, OutputLine):
                 self._logger.debug(f'{_where(event.machine)}: {event.line}')
+            elif isinstance(event, ClockMeasured) and event.warn:
+                what = (f"the clock of '{event.machine}' is {event.offset}, so TF look-ups and "
+                        'stamp matching between the two fail')
+                self._logger.warning(
+                    f'{what}\nsynchronise both clocks: sudo apt-get install chrony')
             self._draw()
 
     def table(self) -> None:

@@ -24,9 +24,9 @@ from fogros2.errors import FogError, Unsupported
 from fogros2.host import DISTRO
 from fogros2.model import Command
 from fogros2.provider import container, container_engine, Provider
-from fogros2.store import state_home
+from fogros2.store import state_home, Store
 from fogros2.vpn import addresses, helped
-from ros2fog_cli.api import lan
+from ros2fog_cli.api import lan, reach
 
 Verdict = Literal['ok', 'warning', 'failed']
 _OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
@@ -61,7 +61,7 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     """
     checks: list[Callable[[], Check]] = [
         python, programs, root, tun, wireguard, engine, overlay, firewall_program, ros, rmw,
-        cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state,
+        cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state, clocks,
         lambda: lan_peers(lan_seconds)]
     known = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
     for name in dict.fromkeys([*known, *providers]):
@@ -334,6 +334,17 @@ def state() -> Check:
         return Check('state folder', 'warning', f'{folder} can be read by others',
                      f'chmod 700 {folder}')
     return Check('state folder', 'ok', str(folder))
+
+
+def clocks() -> Check:
+    """Look whether the clocks of machines under a launch go with this computer's."""
+    name, store = 'clocks of machines', Store()
+    found = {record.name: offset for record in store.machines()
+             if (offset := reach.clock(record, store)) is not None}
+    said = '; '.join(f'{machine}: {offset}' for machine, offset in found.items())
+    if any(offset.exceeds for offset in found.values()):
+        return Check(name, 'warning', said, 'sudo apt-get install chrony, here and there')
+    return Check(name, 'ok', said or 'measured while a machine runs')
 
 
 def lan_peers(seconds: float) -> Check:

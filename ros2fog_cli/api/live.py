@@ -278,6 +278,7 @@ class Live:
         if launch is not None:
             shown.steps = tuple(step for step in launch.steps
                                 if step.machine == shown.entry.name)
+            shown.clock = launch.clocks.get(shown.entry.name)
         if not there:
             shown.ended = shown.ended or now
         up = there and record is not None and record.launch_alive and bool(record.agent) and (

@@ -14,9 +14,10 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import plugin_system, process
+from fogros2 import journal, plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
+from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.model import Command, Endpoint
 from fogros2.shell import Shell
@@ -207,6 +208,13 @@ def ping(address: str, count: int = 5) -> Optional[float]:
         return None
     times = sorted(float(t) for t in re.findall(r'time=([0-9.]+) ms', result.stdout))
     return times[len(times) // 2] if times else None
+
+
+def clock(record: Record, store: Store) -> Optional[ClockOffset]:
+    """Return the offset that the launch measured last, None without a launch or measurement."""
+    if not record.launch or not record.launch_alive:
+        return None
+    return journal.read_clocks(store.root / 'launches' / record.launch).get(record.name)
 
 
 def follow(

@@ -120,6 +120,8 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
         yield 'traffic', (
             f"received {size(vpn['received'])}{_rate(vpn['receiving'])}, "
             f"sent {size(vpn['sent'])}{_rate(vpn['sending'])}")
+    if machine['clock'] is not None:
+        yield 'clock', machine['clock']['text']
     if agent is not None:
         beat = agent['heartbeat_age']
         yield 'agent', (f"since {duration(max(0.0, now - (agent['since'] or now)))}, "

@@ -12,6 +12,7 @@ import time
 from typing import Any, Optional, TextIO
 
 from fogros2 import journal
+from fogros2.clock import ClockOffset
 from fogros2.store import process_alive
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.machines import Entry
@@ -27,6 +28,7 @@ class Shown:
     entry: Entry
     follower: Optional[Follower] = None
     steps: tuple[journal.Step, ...] = ()
+    clock: Optional[ClockOffset] = None
     launch: str = ''
     ended: float = 0.0
     deleting: bool = False
@@ -53,6 +55,7 @@ class ShownLaunch:
     file: Optional[TextIO] = None
     size: int = 0
     steps: tuple[journal.Step, ...] = ()
+    clocks: Mapping[str, ClockOffset] = dataclasses.field(default_factory=dict)
     ended: float = 0.0
 
     def read(self, folder: Path) -> None:
@@ -64,7 +67,8 @@ class ShownLaunch:
             if size != self.size:
                 self.size = size
                 self.file.seek(0)
-                self.steps = tuple(journal.steps(self.file.read().splitlines()))
+                lines = self.file.read().splitlines()
+                self.steps, self.clocks = tuple(journal.steps(lines)), journal.clocks(lines)
         except OSError:
             return  # there is none yet
 
@@ -97,6 +101,8 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'bridge': record.monitor if record is not None else 0,
         'steps': steps,
         'vpn': _vpn(follower.vpn) if follower is not None else None,
+        'clock': None if follower is None or shown.clock is None
+        else {**dataclasses.asdict(shown.clock), 'text': str(shown.clock)},
         'agent': None if agent is None else {
             key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
         'nodes': [] if agent is None else agent['nodes'],

@@ -31,6 +31,7 @@ class StatusVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print it; 1 if the machine doesn't run, or an agent that it should have is silent."""
         from fogros2.errors import ConfigurationError, FogError
+        from fogros2.store import Store
         from ros2fog_cli.api import reach
         if args.watch:
             from ros2fog_cli.api.watching import watch
@@ -43,7 +44,7 @@ class StatusVerb(VerbExtension):
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
         entry = reach.find(args.name, warn, regions=args.region)
-        status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'agent': None}
+        status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
@@ -55,6 +56,8 @@ class StatusVerb(VerbExtension):
                 status['vpn'] = dataclasses.asdict(link) if link is not None else None
             except FogError as error:
                 problems.append(f'VPN: {error}')
+            offset = reach.clock(entry.record, Store())
+            status['clock'] = dataclasses.asdict(offset) if offset is not None else None
             try:
                 with reach.session(entry) as shell:
                     client = reach.agent(entry, shell)
@@ -86,6 +89,7 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     """
     from decimal import Decimal
 
+    from fogros2.clock import ClockOffset
     from ros2fog_cli.api.table import cost, duration, size, table
     now = time.time()
     lines = [
@@ -112,6 +116,8 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
             ('round trip', latency),
             ('traffic', f"{size(vpn['received'])} received, {size(vpn['sent'])} sent"),
         ]
+    if status['clock'] is not None:
+        lines.append(('clock', str(ClockOffset(**status['clock']))))
     if agent is not None:
         heartbeat = agent.get('heartbeat_age')
         lines += [

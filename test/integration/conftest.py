@@ -18,6 +18,7 @@ import uuid
 
 import pytest
 
+from fogros2.agent_client import agent_source
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
@@ -42,6 +43,17 @@ echo "it has $(cd /opt/ros/jazzy/lib; echo *) for $RMW_IMPLEMENTATION and was to
 #: What of a Debian system Python and ROS 2's libraries don't need.
 LEFT_OUT = ('./var', './usr/share', './usr/sbin', './usr/lib/apt', './usr/lib/systemd',
             './usr/lib/*/perl*', './usr/lib/*/gconv')
+
+
+@pytest.fixture
+def slow_agent(tmp_path: Path) -> Path:
+    """Return the agent's file for a machine whose clock is 1.5 s behind this computer's."""
+    clock = 'import time\n_now = time.time\ntime.time = lambda: _now() - 1.5\n'
+    source = agent_source().read_text()
+    assert source.count('import time\n') == 1
+    path = tmp_path / 'agent.py'
+    path.write_text(source.replace('import time\n', clock))
+    return path
 
 
 @pytest.fixture(scope='session')

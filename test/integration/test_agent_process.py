@@ -114,9 +114,11 @@ class Rig:
         path.write_text(json.dumps(config))
         return path
 
-    def serve(self, **config: Any) -> subprocess.Popen[bytes]:
+    def serve(
+        self, program: Optional[Path] = None, **config: Any,
+    ) -> subprocess.Popen[bytes]:
         agent = subprocess.Popen(
-            [sys.executable, '-IS', str(agent_source()), 'serve', '--config',
+            [sys.executable, '-IS', str(program or agent_source()), 'serve', '--config',
              str(self.config(**config))], stderr=subprocess.PIPE)
         self.agents.append(agent)
         wait_until(lambda: self.can_connect() or agent.poll() is not None, timeout=10,
@@ -716,6 +718,18 @@ def test_a_robot_that_has_gone_ends_the_machine(rig, free_udp_port):
         client.request('start', nodes=[rig.node('late', SLEEP)])
 
 
+def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
+    rig.serve(program=slow_agent, heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', interval=0.1)
+    try:
+        wait_until(lambda: heartbeat.clock_offset is not None, timeout=10, what='the offset')
+        offset = heartbeat.clock_offset
+        assert offset.exceeds and abs(offset.seconds + 1.5) <= offset.uncertainty + 1e-3
+    finally:
+        heartbeat.close()
+
+
 @pytest.mark.parametrize('wrong', ['launch', 'peer', 'nonsense'])
 def test_only_the_launchs_own_heartbeats_count(rig, free_udp_port, wrong):
     rig.serve(robot_timeout=0.8, end_command=ends(rig), heartbeat={
@@ -727,7 +741,7 @@ def test_only_the_launchs_own_heartbeats_count(rig, free_udp_port, wrong):
         link = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         heartbeat = None
         if wrong == 'nonsense':
-            for data in (b'', b'x', b'[]', b'7', b'\xff', b'{"launch": 1}'):
+            for data in (b'', b'x', b'[]', b'[' * 2000, b'7', b'\xff', b'{"launch": 1}'):
                 link.sendto(data, ('127.0.0.1', free_udp_port))
         else:
             heartbeat = stack.enter_context(contextlib.closing(Heartbeat(

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import sys
 import threading
@@ -11,14 +13,17 @@ import time
 import uuid
 
 import pytest
+from ros2cli.cli import main
 
 from fogros2.deploy import Launch
 from fogros2.errors import FogError, NameTaken, WorkspaceError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.report import StepDone, StepFailed, StepStarted
+from fogros2.provider import container_entry
+from fogros2.report import ClockMeasured, StepDone, StepFailed, StepStarted
 from fogros2.store import Store
 from fogros2.waiting import wait_until
+from ros2fog_cli.api import doctor
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -65,6 +70,29 @@ def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
     started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
     done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
     assert sorted(started) == sorted(done)
+
+
+def test_machine_with_a_slow_clock_is_warned_of_and_shown(
+    spec, slow_agent, monkeypatch, capsys,
+):
+    monkeypatch.setattr(container_entry, 'agent_file', lambda: slow_agent)
+    events = []
+    launch = Launch(report=events.append)
+    name = spec().name
+    try:
+        launch.up(spec())
+        wait_until(lambda: any(isinstance(e, ClockMeasured) for e in events), timeout=10,
+                   what='the offset')
+        assert main(argv=['fog', 'status', name, '--json']) == 0
+        clock = json.loads(capsys.readouterr().out)['clock']
+        assert main(argv=['fog', 'status', name]) == 0
+        assert re.search(r"^clock +1\.50 s behind the robot's \(± ", capsys.readouterr().out, re.M)
+        found = doctor.clocks()
+    finally:
+        assert launch.down() == []
+    assert abs(clock['seconds'] + 1.5) <= clock['uncertainty'] + 1e-3
+    assert [e.warn for e in events if isinstance(e, ClockMeasured)][0]
+    assert found.verdict == 'warning' and f'{name}: 1.50 s behind' in found.detail
 
 
 STEPS = ['machine', 'connect', 'ROS 2', 'guard', 'VPN', 'agent']

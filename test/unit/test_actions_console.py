@@ -10,7 +10,9 @@ import launch.logging
 import pytest
 
 from fogros2.actions.console import Console
+from fogros2.clock import ClockOffset
 from fogros2.report import (
+    ClockMeasured,
     OutputLine,
     Progress,
     StepDone,
@@ -58,6 +60,15 @@ def test_lines(lines):
         ('INFO', 'planner: sync 1.23 s (3 files)'),
         ('INFO', 'robot: VPN interface failed after 0.50 s'),
         ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN')]
+
+
+def test_only_a_large_clock_offset_is_a_warning(lines):
+    console = Console(io.StringIO())
+    console(ClockMeasured('planner', ClockOffset(0.01, 0.001)))
+    console(ClockMeasured('planner', ClockOffset(-1.2, 0.001), warn=True))
+    assert lines == [('WARNING', (
+        "the clock of 'planner' is 1.20 s behind the robot's (± 1.0 ms), so TF look-ups and stamp "
+        'matching between the two fail\nsynchronise both clocks: sudo apt-get install chrony'))]
 
 
 def test_log_level(lines):

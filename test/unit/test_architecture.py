@@ -17,7 +17,7 @@ CORE = ROOT / 'fogros2'
 #: Who may import whom: a module's layer imports its own and lower ones.
 LAYERS = [
     {'model'},
-    {'errors'},
+    {'errors', 'clock'},
     {'waiting', 'report', 'process', 'plugin_system'},
     {'store', 'journal', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
      'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',

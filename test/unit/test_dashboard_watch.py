@@ -171,7 +171,7 @@ def machine(**changes: Any) -> dict[str, Any]:
         'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '3.6',
         'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
         'log': 0, 'agent': {'since': 1010.0, 'rss': 14_000_000, 'heartbeat_age': 1.0},
-        'vpn': {'address': '198.18.0.2', 'interface': 'fogabc', 'received': 5e6, 'sent': 1e3,
+        'clock': None, 'vpn': {'address': '198.18.0.2', 'interface': 'fogabc', 'received': 5e6, 'sent': 1e3,
                 'latency': 20.5, 'receiving': 2e5, 'sending': None, 'handshake': 1090},
         'steps': [{'step': 'machine', 'state': 'done', 'seconds': 12.3, 'begin': 1000.0,
                    'detail': 'there', 'done': 0, 'total': 0},
