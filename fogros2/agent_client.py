@@ -431,7 +431,7 @@ class Heartbeat:
 
     @property
     def clock_offset(self) -> Optional[ClockOffset]:
-        """The best of the last measurements, None before one and where the agent is an older one."""
+        """The best of the last measurements, None before one and from older agents."""
         return self._offset
 
     @property

@@ -69,6 +69,11 @@ class MachineSpec:
     on_interrupt: OnInterrupt = 'shutdown'
     monitor_allow: tuple[str, ...] = ()
 
+    @property
+    def monitored(self) -> bool:
+        """Whether a bridge to Foxglove starts with the first node, without another action."""
+        return self.launch_foxglove or bool(self.monitor_allow)
+
 
 @dataclasses.dataclass(frozen=True)
 class Endpoint:
@@ -177,6 +182,8 @@ class CreateRequest:
         (``agent_directory``); the provider adds ``user`` and the ``end_command`` it tells later.
     :param dependencies: hash of what will have to be installed on it, by which an image that was
         baked before is found; '' where nothing is known of it.
+    :param application: container image of a web application that serves HTTP on port 8080, for
+        providers that run one beside the machine (``Provider.application_port``); '' for none.
     :param cancel: set when the launch is ending; for a ``create`` that takes long, as for an image
         to be downloaded: what it then raises is Cancelled.
     """
@@ -187,6 +194,7 @@ class CreateRequest:
     vpn_port: int
     agent_config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     dependencies: str = ''
+    application: str = ''
     cancel: Optional[threading.Event] = dataclasses.field(default=None, compare=False)
 
 

@@ -82,8 +82,11 @@ class Foxglove(Action):
                 f"Foxglove: {urls.app(urls.bridge('localhost', port))}"))]
         session = coordinator.session(self.machine)
         options = ['--vpn', str(port)]
+        provider = coordinator.launch.provider(session.spec.provider)
+        if session.spec.monitored and provider.application_port:
+            options += ['--application', f'127.0.0.1:{provider.application_port}']
         with contextlib.suppress(Unsupported):
-            coordinator.launch.provider(session.spec.provider).check_containers(session.spec)
+            provider.check_containers(session.spec)
             options += ['--image', words.resolve(context, self._image)]
         if allow:
             folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)

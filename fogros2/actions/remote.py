@@ -102,7 +102,7 @@ class RemoteProcess(ExecuteLocal):
                 containers.parse(line), number, Coordinator.of(context).launch.id))
             send(follower, session.spec.name)
             found.append(follower)
-        if session.spec.launch_foxglove or session.spec.monitor_allow:
+        if session.spec.monitored:
             from fogros2.actions.foxglove import Foxglove
             found.append(Foxglove(
                 session.spec.name, monitor_allow=session.spec.monitor_allow))

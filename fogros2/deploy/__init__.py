@@ -14,7 +14,8 @@ pushed before its step runs. In the order of the steps:
 ``entering``    log in, give the machine a host key of its own, close the way in behind the VPN
 ``guarding``    the agent, armed before anything slow; nodes and heartbeat
 ``joining``     step 5: the machine's end of the VPN
-``running``     a machine that is up; ``watching``: whether it still exists; ``comparing``: its clock
+``running``     a machine that is up; ``watching``: whether it still exists
+``comparing``   its clock beside the robot's
 """
 
 from fogros2.deploy.launch import Launch

@@ -156,7 +156,8 @@ class Creation:
             machine_id = job.provider.create(job.spec, CreateRequest(
                 token=token, authorized_key=key, tags=tags,
                 vpn_port=plan.machine_port(job.launch.id), agent_config=config,
-                dependencies=dependencies, cancel=job.cancel))
+                dependencies=dependencies, cancel=job.cancel,
+                application=urls.IMAGE if job.spec.monitored else ''))
         except FogError as error:
             # of one that was refused nothing has to be looked for
             self._asked = not error.refused

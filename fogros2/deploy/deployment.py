@@ -19,6 +19,7 @@ from fogros2 import bootstrap, workspace
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import routing
 from fogros2.deploy.beside import Containers
+from fogros2.deploy.comparing import Comparison
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.equipping import Equipment
@@ -90,6 +91,7 @@ class Deployment:
             self.guard.undo_nodes(agent)
             self.start_router(agent, interface)
             self.entrance.go_inside(interface)
+            job.undo.callback(Comparison(job.name, heartbeat, self.launch.report).close)
             job.failed = False
             running = RunningMachine(
                 self.launch, job, machine, shell, agent, heartbeat, interface,

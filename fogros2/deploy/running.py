@@ -11,7 +11,6 @@ from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.beside import Containers
-from fogros2.deploy.comparing import Comparison
 from fogros2.deploy.equipping import Equipment
 from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
@@ -63,7 +62,6 @@ class RunningMachine:
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
         self._watch: Optional[Watch] = None
-        job.undo.callback(Comparison(job.name, heartbeat, launch.report).close)
         if job.provider.owned:
             self._watch = Watch(job, agent, heartbeat, gone=self._gone, found=found)
             job.undo.callback(self._watch.close)

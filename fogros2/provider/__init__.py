@@ -41,6 +41,9 @@ class Provider(abc.ABC):
     owned: ClassVar[bool] = True
     #: Whether a container engine can run on its machines, unasked.
     runs_containers: ClassVar[bool] = True
+    #: Port of the machine's loopback at which ``create`` serves the request's application, 0 where
+    #: it serves none.
+    application_port: ClassVar[int] = 0
     #: Seconds between two looks at a machine that comes up slowly, at the most.
     look_interval: ClassVar[float] = 3.0
     #: Whether ``allow`` decides who reaches a machine; the launch then closes the SSH port as soon

@@ -83,7 +83,7 @@ def test_offset_in_words(offset: ClockOffset, text: str) -> None:
     assert str(offset) == text
 
 
-# -- by the heartbeat ------------------------------------------------------------------------------
+# -- by the heartbeat --------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -159,7 +159,7 @@ def test_launch_reports_changes_alone() -> None:
         ClockMeasured('planner', far, warn=True)]
 
 
-# -- kept and shown --------------------------------------------------------------------------------
+# -- kept and shown ----------------------------------------------------------------------
 
 
 def launched(store: Store, name: str, *lines: str) -> Record:

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import json
 from pathlib import Path
 import socket
 import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -33,6 +36,7 @@ from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.pods import Trouble
 from fogros2.testing.shell_contract import raised
+from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What the manifests have to hold in, beside the real cluster of the tests (1.20).
@@ -40,6 +44,8 @@ VERSIONS = ('1.25', '1.30', '1.33', '')
 REQUEST = CreateRequest(
     token='4f5b2a9c-0001-4000-8000-000000000001', authorized_key='ssh-ed25519 AAAA',
     tags={TAG_NAME: 'Talker', TAG_LAUNCH: 'a1b2c3', TAG_ROBOT: "Anna's robot"}, vpn_port=51830)
+
+MONITORED = dataclasses.replace(REQUEST, application='registry.example/lichtblick:1')
 
 
 def made(**options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -71,8 +77,9 @@ def test_manifests_are_valid_in_old_and_new_versions(options):
     spec = MachineSpec('Talker', 'kubernetes', options)
     for kind in ('NodePort', 'LoadBalancer'):
         valid(manifests.service(kind, spec, REQUEST, Options.parse(options), 'a-uid'))
-    pod = manifests.pod(spec, REQUEST, Options.parse(options))
-    valid({**pod, 'metadata': {**pod['metadata'], 'name': 'x'}})
+    for request in (REQUEST, MONITORED):
+        pod = manifests.pod(spec, request, Options.parse(options))
+        valid({**pod, 'metadata': {**pod['metadata'], 'name': 'x'}})
 
 
 @pytest.mark.parametrize('name', ['role.yaml', 'networkpolicy.yaml'])
@@ -130,6 +137,48 @@ def test_a_pod_has_net_admin_and_no_other_right():
     # nothing secret in what everybody in the namespace can read
     assert REQUEST.token not in json.dumps(pod)
     assert REQUEST.authorized_key not in json.dumps(pod)
+
+
+@pytest.mark.parametrize(('options', 'resources'), [
+    ({}, None), ({'mcpu': 1500}, {'cpu': '100m'}),
+    (EVERYTHING, {'cpu': '100m', 'memory': '128Mi'})])
+def test_web_application_is_a_second_container(options, resources):
+    spec = MachineSpec('Talker', 'kubernetes', options)
+    machine, application = manifests.pod_spec(
+        spec, MONITORED, Options.parse(options))['containers']
+    assert machine['name'] == 'machine' and application['name'] == 'application'
+    assert application['image'] == 'registry.example/lichtblick:1'
+    assert application['ports'][0]['containerPort'] == 8080
+    rights = application['securityContext']
+    assert rights['capabilities'] == {'drop': ['ALL'], 'add': ['NET_BIND_SERVICE']}
+    assert not rights['allowPrivilegeEscalation']
+    limits = application.get('resources')
+    assert limits == (resources and {'limits': resources, 'requests': resources})
+    # what ends it with the machine: nobody else would
+    assert application['livenessProbe']['tcpSocket'] == {'port': boot.ALIVE_PORT}
+    assert machine['command'][-1] == boot.ALIVE
+
+
+def test_pod_without_a_monitor_has_one_container():
+    _, pod = made()
+    machine, = pod['containers']
+    assert machine['command'][-1] == ''
+
+
+def test_machine_shows_that_it_lives():
+    program = subprocess.Popen([sys.executable, '-ISc', boot.ALIVE])
+    try:
+        def answers() -> bool:
+            with contextlib.suppress(OSError):
+                socket.create_connection(('127.0.0.1', boot.ALIVE_PORT), timeout=1).close()
+                return True
+            return False
+
+        for _ in range(3):
+            wait_until(answers, timeout=10, what='an answer')
+    finally:
+        program.kill()
+        program.wait()
 
 
 def test_options_reach_the_pod():
@@ -312,6 +361,26 @@ def test_where_a_machine_is_in_its_life():
     deleted = job_of()
     deleted['metadata']['deletionTimestamp'] = 'now'
     assert pods.state_of(deleted, pod_of()) is MachineState.STOPPING
+
+
+def test_web_application_neither_holds_up_nor_keeps_a_machine():
+    def beside(machine: Any, application: Any, phase: str) -> dict[str, Any]:
+        pod = pod_of(phase, state=machine)
+        pod['status']['containerStatuses'].insert(
+            0, {'name': 'application', 'image': 'x/app:1', 'state': application})
+        return pod
+
+    running: dict[str, Any] = {'running': {}}
+    pulled = {'waiting': {'reason': 'ErrImagePull', 'message': 'not found'}}
+    coming = beside(running, pulled, 'Pending')
+    assert pods.state_of(job_of(), coming) is MachineState.RUNNING
+    assert pods.trouble_of(coming) is None and not pods.has_ended(coming)
+    only = beside({'waiting': {}}, running, 'Pending')
+    assert pods.state_of(job_of(), only) is MachineState.PENDING
+    over = beside({'terminated': {'exitCode': 3, 'reason': 'Error'}}, running, 'Running')
+    assert pods.state_of(job_of(), over) is MachineState.STOPPING
+    assert pods.has_ended(over)
+    assert 'exit status 3' in pods.end_of(job_of(), over)
 
 
 def test_the_first_pod_is_the_machine():

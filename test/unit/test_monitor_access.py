@@ -169,22 +169,43 @@ def test_a_service_that_can_not_be_removed_says_how():
         publishing.close(Api(), MachineId('robots', 'fogros2-planner', 'u-1', ''), 8766)
 
 
-@pytest.mark.parametrize(('runs', 'on_robot'), [(True, False), (False, False), (True, True)])
-def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, runs, on_robot):
-    made = []
+@pytest.fixture
+def made(monkeypatch):
+    """Return the specs of the processes that actions make."""
+    found = []
 
     class Carrier(carriers.Carrier):
         def __init__(self, spec):
-            made.append(spec)
+            found.append(spec)
             super().__init__(spec)
 
-    monkeypatch.setattr(FakeProvider, 'runs_containers', runs)
-    spec = MachineSpec('planner', 'fake')
     monkeypatch.setattr(foxglove, 'Carrier', Carrier)
     monkeypatch.setattr(foxglove, 'send', lambda process, machine: None)
+    return found
+
+
+def coordinated(monkeypatch, spec, *, on_robot=False):
     monkeypatch.setattr(foxglove, 'Coordinator', SimpleNamespace(of=lambda _: SimpleNamespace(
         on_robot=lambda _: on_robot, session=lambda _: SimpleNamespace(spec=spec),
         launch=SimpleNamespace(id='abc123', provider=lambda _: FakeProvider()))))
+
+
+@pytest.mark.parametrize(('launch_foxglove', 'beside'), [(True, True), (False, False)])
+def test_gate_leads_to_the_application_that_the_provider_serves(
+    monkeypatch, made, launch_foxglove, beside,
+):
+    monkeypatch.setattr(FakeProvider, 'runs_containers', False)
+    monkeypatch.setattr(FakeProvider, 'application_port', 8080)
+    coordinated(monkeypatch, MachineSpec('pod', 'fake', launch_foxglove=launch_foxglove))
+    Foxglove('pod').execute(LaunchContext())
+    words = ' '.join(made[0].arguments)
+    assert ('--application 127.0.0.1:8080' in words) is beside and '--image' not in words
+
+
+@pytest.mark.parametrize(('runs', 'on_robot'), [(True, False), (False, False), (True, True)])
+def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, made, runs, on_robot):
+    monkeypatch.setattr(FakeProvider, 'runs_containers', runs)
+    coordinated(monkeypatch, MachineSpec('planner', 'fake'), on_robot=on_robot)
     Foxglove('planner', topics=['/a', '/b*'], port=9000, image='x:1',
              monitor_allow=SOURCES).execute(LaunchContext())
     words = list(made[0].arguments)

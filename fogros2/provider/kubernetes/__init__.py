@@ -39,6 +39,7 @@ class KubernetesProvider(Provider):
     #: Not within a pod that may do no more than WireGuard takes.
     runs_containers = False
     shell_kind: ClassVar[str] = 'kubernetes'
+    application_port: ClassVar[int] = manifests.APPLICATION_PORT
     look_interval: ClassVar[float] = 1.0
     notice: ClassVar[tuple[str, ...]] = boot.NOTICE_COMMAND
 

@@ -41,8 +41,17 @@ while time.monotonic() < last and not os.listdir('/run/fogros2'):
         pass
 """
 
+#: TCP port at which a pod with a second container shows that its first one lives.
+ALIVE_PORT = 7398
+ALIVE = f"""\
+import socket
+door = socket.create_server(('', {ALIVE_PORT}))
+while True:
+    door.accept()[0].close()
+"""
+
 SCRIPT = r"""
-user=$1 patience=$2 port=$3 word=$4 listen=$5 echo=$6
+user=$1 patience=$2 port=$3 word=$4 listen=$5 echo=$6 alive=$7
 agents=/run/fogros2 notice=/run/fogros2-notice grace=@GRACE@ uid=@UID@
 # without a process of its own: this is asked each second, in each pod of a node
 clock() { read -r now _ </proc/uptime; now=${now%.*}; }
@@ -86,6 +95,7 @@ if [ "$user" != root ] && [ -d /etc/sudoers.d ]; then
     (umask 277; echo "$user ALL=(ALL:ALL) NOPASSWD: ALL" >/etc/sudoers.d/fogros2)
 fi
 [ "$port" = 0 ] || python3 -ISc "$echo" "$port" "$word" "$listen" &
+[ -z "$alive" ] || python3 -ISc "$alive" &
 clock
 since=$now before=none
 while :; do
@@ -112,7 +122,9 @@ done
 """.replace('@UID@', str(UID)).replace('@GRACE@', str(GRACE - 5)).lstrip()
 
 
-def arguments(user: str, patience: float, port: int, word: str, listen: float) -> list[str]:
+def arguments(
+    user: str, patience: float, port: int, word: str, listen: float, *, alive: bool = False,
+) -> list[str]:
     """
     Return the pod's command.
 
@@ -120,6 +132,7 @@ def arguments(user: str, patience: float, port: int, word: str, listen: float) -
     :param port: UDP port on which the robot's question is answered, 0 for none.
     :param word: what a question begins with; others get no answer.
     :param listen: seconds for which questions are answered at the most.
+    :param alive: whether another container of the pod probes this one.
     """
     return ['/bin/sh', '-c', SCRIPT, 'fogros2', user, str(max(1, round(patience))), str(port),
-            word, f'{listen:g}', ECHO]
+            word, f'{listen:g}', ECHO, ALIVE if alive else '']

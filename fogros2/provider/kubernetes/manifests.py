@@ -19,6 +19,10 @@ TTL = 60
 BOOT = 600.0
 #: Seconds for which a pod answers the question whether UDP gets through.
 LISTEN = 180.0
+#: Port at which images of web applications serve HTTP.
+APPLICATION_PORT = 8080
+#: What a server of files may use, of the kinds of which the machine's own container has a limit.
+_APPLICATION_LIMITS = {'cpu': '100m', 'memory': '128Mi'}
 
 
 def job(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:
@@ -68,7 +72,8 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         'name': names.CONTAINER, 'image': image_for(options, request.dependencies),
         'imagePullPolicy': 'IfNotPresent',
         'command': boot.arguments(
-            options.user, max(BOOT, spec.robot_timeout), port, word(request.token), LISTEN),
+            options.user, max(BOOT, spec.robot_timeout), port, word(request.token), LISTEN,
+            alive=bool(request.application)),
         'env': [{'name': name, 'value': value} for name, value in options.env.items()],
         'securityContext': {
             # an image may have another user; an interface takes root with NET_ADMIN
@@ -83,6 +88,8 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         'restartPolicy': 'Never', 'automountServiceAccountToken': False,
         'enableServiceLinks': False, 'hostname': names.job_name(spec.name)[len('fogros2-'):],
         'terminationGracePeriodSeconds': boot.GRACE, 'containers': [container]}
+    if request.application:
+        found['containers'].append(_application(request.application, resources))
     if options.node_selector:
         found['nodeSelector'] = dict(options.node_selector)
     if options.tolerations:
@@ -95,6 +102,28 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         found['serviceAccountName'] = options.service_account
     if options.zone:
         found['affinity'] = _preferring(options.zone)
+    return found
+
+
+def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
+    """
+    Return the container of a web application.
+
+    Its probe asks the machine's container, so that it ends with that one, and the pod with both.
+
+    :param beside: limits of the machine's container.
+    """
+    found: dict[str, Any] = {
+        'name': names.APPLICATION, 'image': image, 'imagePullPolicy': 'IfNotPresent',
+        'ports': [{'name': 'application', 'containerPort': APPLICATION_PORT}],
+        'securityContext': {
+            # Lichtblick's server is a file with this one capability: without, it doesn't start
+            'privileged': False, 'allowPrivilegeEscalation': False,
+            'capabilities': {'drop': ['ALL'], 'add': ['NET_BIND_SERVICE']}},
+        'livenessProbe': {'tcpSocket': {'port': boot.ALIVE_PORT}, 'periodSeconds': 5}}
+    limits = {kind: value for kind, value in _APPLICATION_LIMITS.items() if kind in beside}
+    if limits:
+        found['resources'] = {'limits': limits, 'requests': limits}
     return found
 
 

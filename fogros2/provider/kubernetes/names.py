@@ -27,8 +27,9 @@ LOGIN = 'fogros2-login'
 #: What the launch file said of the way, and of the robot's address for pods that dial it.
 EXPOSE = 'fogros2-expose'
 ROBOT_HOST = 'fogros2-robot-host'
-#: The one container of the pod.
+#: The container of a pod that is the machine, and the web application beside it.
 CONTAINER = 'machine'
+APPLICATION = 'application'
 
 _LABEL_VALUE = re.compile(r'([A-Za-z0-9]([A-Za-z0-9._-]{0,61}[A-Za-z0-9])?)?')
 

@@ -10,7 +10,7 @@ import re
 from typing import Any, Optional
 
 from fogros2.model import MachineState
-from fogros2.provider.kubernetes import hints
+from fogros2.provider.kubernetes import hints, names
 
 #: What a container waits for that it will wait for in vain.
 _HOPELESS = ('InvalidImageName', 'ErrImageNeverPull', 'CreateContainerConfigError',
@@ -64,23 +64,34 @@ def state_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> Machin
             (job.get('status') or {}).get('failed')
         return MachineState.STOPPING if lost else MachineState.PENDING
     phase = (pod.get('status') or {}).get('phase')
-    if pod['metadata'].get('deletionTimestamp') or phase in ('Succeeded', 'Failed'):
+    if pod['metadata'].get('deletionTimestamp') or phase in ('Succeeded', 'Failed') \
+            or _machine_has(pod, 'terminated'):
         return MachineState.STOPPING
     return MachineState.RUNNING if is_running(pod) else MachineState.PENDING
 
 
 def is_running(pod: Mapping[str, Any]) -> bool:
-    """Return whether the container of a pod runs."""
-    return (pod.get('status') or {}).get('phase') == 'Running' and any(
-        'running' in (each.get('state') or {})
-        for each in (pod.get('status') or {}).get('containerStatuses') or ())
+    """Return whether the machine of a pod runs; the application beside it may come later."""
+    return (pod.get('status') or {}).get('phase') in ('Pending', 'Running') \
+        and _machine_has(pod, 'running')
 
 
 def has_ended(pod: Mapping[str, Any]) -> bool:
     """Return whether nothing of a pod runs any more, or has yet."""
-    status = pod.get('status') or {}
-    return status.get('phase') in ('Pending', 'Succeeded', 'Failed') and not any(
-        'running' in (each.get('state') or {}) for each in status.get('containerStatuses') or ())
+    phase = (pod.get('status') or {}).get('phase')
+    # the application, which nobody needs then, may run for a moment longer
+    return not _machine_has(pod, 'running') and (
+        phase in ('Pending', 'Succeeded', 'Failed') or _machine_has(pod, 'terminated'))
+
+
+def _machine_has(pod: Mapping[str, Any], state: str) -> bool:
+    return any(state in (each.get('state') or {}) for each in _machine(pod))
+
+
+def _machine(pod: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the statuses of a pod's containers without that of the application."""
+    return [each for each in (pod.get('status') or {}).get('containerStatuses') or ()
+            if each.get('name') != names.APPLICATION]
 
 
 def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
@@ -94,7 +105,7 @@ def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
     status = pod.get('status') or {}
     if status.get('reason') or status.get('message'):
         return ': '.join(str(status[key]) for key in ('reason', 'message') if status.get(key))
-    for each in status.get('containerStatuses') or ():
+    for each in _machine(pod):
         ended = (each.get('state') or {}).get('terminated')
         if ended:
             said = f", {ended['message'].strip()}" if ended.get('message') else ''
@@ -114,7 +125,7 @@ def trouble_of(
             message = str(condition.get('message') or condition.get('reason') or '')
             return Trouble(f'FailedScheduling: {message}',
                            hints.of_scheduling(message, gpu_resource))
-    for each in status.get('containerStatuses') or ():
+    for each in _machine(pod):
         waiting = (each.get('state') or {}).get('waiting') or {}
         reason, message = str(waiting.get('reason', '')), str(waiting.get('message', ''))
         if reason in (*_HOPELESS, *_PULL):

@@ -9,8 +9,8 @@ namespaces of their own and end with them, see ``node``; ``services`` says what 
 
 from fogros2.testing.cluster.client import Client, Refused
 from fogros2.testing.cluster.cluster import Cluster, cluster, running_cluster
-from fogros2.testing.cluster.images import BARE, DEFAULT, READY
+from fogros2.testing.cluster.images import APPLICATION, BARE, DEFAULT, READY
 from fogros2.testing.cluster.node_process import ClusterError
 
-__all__ = ['BARE', 'Client', 'Cluster', 'ClusterError', 'DEFAULT', 'READY', 'Refused',
-           'cluster', 'running_cluster']
+__all__ = ['APPLICATION', 'BARE', 'Client', 'Cluster', 'ClusterError', 'DEFAULT', 'READY',
+           'Refused', 'cluster', 'running_cluster']

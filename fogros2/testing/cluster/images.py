@@ -39,6 +39,11 @@ READY = 'fogros2.test/machine:ready'
 DEFAULT = IMAGE
 SANDBOX = 'fogros2.test/sandbox:1'
 _SANDBOX_CONFIG = {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']}
+#: Stands for Lichtblick: serves one page at port 8080.
+APPLICATION = 'fogros2.test/application:1'
+_APPLICATION_CONFIG = {'Env': ['PATH=/'], 'Cmd': [
+    '/busybox', 'sh', '-c', '/busybox echo "the application" >/index.html; '
+    'exec /busybox httpd -f -p 8080 -h /']}
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
             'rsync', 'wireguard-go', 'wireguard-tools')
@@ -214,6 +219,7 @@ def _make(
             sandbox_layer(layers[2], static_busybox())
             write_archive(archive, [
                 Image(BARE, (layers[0],), _CONFIG),
+                Image(APPLICATION, (layers[2],), _APPLICATION_CONFIG),
                 Image(SANDBOX, (layers[2],), _SANDBOX_CONFIG)])
             _unpack(archive, system, binaries)
         shell = RootShell(root, upper)
@@ -299,7 +305,8 @@ def system_key(root: Path, busybox: Path) -> str:
     :param root: the system, with dpkg's list of packages and versions.
     """
     packages = _digest(root / 'var/lib/dpkg/status')
-    return _checksum(f'2 {root.name} {packages} {_digest(busybox)} {_CONFIG} {_SANDBOX_CONFIG}')
+    return _checksum(f'2 {root.name} {packages} {_digest(busybox)} {_CONFIG} {_SANDBOX_CONFIG} '
+                     f'{_APPLICATION_CONFIG}')
 
 
 def sandbox_layer(target: Path, busybox: Path) -> None:

@@ -6,13 +6,15 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
+import re
 import shutil
 import time
+import urllib.request
 import uuid
 
 import pytest
 
-from fogros2.testing.cluster import DEFAULT, READY
+from fogros2.testing.cluster import APPLICATION, DEFAULT, READY
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
@@ -83,10 +85,10 @@ def logs(tmp_path, monkeypatch):
 def launch(tmp_path):
     """Return what starts a launch of some entities, written as in a launch file."""
     with launching() as start:
-        def run(*entities: str, **launched):
+        def run(*entities: str, before: str = '', **launched):
             path = tmp_path / f'{uuid.uuid4().hex[:6]}.launch.py'
             lines = ''.join(f'        {entity},\n' for entity in entities)
-            path.write_text(f"{HEADER.replace('{image}', READY)}{lines}    ])\n")
+            path.write_text(f"{before}{HEADER.replace('{image}', READY)}{lines}    ])\n")
             return start(str(path), **launched)
 
         yield run
@@ -178,6 +180,45 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
     assert run.ended() == 0, run.text
     assert clean(run), run.text
     assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_pod_serves_the_web_application(launch, namespace):
+    run = launch("talker(pod('watched', launch_foxglove=True))", 'listener()',
+                 before=f"from fogros2.monitor import urls\nurls.IMAGE = '{APPLICATION}'\n")
+    run.wait_for('Foxglove at ws://', timeout=PATIENCE)
+    address = re.search(r'Foxglove at ws://(\S+);', run.text)
+    assert address is not None
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+    def page():
+        with opener.open(f'http://{address[1]}/', timeout=5) as answer:
+            return answer.read().decode()
+
+    wait_until(lambda: page().strip() == 'the application', timeout=60.0, what='the application')
+    (found,) = namespace.all('pods')
+    assert [each['name'] for each in found['spec']['containers']] == ['machine', 'application']
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_application_ends_with_a_machine_that_ends_itself(launch, namespace):
+    run = launch("talker(pod('watched', launch_foxglove=True, robot_timeout=3))", 'listener()',
+                 before=f"from fogros2.monitor import urls\nurls.IMAGE = '{APPLICATION}'\n")
+    run.wait_for('I heard', timeout=PATIENCE)
+    run.kill()
+
+    def ended():
+        return [pod['status']['phase'] for pod in namespace.all('pods')
+                if pod['status']['phase'] not in ('Succeeded', 'Failed')] == []
+
+    wait_until(ended, timeout=90.0, what='both containers to end')
+    assert ros2('fog', 'gc').returncode == 0
+    deleted = ros2('fog', 'delete', 'watched', '--yes')
+    assert deleted.returncode == 0 or namespace.left() == [], deleted
 
 
 @pytest.mark.usefixtures('nothing_left')
