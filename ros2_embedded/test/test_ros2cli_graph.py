@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 topic|node|service|param`` beside a node that runs."""
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -42,8 +43,8 @@ def worker():
         process.terminate()
 
 
-def ros2(*command, status=0, timeout=40, until=None):
-    """Run a command; once it has said ``until``, send it SIGINT."""
+def ros2(*command, status=0, timeout=40, until=None, by=signal.SIGINT):
+    """Run a command; once it has said ``until``, send it a signal."""
     if command[1] in ('list', 'info', 'get', 'set', 'echo'):
         command = (*command[:2], '--no-daemon', *command[2:])  # which would outlive the test
     process = subprocess.Popen(
@@ -57,7 +58,7 @@ def ros2(*command, status=0, timeout=40, until=None):
             assert line, said
             said += line
         if until is not None:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(by)
         out, errors = process.communicate(timeout=timeout)
     finally:
         process.kill()
@@ -102,6 +103,23 @@ def test_pub(worker):
                          ('3', 'needs to be a dictionary')):
         assert text in ros2('topic', 'pub', '--once', '-w', '0', '/x', 'std_msgs/msg/String',
                             values, status=1)
+
+
+@pytest.mark.parametrize('options', [(), ('-r', '5'), ('-w', '0')])
+def test_pub_repeats_until_interrupted(worker, options):
+    ros2('topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}',
+         until='publishing #3', status=signal.SIGINT)
+    assert [worker.stdout.readline() for _ in range(2)] == ['again\n'] * 2
+
+
+@pytest.mark.parametrize('command', [
+    ('topic', 'pub', '--once', '/nobody', 'std_msgs/msg/String'),
+    ('service', 'call', '/nobody', 'example_interfaces/srv/AddTwoInts')])
+def test_sigterm_ends_a_command_that_waits(command):
+    said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=10)
+    assert 'publishing' not in said and 'response' not in said
+    if importlib.util.find_spec('rosidl_embedded'):
+        assert len(said.splitlines()) == 1
 
 
 def test_rates(worker):

@@ -44,6 +44,7 @@ class CallVerb(VerbExtension):
 
     def _call(self, node: Any, kind: Any, args: Any) -> str | None:
         import rclpy
+        from rclpy.executors import ExternalShutdownException
         from rosidl_runtime_py import set_message_fields
         import yaml
         client = node.create_client(kind, args.service_name)
@@ -54,7 +55,8 @@ class CallVerb(VerbExtension):
             return f'Failed to populate field: {error}'
         if not client.service_is_ready():
             print('waiting for service to become available...')
-            client.wait_for_service()
+            if not client.wait_for_service():
+                raise ExternalShutdownException()  # a signal has ended the wait
         print(f'requester: making request: {request!r}\n')
         future = client.call_async(request)
         rclpy.spin_until_future_complete(node, future)

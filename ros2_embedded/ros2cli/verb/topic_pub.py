@@ -25,7 +25,7 @@ class PubVerb(VerbExtension):
             help='Publishing rate in Hz (default: 1)')
         group = parser.add_mutually_exclusive_group()
         group.add_argument('-1', '--once', action='store_const', dest='times', const=1,
-                           help='Publish one message and exit')
+                           default=0, help='Publish one message and exit')
         group.add_argument('-t', '--times', type=above(-1), default=0,
                            help='Publish this number of times and then exit')
         add('-w', '--wait-matching-subscriptions', type=above(-1), default=None,
@@ -55,7 +55,7 @@ def _publish(node: Any, args: Any) -> str | None:
         if waited % 10 == 0:
             print(f'Waiting for at least {wanted} matching subscription(s)...')
         waited += 1
-        time.sleep(_WAIT)
+        rclpy.spin_once(node, timeout_sec=_WAIT)  # raises when a signal has come
     message = kind()
     try:
         set_message_fields(message, values)
