@@ -246,12 +246,9 @@ class LaunchService:
         waiting: Waiting | None = None
         if not self.__shutting_down:
             event = Shutdown(reason=reason, due_to_sigint=due_to_sigint)
-            here: Loop | None = None
-            with contextlib.suppress(RuntimeError):
-                here = asyncio.get_running_loop()
             if force_sync:
                 self.__context.emit_event_sync(event)
-            elif here is self.__loop:
+            elif threading.current_thread() is threading.main_thread():  # the loop's
                 waiting = self.__context.emit_event(event)
             else:
                 self.emit_event(event)

@@ -289,6 +289,27 @@ def test_run_async_beside_other_coroutines():
         asyncio.set_event_loop(asyncio.new_event_loop())
 
 
+def test_shutdown_while_the_loop_is_paused():
+    async def begin():
+        service.include_launch_description(LaunchDescription([]))
+        task = asyncio.get_running_loop().create_task(
+            service.run_async(shutdown_when_idle=False))
+        while service.event_loop is None:
+            await asyncio.sleep(0.01)
+        return task
+
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    try:
+        service = LaunchService(noninteractive=True)
+        task = loop.run_until_complete(begin())
+        loop.run_until_complete(service.shutdown())
+        assert loop.run_until_complete(task) == 0
+    finally:
+        loop.close()
+        asyncio.set_event_loop(asyncio.new_event_loop())
+
+
 PYTHON_FILE = '''
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetLaunchConfiguration
