@@ -52,7 +52,7 @@ class ParameterFile:
         takes its place, which goes when this object does.
     """
 
-    __evaluated = False
+    __evaluated: Path | None = None
     __created_tmp_file = False
 
     def __init__(
@@ -64,9 +64,14 @@ class ParameterFile:
             'ParameterFile()')
         ensure_argument_type(allow_substs, bool, 'allow_subst', 'ParameterFile()')
         # Bytes are iterable, but no substitutions.
-        self.param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
+        self.__param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
             normalize(param_file))
         self.allow_substs = allow_substs
+
+    @property
+    def param_file(self) -> Any:
+        """The path once evaluated, before that as it was given."""
+        return self.__evaluated or self.__param_file
 
     def evaluate(self, context: LaunchContext) -> Path:
         """
@@ -74,9 +79,9 @@ class ParameterFile:
 
         :raises SubstitutionFailure: if the file with its substitutions performed isn't YAML.
         """
-        if self.__evaluated:
-            return Path(self.param_file)
-        path = self.param_file
+        if self.__evaluated is not None:
+            return self.__evaluated
+        path = self.__param_file
         if isinstance(path, list):
             path = perform_substitutions(context, path)
         path = Path(os.fsdecode(path))
@@ -89,17 +94,17 @@ class ParameterFile:
                 raise SubstitutionFailure(
                     'The substituted parameter file is not a valid yaml file') from exc
             with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
-                path = self.param_file = Path(file.name)
+                path = Path(file.name)
                 self.__created_tmp_file = True
                 file.write(text)
-        self.param_file = path
-        self.__evaluated = True
+        self.__evaluated = path
         return path
 
     def cleanup(self) -> None:
         """Remove the temporary file, if there is one."""
-        if self.__created_tmp_file:
-            Path(self.param_file).unlink(missing_ok=True)
+        if self.__created_tmp_file and self.__evaluated is not None:
+            self.__evaluated.unlink(missing_ok=True)
+            self.__evaluated = None
 
     def __del__(self) -> None:
         self.cleanup()

@@ -215,6 +215,9 @@ def test_parameter_files(tmp_path, capsys):
     assert 'Parameter file path is not a file: /no/such/file' in capsys.readouterr().out
     substituted.cleanup()
     assert not os.path.exists(got[8]) and file.exists()
+    context = LaunchContext()
+    context.launch_configurations['i'] = '8'
+    assert load(substituted.evaluate(context)) == {'/**': {'ros__parameters': {'a': 8}}}
 
 
 def test_bad_parameters():

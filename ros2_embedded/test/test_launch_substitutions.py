@@ -111,6 +111,7 @@ def test_what_depends_on_the_computer(context, tmp_path):
     (LocalSubstitution('x', 'what'), "LocalVar('what')"),
     (PathJoinSubstitution(['a', 'b']), "PathJoin(''a' + 'b'')"),
     (Command('ls'), "Command('ls')"), (FindExecutable(name='a'), "FindExec('a')"),
+    (PythonExpression('1 + 1', ['os', 'sys']), "PythonExpr('1 + 1', ['os', 'sys'])"),
 ])
 def test_descriptions(substitution, text):
     assert substitution.describe() == text
@@ -135,6 +136,7 @@ def test_wrong_arguments():
     ('$(var quote)', "it's"), ("it's $(var a) o'clock", "it's 1 o'clock"),
     (r'back\\slash', 'back\\slash'), ('two\nlines $(var a)', 'two\nlines 1'),
     ('$(var a)$(var a)', '11'), ('$(var a ignored)', '1'), ("$(eval 'os.sep' 'os, sys')", '/'),
+    ('$(eval "1 + 1" "")', '2'),
 ])
 def test_texts_with_substitutions(context, text, expected):
     assert perform_substitutions(context, parse_substitution(text)) == expected

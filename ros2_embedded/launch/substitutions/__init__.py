@@ -259,7 +259,6 @@ class PythonExpression(ParsedSubstitution):
     """The value of a Python expression over modules; over ``math``, its content too."""
 
     _parameters = ('expression', 'python_modules?')
-    _label = 'PythonExpr'
 
     def __init__(
         self, expression: SomeSubstitutionsType, python_modules: SomeSubstitutionsType = ('math',)
@@ -272,8 +271,12 @@ class PythonExpression(ParsedSubstitution):
         _, kwargs = super().parse(data)
         if 'python_modules' in kwargs:
             names = ''.join(getattr(sub, 'text', '') for sub in kwargs['python_modules'])
-            kwargs['python_modules'] = [name.strip() for name in names.split(',')]
+            kwargs['python_modules'] = [name.strip() for name in names.split(',') if name]
         return cls, kwargs
+
+    def describe(self) -> str:
+        modules = ', '.join(sub.describe() for sub in self.python_modules)
+        return f'PythonExpr({described(self.expression)}, [{modules}])'
 
     def perform(self, context: LaunchContext) -> str:
         names: dict[str, Any] = {}
