@@ -38,9 +38,8 @@ REQUEST_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE)
 
 
-#: Bytes from which on a message is waited for, and the longest that it is, in seconds: a reader
-#: that hangs holds up the others.
-LARGE, LONGEST = 200_000, 2.0
+#: Seconds that a message's acknowledgement is waited for: a reader that hangs delays the others.
+LONGEST = 2.0
 
 
 def best_effort(qos: QoSProfile) -> QoSProfile:
@@ -79,25 +78,25 @@ class LazyNode(Node):
                 return
             self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
 
-    def put_through(self, publisher: Publisher, message: Any, large: int = LARGE) -> None:
+    def put_through(self, publisher: Publisher, message: Any) -> None:
         """
-        Publish a message; if it is a large one, when it is its turn, and wait until it is there.
+        Publish a large message when it is this node's turn, and wait until its readers have it.
 
         Large images in quick succession leave a slow link no room for what it lost of them: none
         would ever be whole. What comes meanwhile is left out, but for the newest.
-
-        :param large: bytes from which on it is one.
         """
-        if len(message.data) < large:
-            self.put_out(publisher, message)
-            return
         with self._turns.taken(LONGEST):
             self.put_out(publisher, message)
-            try:
-                publisher.wait_for_all_acked(Duration(seconds=LONGEST))
-            except RuntimeError:  # RCLError, in rclpy's words: the end has come meanwhile
-                if rclpy.ok(context=self.context):
-                    raise
+            self.all_acknowledged(publisher)
+
+    def all_acknowledged(self, publisher: Publisher) -> bool:
+        """Wait until reliable readers have all that was published; False if that takes long."""
+        try:
+            return bool(publisher.wait_for_all_acked(Duration(seconds=LONGEST)))
+        except RuntimeError:  # RCLError, in rclpy's words
+            if rclpy.ok(context=self.context):
+                raise
+            return False  # the node ends
 
     def complain(self, cause: str, message: str) -> None:
         """Warn of a cause, the first time it comes up."""

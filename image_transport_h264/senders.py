@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 import dataclasses
 import threading
 import time
@@ -21,16 +22,18 @@ from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
     FEEDBACK_QOS,
-    IMAGE_QOS,
     LazyNode,
     PIECES_QOS,
     REQUEST_QOS,
     STREAM_QOS,
 )
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
+from image_transport_h264.pacing import MOST, Pace, Sent
 from image_transport_h264.repair import pieces
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
+#: Bytes from which on images of all nodes of this computer take turns.
+LARGE = 200_000
 
 
 class Sender(abc.ABC):
@@ -65,31 +68,72 @@ def make_sender(
     raise ValueError(f"codec '{codec}' is not one of {', '.join(CODECS)}")
 
 
-class RawSender(Sender):
+class PictureSender(Sender):
+    """
+    Publishes complete images no faster than they are acknowledged, so that none waits on the link.
+
+    The node keeps the newest image meanwhile and drops the others.
+    """
+
+    def __init__(
+        self, node: LazyNode, kind: Any, stream: str, changed: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._publisher = node.offer(kind, stream, STREAM_QOS, changed)
+        self.publishers = [self._publisher]
+        self._pace = Pace()
+        self._waiters = ThreadPoolExecutor(MOST, 'acknowledgement')
+        self._under_way: list[Future[tuple[Sent, float, bool]]] = []
+
+    def _put(self, message: Any) -> None:
+        """Publish a message; return when another one may be sent."""
+        if len(message.data) >= LARGE:
+            self._node.put_through(self._publisher, message)
+            return
+        self._settle()
+        sent = self._pace.sent(time.monotonic())
+        self._node.put_out(self._publisher, message)
+        self._under_way.append(self._waiters.submit(self._acknowledged, sent))
+        while not self._pace.may_send():
+            wait(self._under_way, return_when=FIRST_COMPLETED)
+            self._settle()
+
+    def _acknowledged(self, sent: Sent) -> tuple[Sent, float, bool]:
+        arrived = self._node.all_acknowledged(self._publisher)
+        return sent, time.monotonic(), arrived
+
+    def _settle(self) -> None:
+        """Tell the pace of the images that are no longer under way."""
+        for future in [future for future in self._under_way if future.done()]:
+            self._under_way.remove(future)
+            sent, when, arrived = future.result()
+            if arrived:
+                self._pace.acknowledged(sent, when)
+            else:
+                self._pace.expired(when)
+
+
+class RawSender(PictureSender):
     """Passes images on as they are."""
 
     def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
-        self._node = node
-        self._publisher = node.offer(Image, stream, IMAGE_QOS, changed)
-        self.publishers = [self._publisher]
+        super().__init__(node, Image, stream, changed)
 
     def send(self, image: Image) -> None:
         """Publish the image."""
-        self._node.put_through(self._publisher, image)
+        self._put(image)
 
 
-class StillSender(Sender):
+class StillSender(PictureSender):
     """Publishes JPEG or PNG, as the C++ ``compressed`` transport does."""
 
     def __init__(
         self, node: LazyNode, codec: str, stream: str, changed: Callable[[], None],
     ) -> None:
-        self._node = node
+        super().__init__(node, CompressedImage, stream, changed)
         self._kind: stills.Format = 'jpeg' if codec == 'jpeg' else 'png'
         self._quality = int(node.declare_parameter('jpeg_quality', 80).value)
         node.add_on_set_parameters_callback(self._set)
-        self._publisher = node.offer(CompressedImage, stream, IMAGE_QOS, changed)
-        self.publishers = [self._publisher]
 
     def send(self, image: Image) -> None:
         """Encode the image by itself."""
@@ -98,7 +142,7 @@ class StillSender(Sender):
         except CodecError as error:
             self._node.complain(error.cause, f'image not sent: {error}')
             return
-        self._node.put_through(self._publisher, CompressedImage(
+        self._put(CompressedImage(
             header=image.header, format=form, data=message.octets(data)))
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -220,7 +264,7 @@ class VideoSender(Sender):
         if packet.format == 'ffv1':
             # worth nothing without any of its parts: decoders have those come again, and by that
             # it goes at the link's rate
-            self._node.put_through(self._video, message.compressed(image.header, packet), 0)
+            self._node.put_through(self._video, message.compressed(image.header, packet))
             return
         with self._lock:
             protects = self._control.protects(now)

@@ -14,6 +14,9 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
 from fogros2.waiting import wait_until
+from fogros2_examples.scene import Scene
+from image_transport_h264.picture import Picture
+from image_transport_h264.stills import encode
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
@@ -78,6 +81,29 @@ def test_large_images_take_turns_on_a_slow_link(vpn: Any) -> None:
     vpn.relay.tell({'rate': 10e6})
     viewer = stream(vpn, codec='raw', images=2)
     assert len(during(viewer, time.monotonic(), 10.0)) >= 5
+
+
+def wire_seconds(rate: float) -> float:
+    """Return how long a JPEG image of the camera is on a link of ``rate`` bit/s, at the least."""
+    pixels = Scene(640, 480, 30.0).frame(0)
+    picture = Picture(640, 480, 'bgr8', 3 * 640, pixels.reshape(-1).data)
+    return len(encode(picture, 'jpeg')[1]) * 8 / rate
+
+
+@pytest.mark.parametrize(('rate', 'delay'), [(5e6, 0.0), (10e6, 0.05)])
+def test_jpeg_fills_link_and_never_queues(vpn: Any, rate: float, delay: float) -> None:
+    """A longer link takes several images at a time; the queue would hold a second of them."""
+    vpn.relay.tell({'rate': rate, 'delay': delay, 'queue': 1.0})
+    viewer = stream(vpn, codec='jpeg')
+    lines = during(viewer, time.monotonic() + 2.0, 10.0)
+    wire = wire_seconds(rate)
+    assert len(lines) >= 0.6 * 10.0 / wire
+    numbers = [line['image'] for line in lines]
+    assert numbers == sorted(set(numbers))
+    latencies = sorted(line['latency'] - delay for line in lines)
+    # its own time on the wire, twice: before it leaves, it waits for the one before
+    assert latencies[len(latencies) // 2] < 3 * wire + 1 / 30
+    assert latencies[-1] < 0.8
 
 
 def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
