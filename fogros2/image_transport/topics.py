@@ -25,6 +25,8 @@ from fogros2.model import NodeSpec, Stream
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 #: Options of a Stream that are no parameters of the encoder.
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
+#: What FogROS2 appends to a streamed topic's name on machines.
+_CLOUD = '/cloud'
 
 
 def check(stream: Stream) -> None:
@@ -123,13 +125,18 @@ def rewrite(
 
     ROS follows one rule for a name and no further, so ``image:=/camera`` has to say where
     ``/camera`` has gone, and rules for those who use the topic's own name go behind: the first
-    rule that matches counts.
+    rule that matches counts. A rule that leads to ``/camera/cloud`` means the machine's side of
+    ``/camera``: FogROS2's README has users write it so.
 
     :param pairs: the node's own, in order; from its group, SetRemap or itself.
     :param names: see ``remappings``.
     :param namespace: the node's, that relative names are in.
     """
-    changed = [(old, names.get(absolute(new, namespace), new)) for old, new in pairs]
+    def renamed(name: str) -> str:
+        full = absolute(name, namespace)
+        return names.get(full) or names.get(full.removesuffix(_CLOUD), name)
+
+    changed = [(old, renamed(new)) for old, new in pairs]
     taken = {absolute(old, namespace) for old, _ in pairs}
     return [*changed, *((old, new) for old, new in names.items() if old not in taken)]
 

@@ -171,7 +171,12 @@ def test_streams_go_on_when_the_machine_between_goes(
         assert run.errors == [] and 'process has died' not in run.text, run.text
 
 
-@pytest.mark.parametrize('description', [LAUNCH, CHAIN], ids=['both ways', 'machine to machine'])
+#: As FogROS2's README has users write it.
+CLOUD_TOPIC = LAUNCH.replace("('camera', '/front/camera')", "('camera', '/front/camera/cloud')")
+
+
+@pytest.mark.parametrize('description', [LAUNCH, CHAIN, CLOUD_TOPIC],
+                         ids=['both ways', 'machine to machine', 'remapped to its cloud topic'])
 def test_images_cross_encoded(tmp_path: Path, cloud_network: str, description: str) -> None:
     viewer = tmp_path / 'viewer.py'
     viewer.write_text(VIEWER)

@@ -132,6 +132,10 @@ def test_camera_info_comes_back_only_when_asked_for() -> None:
     ([('image', 'camera')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
     # in a namespace, the relative name is another topic
     ([('image', 'camera')], '/left', [('image', 'camera'), ('/camera', '/f/camera')]),
+    # FogROS2's name for the topic on a machine
+    ([('image', '/camera/cloud')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
+    ([('/camera', 'camera/cloud')], '/', [('/camera', '/f/camera')]),
+    ([('image', '/lidar/cloud')], '/', [('image', '/lidar/cloud'), ('/camera', '/f/camera')]),
     # the user has led the topic elsewhere: that stands
     ([('/camera', '/other')], '/', [('/camera', '/other')]),
     ([('camera', 'other')], '/', [('camera', 'other')]),
@@ -141,3 +145,8 @@ def test_rules_do_not_chain_so_they_are_rewritten(
     own: list[tuple[str, str]], namespace: str, expected: list[tuple[str, str]],
 ) -> None:
     assert rewrite(own, {'/camera': '/f/camera'}, namespace) == expected
+
+
+def test_a_streamed_topic_that_ends_in_cloud_keeps_its_name() -> None:
+    names = {'/camera': '/f/camera', '/camera/cloud': '/f/camera/cloud'}
+    assert rewrite([('image', '/camera/cloud')], names)[0] == ('image', '/f/camera/cloud')
