@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         find_cheapest,
         find_cheapest_ec2_instance_type,
         find_nearest_aws_region,
+        nearest_aws_region_now,
     )
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.fog_machine import FogMachine
@@ -23,13 +24,19 @@ if TYPE_CHECKING:
     from fogros2.actions.interruption import MachineInterrupted
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.machines import CloudInstance, ContainerInstance, SSHInstance
-    from fogros2.actions.machines_cloud import AWSCloudInstance, KubeInstance
+    from fogros2.actions.machines_cloud import (
+        AWSCloudInstance,
+        AzureCloudInstance,
+        GCPCloudInstance,
+        KubeInstance,
+    )
     from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
     from fogros2.errors import FogError
     from fogros2.image_transport.streams import StreamTopic
 
 __all__ = [
     'AWSCloudInstance',
+    'AzureCloudInstance',
     'CloudGroup',
     'CloudInstance',
     'CloudNode',
@@ -39,6 +46,7 @@ __all__ = [
     'FogMachine',
     'FogROSLaunchDescription',
     'Foxglove',
+    'GCPCloudInstance',
     'KubeInstance',
     'LifecycleNode',
     'MachineInterrupted',
@@ -49,11 +57,13 @@ __all__ = [
     'find_cheapest',
     'find_cheapest_ec2_instance_type',
     'find_nearest_aws_region',
+    'nearest_aws_region_now',
     'region_ami_selection',
 ]
 
 _MODULES = {
     'AWSCloudInstance': 'fogros2.actions.machines_cloud',
+    'AzureCloudInstance': 'fogros2.actions.machines_cloud',
     'CloudGroup': 'fogros2.actions.cloud_group',
     'CloudInstance': 'fogros2.actions.machines',
     'CloudNode': 'fogros2.actions.nodes',
@@ -63,6 +73,7 @@ _MODULES = {
     'FogMachine': 'fogros2.actions.fog_machine',
     'FogROSLaunchDescription': 'fogros2.actions.launch_description',
     'Foxglove': 'fogros2.actions.foxglove',
+    'GCPCloudInstance': 'fogros2.actions.machines_cloud',
     'KubeInstance': 'fogros2.actions.machines_cloud',
     'LifecycleNode': 'fogros2.actions.nodes',
     'MachineInterrupted': 'fogros2.actions.interruption',
@@ -72,6 +83,7 @@ _MODULES = {
     'find_cheapest': 'fogros2.actions.choices',
     'find_cheapest_ec2_instance_type': 'fogros2.actions.choices',
     'find_nearest_aws_region': 'fogros2.actions.choices',
+    'nearest_aws_region_now': 'fogros2.actions.choices',
 }
 
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.

@@ -3,8 +3,10 @@
 Where and on what to run, found out when the launch is executed.
 
 Each function returns launch Substitutions and asks nobody; a machine that has one among its
-options asks in a thread, as it comes up. The names and keywords of FogROS2's package ``utils``
-are among them, which it calls ``region_ami_selection`` and ``ec2_instance_type_selection``.
+options asks in a thread, as it comes up. The exception is ``nearest_aws_region_now``.
+
+The names and keywords of FogROS2's package ``utils`` are among them, which it calls
+``region_ami_selection`` and ``ec2_instance_type_selection``.
 """
 
 from __future__ import annotations
@@ -75,6 +77,20 @@ def find_nearest_aws_region(regions: Optional[Sequence[SomeSubstitutionsType]] =
     :param regions: those to choose among; None for all that every account may use.
     """
     return Choice('the nearest AWS region', _nearest, {'regions': words.items(regions)})
+
+
+def nearest_aws_region_now(regions: Optional[Sequence[str]] = None) -> str:
+    """
+    Return the AWS region that a connection reaches first as a text, and ask for it at once.
+
+    This is the one function that asks when it is called, so ``ros2 launch -s`` measures too,
+    which takes up to five seconds. Where a value of a machine depends on the region, a mapping
+    needs no such call: see :class:`~fogros2.AWSCloudInstance`.
+
+    :param regions: those to choose among; None for all that every account may use.
+    :raises ProviderError: no region answers, and this computer's place on the globe is unknown.
+    """
+    return _nearest(regions)
 
 
 def find_nearest_region_and_ami(

@@ -25,11 +25,13 @@ GROUP = 'fogros2.machine'
 #: Stands for no machine at all: the nodes run on this computer.
 ROBOT = 'robot'
 
-Kind = Literal['text', 'number', 'truth', 'scalar', 'list', 'mapping', 'table']
+Kind = Literal[
+    'text', 'number', 'truth', 'scalar', 'list', 'mapping', 'text or mapping', 'table']
 
 #: What the annotations name that exists for type checkers alone.
 _NAMES: dict[str, Any] = {
     'SomeSubstitutionsType': str, 'Value': Union[str, int, float], 'Truth': Union[bool, str],
+    'ByRegion': Union[str, Mapping[str, str]],
 }
 #: Parameters that are not for launch files.
 _NOT_MEANT = ('self', 'return', 'options', 'unknown', 'common')
@@ -116,7 +118,7 @@ def _kind(hint: Any) -> tuple[Kind, Mapping[str, Kind]]:
             continue
         item = get_args(option)[-1]
         if issubclass(get_origin(option), Mapping):
-            return 'mapping', {}
+            return ('text or mapping' if str in options else 'mapping'), {}
         if str in options:
             continue  # one text, or its parts
         if isinstance(item, type) and issubclass(item, dict):
@@ -157,7 +159,8 @@ def _read(keyword: Keyword, text: str) -> Any:
         return words.read_truth(text)
     if keyword.kind in ('number', 'scalar'):
         return number(text)
-    if keyword.kind in ('mapping', 'table'):
+    if keyword.kind in ('mapping', 'table') or (
+            keyword.kind == 'text or mapping' and text.startswith('{')):
         return _nested(keyword, text)
     return text
 
@@ -175,7 +178,7 @@ def number(text: str) -> Union[int, float, str]:
 def _nested(keyword: Keyword, text: str) -> Any:
     """Return a mapping, or a table's rows, of YAML's: ``{a: b}``, ``[{key: gpu}]``."""
     found = words.read_yaml(text)
-    if keyword.kind == 'mapping':
+    if keyword.kind != 'table':
         if isinstance(found, dict) and all(isinstance(one, str) for one in found.values()):
             return found
         raise ConfigurationError(f'{text!r} has no names and texts', 'write {name: value}')

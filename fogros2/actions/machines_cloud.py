@@ -5,15 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Any, Optional, TYPE_CHECKING, TypedDict, Union
+from typing import Any, ClassVar, Optional, TYPE_CHECKING, TypedDict, Union
 
 from fogros2.actions import words
 from fogros2.actions.machines import CloudInstance
+from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
     from fogros2.actions.machines import Truth, Value
+
+    #: One value, or one for each region.
+    ByRegion = Union[SomeSubstitutionsType, Mapping[str, SomeSubstitutionsType]]
 
 
 class Toleration(TypedDict, total=False):
@@ -33,6 +37,10 @@ class AWSCloudInstance(CloudInstance):
     What isn't said is left to the provider: the region of the user's AWS configuration, an image
     baked before with what the launch needs or else Ubuntu 24.04, and of the types t3.medium, or
     the cheapest with what is asked for below.
+
+    ``ami_image``, ``ec2_instance_type`` and ``subnet`` may depend on the region: a mapping such as
+    ``{'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}`` has a value for each, and the launch takes the
+    one of the region that it chooses.
 
     :param ami_image: id of an image.
     :param region: such as 'eu-central-1'; 'nearest' for the one that answers first.
@@ -61,9 +69,9 @@ class AWSCloudInstance(CloudInstance):
     provider = 'aws'
 
     def __init__(
-        self, ami_image: Optional[SomeSubstitutionsType] = None,
+        self, ami_image: Optional[ByRegion] = None,
         region: Optional[SomeSubstitutionsType] = None,
-        ec2_instance_type: Optional[SomeSubstitutionsType] = None,
+        ec2_instance_type: Optional[ByRegion] = None,
         disk_size: Optional[Value] = None, *,
         spot: Optional[Truth] = None,
         arch: Optional[SomeSubstitutionsType] = None,
@@ -74,7 +82,7 @@ class AWSCloudInstance(CloudInstance):
         gpu_memory_gb: Optional[Value] = None,
         max_price: Optional[Union[Value, Decimal]] = None,
         iam_instance_profile: Optional[SomeSubstitutionsType] = None,
-        subnet: Optional[SomeSubstitutionsType] = None,
+        subnet: Optional[ByRegion] = None,
         security_groups: Optional[Sequence[SomeSubstitutionsType]] = None,
         tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         regions: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -98,12 +106,18 @@ class AWSCloudInstance(CloudInstance):
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
         """Return what is known of the machine, with FogROS2's keys."""
         machine = self._running.machine if self._running else None
+        region = self._option('region')
+
+        def regional(name: str) -> Any:
+            value = self._option(name)
+            return value.get(region, value) if isinstance(value, Mapping) else value
+
         return {
             **super().info(flush_to_disk),
-            'ec2_region': self._option('region'),
-            'ec2_instance_type': self._option('ec2_instance_type'),
+            'ec2_region': region,
+            'ec2_instance_type': regional('ec2_instance_type'),
             'disk_size': self._option('disk_size'),
-            'aws_ami_image': self._option('ami_image'),
+            'aws_ami_image': regional('ami_image'),
             'ec2_instance_id': machine.id.rpartition('/')[2] if machine else None,
         }
 
@@ -175,3 +189,28 @@ class KubeInstance(CloudInstance):
                 f'{self._option("mcpu") or 0}mx{self._option("mb") or 0}Mb',
             'compute_instance_id': machine.id if machine else None,
         }
+
+
+class _NoProvider(CloudInstance):
+    """A machine of FogROS2's for which there is no provider here; building one is an error."""
+
+    cloud: ClassVar[str]
+
+    def __init__(self, *given: object, **keywords: object) -> None:
+        raise ConfigurationError(
+            f'{type(self).__name__} is not available: FogROS2 for Jazzy has no provider for '
+            f'{self.cloud}',
+            'use KubeInstance for a cluster there, SSHInstance(host=..., user=...) for a VM that '
+            'you create there yourself, AWSCloudInstance, or ContainerInstance on this computer')
+
+
+class GCPCloudInstance(_NoProvider):
+    """A virtual machine of Google Cloud, which launch files of FogROS2 name."""
+
+    cloud = 'Google Cloud'
+
+
+class AzureCloudInstance(_NoProvider):
+    """A virtual machine of Azure, which launch files of FogROS2 name."""
+
+    cloud = 'Azure'

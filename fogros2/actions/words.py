@@ -118,6 +118,8 @@ def plain(value: Any) -> Any:
     """Return a number, a truth, or a text for people, of a value that may not be resolved yet."""
     if isinstance(value, (Number, Truth, Listed)):
         return plain(value.value)
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
     return value if value is None or isinstance(value, (bool, int, float)) else describe(value)
 
 

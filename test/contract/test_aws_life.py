@@ -772,12 +772,50 @@ def test_a_fault_of_aws_leaves_open_whether_there_is_a_machine(aws, monkeypatch)
 
 
 def test_the_nearest_region_has_neighbours_to_go_on_in(aws, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region', lambda: HOME)
+    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region', lambda among: HOME)
     spec, _ = ask(region='nearest')
     assert aws.provider.resolve(spec).options == {
         **spec.options, 'region': HOME, 'regions': ['eu-west-3', 'eu-west-2']}
     named, _ = ask(region='nearest', regions=[AWAY])
     assert aws.provider.resolve(named).options['regions'] == [AWAY]
+
+
+def test_the_nearest_region_is_one_that_has_a_value(aws, monkeypatch):
+    asked = []
+    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region',
+                        lambda among: asked.append(among) or HOME)
+    images = {HOME: 'ami-1', 'eu-west-2': 'ami-2', AWAY: 'ami-3'}
+    spec, _ = ask(region='nearest', ami_image=images)
+    found = aws.provider.resolve(spec).options
+    assert asked == [[HOME, 'eu-west-2', AWAY]]
+    # the neighbour eu-west-3 has no image, so the launch doesn't go on there
+    assert (found['region'], found['regions'], found['ami_image']) == (
+        HOME, ['eu-west-2'], images)
+
+
+@pytest.mark.parametrize('where', [{'region': AWAY}, {'region': HOME, 'regions': [AWAY]}, {
+    'region': 'nearest', 'regions': [AWAY]}])
+def test_a_region_without_a_value_is_an_error_before_anything(aws, where):
+    spec, _ = ask(**where, ami_image={HOME: 'ami-1', 'eu-west-1': 'ami-2'})
+    with pytest.raises(ConfigurationError, match=(
+            f'ami_image has no value for the region {AWAY}')) as caught:
+        aws.provider.check(spec)
+    assert caught.value.hint == f'add one, or choose the region among {HOME}, eu-west-1'
+    assert aws.calls == []
+
+
+def test_each_region_gets_its_own_image_and_type(aws):
+    """The first has no room, and the launch goes on with what is for the second."""
+    here, there = [boto3.client('ssm', region).get_parameter(
+        Name=images.UBUNTU['x86_64'])['Parameter']['Value'] for region in (HOME, AWAY)]
+    assert here != there
+    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
+    machine_id = aws.provider.create(*ask(
+        region=HOME, regions=[AWAY], ami_image={HOME: here, AWAY: there},
+        ec2_instance_type={HOME: 't3.medium', AWAY: 't3.large'}))
+    assert machine_id.startswith(f'aws:{AWAY}/')
+    asked = [(words['ImageId'], words['InstanceType']) for words in aws.asked('RunInstances')]
+    assert asked[0] == (here, 't3.medium') and asked[-1] == (there, 't3.large')
 
 
 def test_all_providers_of_a_process_share_what_is_slow_to_make(monkeypatch):

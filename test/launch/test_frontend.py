@@ -148,9 +148,28 @@ def test_a_pod_s_tolerations_are_elements_of_their_own():
                       'tolerationSeconds': 30}]).spec(LaunchContext())
 
 
+@pytest.mark.parametrize('text', [
+    '''<launch><fog_machine name="planner" provider="aws" region="nearest" ros_workspace="">
+         <ami_image name="us-west-1" value="ami-1"/><ami_image name="eu-west-1" value="$(var id)"/>
+       </fog_machine></launch>''',
+    '''launch:
+- fog_machine:
+    name: planner
+    provider: aws
+    region: nearest
+    ros_workspace: ''
+    ami_image: [{name: us-west-1, value: ami-1}, {name: eu-west-1, value: $(var id)}]
+'''], ids=['XML', 'YAML'])
+def test_a_value_for_each_region_is_an_element_each(text):
+    assert machine(load(text), id='ami-2') == AWSCloudInstance(
+        name='planner', region='nearest', ros_workspace='',
+        ami_image={'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}).spec(LaunchContext())
+
+
 #: A text, and the Python value it stands for, of each kind.
 EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'truth': ('true', True),
-            'scalar': ('true', True), 'list': ('a,b', ['a', 'b'])}
+            'scalar': ('true', True), 'list': ('a,b', ['a', 'b']),
+            'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'name': 'planner'}
 LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1'])}

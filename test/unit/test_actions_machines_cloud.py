@@ -13,7 +13,7 @@ import pytest
 import fogros2
 from fogros2 import AWSCloudInstance, KubeInstance
 from fogros2.actions import choices as later
-from fogros2.actions import words
+from fogros2.actions import keywords, words
 from fogros2.errors import ConfigurationError
 from fogros2.provider.aws import choices
 
@@ -73,6 +73,33 @@ def test_what_fogros2_has_by_position(context):
         'disk_size': 30}
     assert options(KubeInstance('image', 'zone', 100, 200), context) == {
         'container_image': 'image', 'zone': 'zone', 'mcpu': 100, 'mb': 200}
+
+
+IMAGES = {'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}
+
+
+def test_a_value_may_depend_on_the_region(context):
+    context.launch_configurations['image'] = 'ami-1'
+    machine = AWSCloudInstance(region='us-west-1', ami_image={
+        'us-west-1': LaunchConfiguration('image'), 'eu-west-1': 'ami-2'})
+    assert options(machine, context) == {'region': 'us-west-1', 'ami_image': IMAGES}
+    assert machine.info()['aws_ami_image'] == 'ami-1'
+    assert AWSCloudInstance(ami_image=IMAGES).info()['aws_ami_image'] == IMAGES
+
+
+@pytest.mark.parametrize(('element', 'expected'), [
+    ('ami_image="ami-1"', 'ami-1'), ('ami_image="{us-west-1: ami-1, eu-west-1: ami-2}"', IMAGES)])
+def test_regional_values_in_text(element, expected):
+    text = element.partition('=')[2].strip('"')
+    assert keywords.read(keywords.keywords(AWSCloudInstance)['ami_image'], text) == expected
+
+
+@pytest.mark.parametrize('name', ['GCPCloudInstance', 'AzureCloudInstance'])
+def test_clouds_without_a_provider_name_the_alternatives(name):
+    with pytest.raises(ConfigurationError, match=f'{name} is not available') as caught:
+        getattr(fogros2, name)(project_id='p')
+    for other in ('KubeInstance', 'SSHInstance', 'AWSCloudInstance', 'ContainerInstance'):
+        assert other in caught.value.hint and hasattr(fogros2, other)
 
 
 def test_launch_arguments(context):
@@ -166,6 +193,13 @@ def test_nobody_is_asked_before_the_launch_does(asked, context):
     other = AWSCloudInstance(region=region, ec2_instance_type=kind)
     assert found(other, context) == words.answered(spec.options)
     assert region.perform(context) == 'eu-north-1' and len(asked) == 2
+
+
+def test_the_one_helper_that_asks_at_once(asked):
+    region = fogros2.nearest_aws_region_now(list(IMAGES))
+    assert (region, asked) == ('eu-north-1', [('nearest_region', (list(IMAGES),), {})])
+    # a text, so that it is a key of a dictionary
+    assert {'eu-north-1': 'ami-3'}[region] == 'ami-3'
 
 
 def test_the_cheapest_of_all(asked, context):

@@ -90,10 +90,27 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'ami_image': 'ami-1', 'regions': ['us-east-1']}, 'belongs to one region'),
     ({'subnet': 'subnet-1', 'region': 'nearest'}, 'belongs to one region'),
     ({'user': 'Robert; drop'}, 'it takes a login name'),
+    ({'ami_image': {}}, 'ami_image is an empty mapping'),
+    ({'ami_image': {'Oregon': 'ami-1'}}, "'Oregon' can't be the region"),
+    ({'ami_image': {'us-west-2': 'ubuntu'}}, 'it takes ami-'),
+    ({'ami_image': {'us-west-2': 1}}, 'it takes names and strings'),
+    ({'ec2_instance_type': {'us-west-2': 'cheapest'}}, "can't have 'nearest' or 'cheapest'"),
 ])
 def test_a_wrong_option_is_named_with_what_to_do(options, words):
     with pytest.raises(ConfigurationError, match=re.escape(words)):
         Options.parse(options)
+
+
+def test_options_by_region_are_those_of_the_region():
+    options = Options.parse({
+        'ami_image': {'us-west-2': 'ami-1', 'eu-west-1': 'ami-2'}, 'regions': ['eu-west-1'],
+        'subnet': {'eu-west-1': 'subnet-2', 'us-west-2': 'subnet-1'}, 'min_cpu': 4})
+    here = options.in_region('eu-west-1')
+    assert (here.ami_image, here.subnet, here.min_cpu) == ('ami-2', 'subnet-2', 4.0)
+    assert options.common_regions() == ['us-west-2', 'eu-west-1']
+    assert here.common_regions() is None
+    with pytest.raises(ConfigurationError, match='no value for the region us-east-1'):
+        options.in_region('us-east-1')
 
 
 def test_a_spot_instance_that_should_stop_is_refused_before_anything():

@@ -56,6 +56,8 @@ def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
         return _mapping(entity, parser, keyword)
     if keyword.kind == 'table':
         return _table(entity, parser, keyword)
+    if keyword.kind == 'text or mapping' and not _is_text(entity, keyword.name):
+        return _mapping(entity, parser, keyword)
     raw = _raw(entity, keyword.name)
     if isinstance(raw, list):
         if keyword.kind != 'list' or not all(isinstance(item, str) for item in raw):
@@ -69,6 +71,14 @@ def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
     if raw is None or _fits(keyword.kind, raw):
         return raw
     raise _wrong(entity, keyword, raw)
+
+
+def _is_text(entity: Entity, name: str) -> bool:
+    """Return whether an attribute is a text, and neither missing nor elements of their own."""
+    try:
+        return entity.get_attr(name, data_type=str, optional=True) is not None
+    except TypeError:
+        return False
 
 
 def _raw(entity: Entity, name: str) -> Union[str, int, float, bool, list[Any], None]:

@@ -24,7 +24,7 @@ from fogros2.provider.aws.failures import AwsError, NO_ROOM, NO_ROOM_IN_REGION
 from fogros2.provider.aws.host_key import one_time
 from fogros2.provider.aws.images import Kind
 from fogros2.provider.aws.instances import MachineId, Place, TAG_ATTEMPT, TAG_MADE
-from fogros2.provider.aws.options import Options
+from fogros2.provider.aws.options import DEFAULT_TYPE, Options
 from fogros2.provider.aws.user_data import user_data
 
 #: Returns what a machine costs by the hour (US dollars), None where nobody knows.
@@ -50,7 +50,9 @@ class Creation:
         self.account = account.until(request.cancel)
         self.spec = spec
         self.request = request
+        #: Those of the region that is tried.
         self.options = options
+        self._all_options = options
         self.attempt = instances.attempt_of(request.token)
         self._robot_address = robot_address
         self._ask_price = price
@@ -61,7 +63,7 @@ class Creation:
         self.undo_failures: list[FogError] = []
         self._images: dict[tuple[str, str, bool], Mapping[str, Any]] = {}
 
-    def run(self, regions: list[str], types: list[str]) -> MachineId:
+    def run(self, regions: list[str]) -> MachineId:
         """
         Return the machine, in the first of the regions that has room for one of the types.
 
@@ -69,17 +71,20 @@ class Creation:
         :raises FogError: see :mod:`~fogros2.provider.aws.failures`; nothing is left behind.
         """
         try:
-            return self._in_regions(regions, types)
+            return self._in_regions(regions)
         except FogError as error:
             error.refused = not self._unsure
             error.undo_failures = tuple(self.undo_failures)
             raise
 
-    def _in_regions(self, regions: list[str], types: list[str]) -> MachineId:
+    def _in_regions(self, regions: list[str]) -> MachineId:
         first: Optional[AwsError] = None
         for region in regions:
             try:
-                return self._in_region(region, types)
+                self.options = self._all_options.in_region(region)
+                return self._in_region(region, list(dict.fromkeys([
+                    self.options.ec2_instance_type or DEFAULT_TYPE,
+                    *self.options.instance_types])))
             except ConfigurationError:
                 if first is None:
                     raise

@@ -25,6 +25,8 @@ _FORMS = {
     'subnet': (r'subnet-[0-9a-f]+', 'subnet-...'),
     'user': (r'[a-z_][a-z0-9_-]{0,31}', "a login name, such as 'ubuntu'"),
 }
+#: Options that may depend on the region: a mapping has one value for each region.
+_BY_REGION = ('ami_image', 'ec2_instance_type', 'subnet')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +54,8 @@ class Options:
     :param user: the image's login user.
     :param ssh_from: networks (CIDR) that may reach the SSH port; none for this robot's public
         address alone.
+    :param by_region: options that depend on the region, by name: their values by region.
+        ``in_region`` puts them into the fields above.
     """
 
     ami_image: str = ''
@@ -74,6 +78,7 @@ class Options:
     tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
     user: str = 'ubuntu'
     ssh_from: tuple[str, ...] = ()
+    by_region: Mapping[str, Mapping[str, str]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def parse(cls, given: Mapping[str, Any]) -> Options:
@@ -82,9 +87,35 @@ class Options:
 
         :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
         """
-        options = parsed(cls, given, 'a machine at AWS', _value)
+        by_region = {name: convert(name, given[name], {}) for name in _BY_REGION
+                     if isinstance(given.get(name), Mapping)}
+        options = parsed(cls, {name: value for name, value in given.items()
+                               if name not in by_region}, 'a machine at AWS', _value)
         _check(options)
-        return dataclasses.replace(options, arch=_ARCHES[options.arch])
+        _check_by_region(by_region)
+        return dataclasses.replace(options, arch=_ARCHES[options.arch], by_region=by_region)
+
+    def in_region(self, region: str) -> Options:
+        """
+        Return the options with the values that a region has.
+
+        :raises ConfigurationError: an option depends on the region and has no value for this one.
+        """
+        for name, values in self.by_region.items():
+            if region not in values:
+                raise ConfigurationError(
+                    f'{name} has no value for the region {region}',
+                    f'add one, or choose the region among {", ".join(values)}')
+        chosen: dict[str, Any] = {
+            name: values[region] for name, values in self.by_region.items()}
+        return dataclasses.replace(self, by_region={}, **chosen)
+
+    def common_regions(self) -> Optional[list[str]]:
+        """Return the regions for which every option has a value; None where all regions do."""
+        if not self.by_region:
+            return None
+        first, *others = self.by_region.values()
+        return [region for region in first if all(region in values for values in others)]
 
     @property
     def chooses_type(self) -> bool:
@@ -163,6 +194,20 @@ def _check(options: Options) -> None:
                                  'leave ami_image= or regions= out')
     if options.subnet and (options.regions or options.region == NEAREST):
         raise ConfigurationError('a subnet belongs to one region', 'name that one with region=')
+
+
+def _check_by_region(by_region: Mapping[str, Mapping[str, str]]) -> None:
+    for name, values in by_region.items():
+        if not values:
+            raise ConfigurationError(f'{name} is an empty mapping',
+                                     "write {'us-west-1': ...}, or leave it out")
+        for region, value in values.items():
+            if region == NEAREST or value == CHEAPEST:
+                raise ConfigurationError(
+                    f"{name}: a mapping can't have '{NEAREST}' or '{CHEAPEST}'",
+                    'it takes names of regions, and a value for each')
+            one: dict[str, Any] = {'region': region, name: value}
+            _check(Options(**one))
 
 
 def cidr(text: str) -> str:

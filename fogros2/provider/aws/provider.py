@@ -87,7 +87,9 @@ class AWSProvider(Provider):
         """Look at the options, for boto3 and for credentials; AWS isn't asked."""
         options = check_spec(spec)
         self._account.check_credentials()
-        self._region(options)
+        region = self._region(options)
+        for one in (*((region,) if region != NEAREST else ()), *options.regions):
+            options.in_region(one)
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """Choose the region and the type, and refuse what costs more than ``max_price``."""
@@ -100,9 +102,12 @@ class AWSProvider(Provider):
         chosen: dict[str, Any] = {}
         region = self._region(options)
         if region == NEAREST:
-            region = choices.nearest_region()
+            among = options.common_regions()
+            region = choices.nearest_region(among)
             if not options.regions and not options.ami_image:
-                chosen['regions'] = places.neighbours(region)
+                chosen['regions'] = [one for one in places.neighbours(region)
+                                     if among is None or one in among]
+        options = options.in_region(region)
         kind = options.ec2_instance_type
         market = Market(self._account.client, cancel=cancel)
         if options.chooses_type:
@@ -124,12 +129,15 @@ class AWSProvider(Provider):
                 raise ConfigurationError(
                     f'{kind} in {region} costs {price} US dollars an hour, more than max_price='
                     f'{options.max_price}', 'ros2 fog price shows what is cheaper')
-        return dataclasses.replace(spec, options={
-            **spec.options, **chosen, 'region': region, 'ec2_instance_type': kind})
+        # a mapping stays: the launch may go on in another region
+        if not isinstance(spec.options.get('ec2_instance_type'), Mapping):
+            chosen['ec2_instance_type'] = kind
+        return dataclasses.replace(spec, options={**spec.options, **chosen, 'region': region})
 
     def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Return the type and the region, and where the launch goes on if there is no room."""
         options = Options.parse(chosen.options)
+        options = options.in_region(options.region)
         kinds = [kind for kind in options.instance_types if kind != options.ec2_instance_type]
         more = [' or '.join(kinds), *([f'in {" or ".join(options.regions)}']
                                       if options.regions else [])]
@@ -140,7 +148,10 @@ class AWSProvider(Provider):
         """Return the price of a machine (US dollars an hour); its disk and traffic come on top."""
         options = Options.parse(spec.options)
         region = self._region(options)
-        if region == NEAREST or options.chooses_type:
+        if region == NEAREST:
+            return None
+        options = options.in_region(region)
+        if options.chooses_type:
             return None
         return self._price(region, options.ec2_instance_type or DEFAULT_TYPE, options.spot,
                            self.cancel)
@@ -168,10 +179,7 @@ class AWSProvider(Provider):
             self._account, spec, request, options,
             robot_address=lambda: self._sources(request.cancel),
             price=lambda region, kind: self._price(region, kind, options.spot, request.cancel))
-        machine = creation.run(
-            list(dict.fromkeys([self._region(options), *options.regions])),
-            list(dict.fromkeys([options.ec2_instance_type or DEFAULT_TYPE,
-                                *options.instance_types])))
+        machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
         self._account.made[machine.instance] = time.monotonic()
         if creation.undo_failures:
             self._notes[machine.instance] = '; '.join(map(str, creation.undo_failures))
