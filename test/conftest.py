@@ -61,6 +61,27 @@ def state_home(
     shutil.rmtree(path, ignore_errors=True)
 
 
+@pytest.fixture(scope='session')
+def upstream() -> Path:
+    """Return a folder with checkouts of FogROS2's repositories, which tests run unedited."""
+    named = os.environ.get('FOGROS2_UPSTREAM', '')
+    if not Path(named, 'FogROS2', 'fogros2_examples').is_dir() or not named:
+        pytest.skip('needs FOGROS2_UPSTREAM: a folder with checkouts of FogROS2 (branch humble) '
+                    'and fogros2-examples')
+    return Path(named)
+
+
+@pytest.fixture
+def jammy(tmp_path: Path) -> dict[str, str]:
+    """Return the environment on a simulated Ubuntu 22.04, the release that FogROS2 asks for."""
+    modules = tmp_path / 'jammy'
+    modules.mkdir()
+    (modules / 'lsb_release.py').write_text(
+        "def get_os_release():\n    return {'RELEASE': '22.04'}\n")
+    before = os.environ.get('PYTHONPATH')
+    return {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, (str(modules), before)))}
+
+
 @pytest.fixture
 def free_udp_port() -> int:
     """Return a UDP port that was free a moment ago."""

@@ -27,8 +27,11 @@ REGION = 'us-east-1'
 #: What is tried on ROS 2 as well as on the embedded default: what its launch and nodes have a part
 #: in. All else is AWS's and the box's, the same on either, and takes minutes.
 ON_BOTH = (
-    'test_the_talker_from_nothing_to_nothing', 'test_fogros2s_own_launch_file_runs_unchanged',
-    'test_fogros2s_own_choice_of_region_and_type', 'test_two_regions_hear_each_other')
+    'test_the_talker_from_nothing_to_nothing', 'test_two_regions_hear_each_other',
+    'test_fogros2s_form_on_a_simulated_ubuntu_22_04',
+    'test_fogros2s_talker_aws_on_a_simulated_ubuntu_22_04',
+    'test_fogros2s_form_of_choosing_region_and_type',
+    'test_fogros2s_talker_auto_aws_with_one_line_changed')
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 
 import pytest
 
@@ -61,111 +60,6 @@ def test_the_talker_from_nothing_to_nothing(robot, box, name):
     assert f'{name}: ' in run.text and 'h at $0.0416 an hour, $' in run.text
     # what this test has asked itself comes on top
     assert len(asked) - 5 <= CALLS, asked
-
-
-THEIRS = '''\
-from launch_ros.actions import Node
-
-import fogros2
-
-
-def ami_image():
-    import lsb_release
-
-    return {'22.04': 'ami-034160df82745c454'}[lsb_release.get_os_release()['RELEASE']]
-
-
-def generate_launch_description():
-    ld = fogros2.FogROSLaunchDescription()
-    machine1 = fogros2.AWSCloudInstance(
-        region='us-west-1', ec2_instance_type='c5.4xlarge', ami_image=ami_image()
-    )
-    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
-    talker_node = fogros2.CloudNode(
-        package='fogros2_examples', executable='talker', output='screen', machine=machine1,
-    )
-    ld.add_action(talker_node)
-    ld.add_action(listener_node)
-    return ld
-'''
-
-THEIRS_AUTO = '''\
-from launch_ros.actions import Node
-import fogros2
-from utils import region_ami_selection, ec2_instance_type_selection
-
-
-def generic_ubuntu_ami():
-    return {
-        'us-west-1': {'ami_image': 'ami-02ea247e531eb3ce6'},
-        'us-east-1': {'ami_image': 'ami-08c40ec9ead489470'},
-    }
-
-
-def generate_launch_description():
-    ld = fogros2.FogROSLaunchDescription()
-    region, ami = region_ami_selection.find_nearest_region_and_ami(generic_ubuntu_ami())
-    ec2_instance_type = ec2_instance_type_selection.find_cheapest_ec2_instance_type(region)
-    print(region, ami, ec2_instance_type)
-    machine1 = fogros2.AWSCloudInstance(
-        region=region, ec2_instance_type=ec2_instance_type, ami_image=ami
-    )
-    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
-    talker_node = fogros2.CloudNode(
-        package='fogros2_examples', executable='talker', output='screen', machine=machine1,
-    )
-    ld.add_action(talker_node)
-    ld.add_action(listener_node)
-    return ld
-'''
-
-
-def theirs(file, twin):
-    """
-    Return a launch file of FogROS2's.
-
-    Where ``FOGROS2_ORIGINAL`` names a checkout of it, its own; else one of ours that asks for the
-    same in the same words.
-    """
-    checkout = os.environ.get('FOGROS2_ORIGINAL')
-    if not checkout:
-        return twin
-    return Path(checkout, 'fogros2_examples', 'launch', file).read_text()
-
-
-def test_fogros2s_own_launch_file_runs_unchanged(robot, box):
-    box.publish('ami-034160df82745c454', region='us-west-1')
-    modules = robot.home / 'modules'
-    modules.mkdir()
-    (modules / 'lsb_release.py').write_text(
-        "def get_os_release():\n    return {'RELEASE': '22.04'}\n")
-    path = robot.write('theirs.launch.py', theirs('talker.aws.launch.py', THEIRS))
-    before = os.environ.get('PYTHONPATH')
-    run = robot.launch(path, PYTHONPATH=':'.join(filter(None, (str(modules), before))))
-    run.wait_for('I heard: [Hello World from ')
-    (instance,) = box.alive()
-    assert (instance.region, instance.type, instance.image) == (
-        'us-west-1', 'c5.4xlarge', 'ami-034160df82745c454')
-    run.interrupt()
-    assert run.ended() == 0, run.text
-    assert clean(run), run.text
-
-
-def test_fogros2s_own_choice_of_region_and_type(robot, box):
-    for region, image in (('us-west-1', 'ami-02ea247e531eb3ce6'),
-                          ('us-east-1', 'ami-08c40ec9ead489470')):
-        box.publish(image, region=region)
-    text = theirs('talker.auto_aws.launch.py', THEIRS_AUTO)
-    assert 'from utils import' in text
-    path = robot.write('auto.launch.py', text.replace('from utils import', 'from fogros2 import'))
-    run = robot.launch(path)
-    run.wait_for('I heard: [Hello World from ')
-    (instance,) = box.alive()
-    assert instance.image in ('ami-02ea247e531eb3ce6', 'ami-08c40ec9ead489470')
-    assert instance.region in ('us-west-1', 'us-east-1')
-    run.interrupt()
-    assert run.ended() == 0, run.text
-    assert clean(run), run.text
 
 
 @pytest.mark.soak  # the choice by FogROS2's own launch file is the same

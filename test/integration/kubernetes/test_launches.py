@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-import os
-from pathlib import Path
 import re
 import shutil
 import time
@@ -48,23 +46,20 @@ def generate_launch_description():
 """
 
 
-#: What FogROS2's talker.kube.launch.py asks for, in its words; FOGROS2_ORIGINAL names a checkout
-#: whose own is taken instead.
-THEIRS = """
-from launch_ros.actions import Node
-
+#: Ours, with what FogROS2's talker.kube.launch.py uses.
+FORM = """
 import fogros2
+from launch_ros.actions import Node
 
 
 def generate_launch_description():
-    ld = fogros2.FogROSLaunchDescription()
-    machine1 = fogros2.KubeInstance()
-    listener_node = Node(package='fogros2_examples', executable='listener', output='screen')
-    talker_node = fogros2.CloudNode(
-        package='fogros2_examples', executable='talker', output='screen', machine=machine1)
-    ld.add_action(talker_node)
-    ld.add_action(listener_node)
-    return ld
+    description = fogros2.FogROSLaunchDescription()
+    description.add_action(fogros2.CloudNode(
+        package='fogros2_examples', executable='talker', output='screen',
+        machine=fogros2.KubeInstance()))
+    description.add_action(Node(
+        package='fogros2_examples', executable='listener', output='screen'))
+    return description
 """
 
 
@@ -151,13 +146,8 @@ def test_the_example(namespace):
     assert namespace.left() == []
 
 
-@pytest.mark.usefixtures('nothing_left')
-def test_fogros2s_own_launch_file_runs_unchanged(namespace, tmp_path):
-    """Its image is the one that KubeInstance() names; the cluster has one of that name."""
-    path = tmp_path / 'theirs.launch.py'
-    checkout = os.environ.get('FOGROS2_ORIGINAL')
-    path.write_text(THEIRS if not checkout else Path(
-        checkout, 'fogros2_examples', 'launch', 'talker.kube.launch.py').read_text())
+def talks_by_default(path, namespace):
+    """Launch a file whose image is KubeInstance()'s own; the cluster has one of that name."""
     with launching() as start:
         run = start(str(path))
         run.wait_for('I heard: [Hello World from ', timeout=PATIENCE)
@@ -167,6 +157,18 @@ def test_fogros2s_own_launch_file_runs_unchanged(namespace, tmp_path):
         assert run.ended() == 0, run.text
     assert clean(run), run.text
     assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_fogros2s_form(namespace, tmp_path):
+    path = tmp_path / 'form.launch.py'
+    path.write_text(FORM)
+    talks_by_default(path, namespace)
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_fogros2s_talker_kube_byte_for_byte(upstream, namespace):
+    talks_by_default(upstream / 'FogROS2/fogros2_examples/launch/talker.kube.launch.py', namespace)
 
 
 @pytest.mark.usefixtures('nothing_left')
