@@ -24,6 +24,28 @@ ros_setup() {
     fi
 }
 
+# teach_activate VENV SETUP: makes `. VENV/bin/activate` set what `run.sh ros` sets, and deactivate
+# undo it. SETUP is the set-up script of ROS 2, which is sourced where the terminal has not.
+teach_activate() {
+    script=$1/bin/activate
+    ! grep -q ros_environment.sh "$script" || return 0
+    cat >"$script.new" <<END
+_fogros2_deactivate() {
+    if [ -n "\${_OLD_FOGROS2_AMENT_PREFIX_PATH+set}" ]; then
+        AMENT_PREFIX_PATH=\$_OLD_FOGROS2_AMENT_PREFIX_PATH PYTHONPATH=\$_OLD_FOGROS2_PYTHONPATH
+        unset _OLD_FOGROS2_AMENT_PREFIX_PATH _OLD_FOGROS2_PYTHONPATH
+    fi
+}
+$(sed 's/^deactivate () {$/&\n    _fogros2_deactivate/' "$script")
+_OLD_FOGROS2_AMENT_PREFIX_PATH=\${AMENT_PREFIX_PATH:-} _OLD_FOGROS2_PYTHONPATH=\${PYTHONPATH:-}
+if [ -z "\${AMENT_PREFIX_PATH:-}" ]; then
+    . '${2%sh}'"\${BASH_VERSION:+ba}\${ZSH_VERSION:+z}sh"
+fi
+. '$PWD/tools/ros_environment.sh'
+END
+    mv "$script.new" "$script"
+}
+
 # Runs a command as root: as it is, or through sudo, whose password was asked before.
 as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n -- "$@"; fi; }
 

@@ -22,11 +22,8 @@ case $which in
     ros)
         [ -n "$ros" ] || fail "ROS 2 Jazzy isn't installed here."
         set +eu; . "$ros"; set -eu
-        export VIRTUAL_ENV="$VENV_ROS" AMENT_PREFIX_PATH="$VENV_ROS:$AMENT_PREFIX_PATH"
-        packages=$("$VENV_ROS/bin/python" -c \
-            "import sysconfig; print(sysconfig.get_path('purelib'))")
-        # programs of ROS start with the system's interpreter: they find ours by this
-        export PYTHONPATH="$packages:${PYTHONPATH:-}"
+        export VIRTUAL_ENV="$VENV_ROS"
+        . tools/ros_environment.sh
         ;;
     embedded)
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION \

@@ -269,5 +269,6 @@ if [ -n "$ros" ] && [ "$target" != lint ]; then
         printf '#!%s\nimport sys\nfrom ros2cli.cli import main\nsys.exit(main())\n' \
             "$VENV_ROS/bin/python" >"$VENV_ROS/bin/ros2"
         chmod 755 "$VENV_ROS/bin/ros2"
+        teach_activate "$VENV_ROS" "$ros"
     )
 fi

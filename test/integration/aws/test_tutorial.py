@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who follows the tutorial word for word arrives: but for the machine's name, which is shared."""
+"""
+The tutorial works word for word, on the embedded default and on ROS 2.
+
+The name of the machine is another one, as tests share the computer.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ import os
 from pathlib import Path
 import re
 import shlex
+import subprocess
+import sys
 
 import pytest
 
@@ -14,6 +20,8 @@ from fogros2.testing.launched import launching, ros2
 
 PAGE = Path(__file__).resolve().parents[3] / 'doc' / 'tutorial.md'
 FILE = 'first.launch.py'
+#: What ROS 2's set-up script and an activated environment leave in a terminal.
+SET_UP = re.compile(r'VIRTUAL_ENV|PATH|PYTHONPATH|LD_LIBRARY_PATH|(ROS|AMENT|COLCON|CMAKE)_.*')
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -42,13 +50,26 @@ class Tutorial:
         return [self.files[0] if word == f'./{FILE}' else word for word in shlex.split(line)[1:]]
 
 
+def activated(line: str, home: Path) -> dict[str, str]:
+    """Return the variables of a new terminal after the line that activates the environment."""
+    assert line == '. .venv/bin/activate'
+    fresh = {name: value for name, value in os.environ.items()
+             if not SET_UP.fullmatch(name) or name == 'ROS_DOMAIN_ID'}
+    printed = subprocess.run(
+        ['bash', '-c', f'. {shlex.quote(sys.prefix)}/bin/activate && env -0'],
+        capture_output=True, text=True, check=True, env={
+            **fresh, 'PATH': f'/usr/local/sbin:/usr/sbin:/sbin:{os.defpath}', 'HOME': str(home),
+            'ROS_LOG_DIR': str(home / 'log')}).stdout
+    return dict(line.partition('=')[::2] for line in printed.split('\0') if line)
+
+
 @pytest.fixture
 def tutorial(name: str, tmp_path: Path) -> Tutorial:
     return Tutorial(name, tmp_path)
 
 
 def test_a_machine_that_costs_nothing(tutorial, engine, tun, name, tmp_path):
-    environment = {**os.environ, 'HOME': str(tmp_path), 'ROS_LOG_DIR': str(tmp_path / 'log')}
+    environment = activated(tutorial.commands[1], tmp_path)
     with launching() as start:
         words = tutorial.words(f'ros2 launch ./{FILE}')
         run = start(*words[1:], environment=environment)
