@@ -62,7 +62,7 @@ class RefusedNode(Exception):
 def generate_launch_description() -> LaunchDescription:
     """Return a launch description that does what the agent says, until the agent goes."""
     if 'FOGROS2_AGENT_FD' not in os.environ:
-        # raised when launch executes it: an error while launch loads a file gets lines about syntax
+        # launch adds lines about syntax to an error that comes while it loads a file
         return LaunchDescription([OpaqueFunction(function=_refuse_start_by_hand)])
     fd = int(os.environ.pop('FOGROS2_AGENT_FD'))
     directory = os.environ.get('FOGROS2_AGENT_DIRECTORY')

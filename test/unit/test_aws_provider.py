@@ -192,8 +192,8 @@ def instance(state='running', **more):
             'fogros2-price-per-hour': '0.0416', 'fogros2-disk-gb': '30'}
     return {
         'InstanceId': 'i-0abc', 'State': {'Name': state}, 'InstanceType': 't3.medium',
-        'ImageId': 'ami-1', 'KeyName': 'fogros2-0123', 'PublicIpAddress': '198.51.100.9', 'PrivateIpAddress': '10.0.0.9',
-        'VpcId': 'vpc-1', 'LaunchTime': datetime.datetime(
+        'ImageId': 'ami-1', 'KeyName': 'fogros2-0123', 'PublicIpAddress': '198.51.100.9',
+        'PrivateIpAddress': '10.0.0.9', 'VpcId': 'vpc-1', 'LaunchTime': datetime.datetime(
             2026, 1, 1, tzinfo=datetime.timezone.utc),
         'Tags': instances.tag_list(tags), **more}
 
