@@ -148,6 +148,7 @@ setup(
             'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
+            'shell = ros2fog_cli.verb.shell:ShellVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
         ],
     },

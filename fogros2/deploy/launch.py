@@ -15,7 +15,7 @@ import threading
 import time
 from typing import Optional
 
-from fogros2 import containers, model, plan, plugin_system, process, workspace
+from fogros2 import containers, model, plan, plugin_system, process, ros2_daemon, workspace
 from fogros2 import shell as shells
 from fogros2.dds import DdsVendor
 from fogros2.deploy import routing
@@ -244,6 +244,8 @@ class Launch:
                 write_private(path.with_name('domain'), str(self.domain).encode())
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
                 robot.ensure()
+                # a node with the VPN's interface, as any: it ends before the interface
+                self.undo.callback(ros2_daemon.stop, path.parent)
                 self._route(vendor, path.parent)
                 self._robot_environment = dict(
                     vendor.environment(str(path), self.user_environment))

@@ -8,7 +8,7 @@ from pathlib import Path
 import shutil
 import threading
 
-from fogros2 import plugin_system, process
+from fogros2 import plugin_system, process, ros2_daemon
 from fogros2.errors import PrerequisiteError
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step
@@ -81,6 +81,7 @@ def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
     """
     if record.robot_vpn is not None and record.launch and not record.launch_alive:
         with step(report, record.name, 'VPN interface'):
+            ros2_daemon.stop(store.launch(record.launch))
             vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
             for command in vpn.down(record.robot_vpn):
                 process.run(command, timeout=Timeouts().vpn)

@@ -14,7 +14,7 @@ import shutil
 import time
 from typing import Optional
 
-from fogros2 import deploy, plugin_system, process
+from fogros2 import deploy, plugin_system, process, ros2_daemon
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.errors import (
@@ -287,6 +287,7 @@ def clear(leftover: Leftover) -> None:
     interface = VpnInterface(
         name, '127.0.0.1', '127.0.0.1/32', 0,
         helped.key_of(name) or str(leftover.folder / 'vpn.key'), guarded=True)
+    ros2_daemon.stop(leftover.folder)
     _take_down(interface, 'wireguard')
     shutil.rmtree(leftover.folder, ignore_errors=True)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
+import sys
 
 from ros2fog_cli.verb import add_json, add_name, VerbExtension
 
@@ -20,18 +20,17 @@ class EnvVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print lines for ``eval "$(ros2 fog env NAME)"``."""
-        from fogros2.errors import ConfigurationError
+        from fogros2 import ros2_daemon
         from fogros2.store import Store
-        from ros2fog_cli.api import reach
+        from ros2fog_cli.api import joining
         store = Store()
-        record = store.machine(args.name).load()
-        variables = reach.robot_environment(record, store)
-        if variables is None:
-            raise ConfigurationError(f"no launch is running with the machine '{args.name}'",
-                                     'its nodes can be joined while one is')
+        record, variables = joining.launch_of(args.name, store)
         if args.json:
             print(json.dumps(variables, indent=2))
             return 0
-        for name, value in sorted(variables.items()):
-            print(f'export {name}={shlex.quote(value)}')
+        programs = None
+        if joining.has_daemon():
+            # the launch stops its daemon at its end
+            programs = ros2_daemon.install(store.launch(record.launch), sys.executable)
+        print(*joining.exports(variables, programs), sep='\n')
         return 0

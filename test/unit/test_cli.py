@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 import dataclasses
 from decimal import Decimal
+import functools
 import json
 import os
 from pathlib import Path
@@ -23,7 +24,7 @@ from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
 from fogros2.testing.plugins import instead, MemoryProvider
-from ros2fog_cli.api import endings, machines, table
+from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -427,10 +428,66 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}', '42']
     assert run('env', 'a', '--json') == 0
     assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+    # ROS 2's own ros2 has a daemon, which gets a port of this launch
+    monkeypatch.setattr(joining, 'has_daemon', lambda: True)
+    assert run('env', 'a') == 0
+    shown = subprocess.run(['sh', '-c', f'{capsys.readouterr().out}\ncommand -v ros2'],
+                           capture_output=True, text=True, check=True).stdout.strip()
+    assert shown == str(path.parent / 'bin' / 'ros2')
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
     assert 'this terminal rmw_fastrtps_cpp' in str(run('env', 'a'))
     record('a', **dead())
     assert 'no launch is running' in str(run('env', 'a'))
+
+
+@pytest.mark.parametrize('daemon', [False, True])
+def test_shell_runs_a_command_in_the_launch(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, daemon: bool,
+) -> None:
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    monkeypatch.setattr(joining, 'has_daemon', lambda: daemon)
+    machine('a')
+    record('a', **alive())
+    assert 'no launch is running' in str(run('shell', 'a', '--', 'true'))
+    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
+        (Store().launch('abc123') / name).write_text(text)
+    script = 'echo "$ROS_DOMAIN_ID $RMW_IMPLEMENTATION"; command -v ros2; exit 5'
+    assert run('shell', 'a', '--', 'sh', '-c', script) == 5
+    first, where = capfd.readouterr().out.splitlines()
+    assert first == '42 rmw_cyclonedds_cpp'
+    # that of a shell is gone with it
+    assert ('fogros2-shell-' in where) is daemon and Path(where).exists() is not daemon
+    assert "'no-such-program' can not be run" in str(run('shell', 'a', '--', 'no-such-program'))
+    assert run('shell', 'a', '--', 'sh', '-c', 'kill -KILL $$') == 128 + 9
+
+
+def test_shell_is_the_users_own(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    machine('a')
+    record('a', **alive())
+    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
+        (Store().launch('abc123') / name).write_text(text)
+    shell = tmp_path / 'fish'
+    shell.write_text('#!/bin/sh\necho "$0 $# $ROS_DOMAIN_ID"\n')
+    shell.chmod(0o755)
+    monkeypatch.setenv('SHELL', str(shell))
+    assert run('shell', 'a') == 0
+    assert capfd.readouterr().out == f'{shell} 0 42\n'
+    # bash reads .bashrc, and what that sets of ours comes before
+    home = tmp_path / 'home'
+    home.mkdir()
+    (home / '.bashrc').write_text('export ROS_DOMAIN_ID=7 MINE=yes\n')
+    monkeypatch.setenv('HOME', str(home))
+    monkeypatch.setenv('SHELL', '/bin/bash')
+    typed = tmp_path / 'typed'
+    typed.write_text('echo "$MINE $ROS_DOMAIN_ID $PS1"; exit 4\n')
+    with typed.open() as keyboard:
+        monkeypatch.setattr(joining.subprocess, 'Popen', functools.partial(
+            subprocess.Popen, stdin=keyboard))
+        assert run('shell', 'a') == 4
+    assert capfd.readouterr().out.startswith('yes 42 (a) ')
 
 
 @pytest.mark.parametrize('verb', ['status', 'logs', 'connect', 'env', 'delete'])
@@ -477,13 +534,13 @@ def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 0
     said = capsys.readouterr().out
     for verb in ('connect', 'dashboard', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs',
-                 'price', 'regions', 'status'):
+                 'price', 'regions', 'shell', 'status'):
         assert verb in said
 
 
 @pytest.mark.parametrize('words', [
     [], ['connect'], ['dashboard'], ['delete'], ['doctor'], ['env'], ['gc'], ['image'], ['list'],
-    ['logs'], ['price'], ['regions'], ['status']], ids=' '.join)
+    ['logs'], ['price'], ['regions'], ['shell'], ['status']], ids=' '.join)
 def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
     # beside what ros2cli loads for a command of its own
     code = ('import sys\nfrom ros2cli.cli import main\n'

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Terminals on this computer that join the launch of a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import importlib.util
+import os
+from pathlib import Path
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+from typing import Optional
+
+from fogros2 import ros2_daemon
+from fogros2.errors import ConfigurationError
+from fogros2.store import Record, Store
+from ros2fog_cli.api import reach
+
+
+def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
+    """
+    Return the record of a machine, and the variables of its launch.
+
+    :raises ConfigurationError: no launch is running with it.
+    """
+    record = store.machine(name).load()
+    variables = reach.robot_environment(record, store)
+    if variables is None:
+        raise ConfigurationError(f"no launch is running with the machine '{name}'",
+                                 'its nodes can be joined while one is')
+    return record, variables
+
+
+def has_daemon() -> bool:
+    """Return whether ``ros2`` here starts a daemon; that of the embedded default does not."""
+    return importlib.util.find_spec('ros2cli.daemon') is not None
+
+
+def exports(variables: Mapping[str, str], programs: Optional[Path]) -> list[str]:
+    """
+    Return lines for a POSIX shell.
+
+    :param programs: folder to put first into PATH, None for none.
+    """
+    lines = [f'export {name}={shlex.quote(value)}' for name, value in sorted(variables.items())]
+    if programs is not None:
+        lines.append(f'export PATH={shlex.quote(str(programs))}:"$PATH"')
+    return lines
+
+
+def run(name: str, words: Sequence[str] = ()) -> int:
+    """
+    Run a command, or the user's shell, in this terminal and in the launch; return its status.
+
+    Its daemon ends with it.
+
+    :raises ConfigurationError: no launch is running with the machine.
+    """
+    _, variables = launch_of(name, Store())
+    with tempfile.TemporaryDirectory(prefix='fogros2-shell-') as folder:
+        programs = ros2_daemon.install(Path(folder), sys.executable) if has_daemon() else None
+        path = os.environ.get('PATH', os.defpath)
+        environment = {**os.environ, **variables,
+                       'PATH': f'{programs}:{path}' if programs else path}
+        try:
+            return _wait(list(words) or _shell(name, Path(folder), exports(variables, programs)),
+                         environment)
+        finally:
+            ros2_daemon.stop(Path(folder))
+
+
+def _shell(name: str, folder: Path, lines: Sequence[str]) -> list[str]:
+    """Return the command line of the user's shell."""
+    shell = os.environ.get('SHELL') or '/bin/sh'
+    if Path(shell).name != 'bash':
+        return [shell]
+    # what .bashrc sets of the same variables comes before ours
+    start = folder / 'bashrc'
+    start.write_text('\n'.join(
+        ['[ ! -f ~/.bashrc ] || . ~/.bashrc', *lines, f'PS1="({shlex.quote(name)}) $PS1"', '']))
+    return [shell, '--rcfile', str(start), '-i']
+
+
+def _wait(words: list[str], environment: Mapping[str, str]) -> int:
+    """Run a command to its end; Ctrl-C is for the command, a closed terminal for both."""
+    def leave(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    try:
+        child = subprocess.Popen(words, env=dict(environment))
+    except OSError as error:
+        raise ConfigurationError(f"'{words[0]}' can not be run: {error.strerror}",
+                                 'name a program of this computer after --') from error
+    before = {number: signal.signal(number, what) for number, what in (
+        (signal.SIGINT, signal.SIG_IGN), (signal.SIGHUP, leave), (signal.SIGTERM, leave))}
+    try:
+        status = child.wait()
+    except SystemExit:
+        child.terminate()
+        child.wait()
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return status if status >= 0 else 128 - status
