@@ -9,8 +9,8 @@ there as it took the paper's robot: the ratio of the paper's own times of comput
 speed-up can come near that ratio, and what it lacks is the network's.
 
 ``--short`` takes few trials and is done in three minutes; ``--only`` measures some scenarios and
-leaves the other rows as they are. With an account at AWS, the lines that
-are printed last run the same applications there.
+leaves the other rows as they are; ``--ompl-app`` adds two problems of OMPL.app. With an account at
+AWS, the lines that are printed last run the same applications there.
 """
 
 from __future__ import annotations
@@ -94,11 +94,27 @@ SCENARIOS = [
              ('seed:=3', 'workers:=2', 'time:=900.0'), ('environment:=cubicles',), 2,
              ready="environment '", trials=10, held_trials=10),
 ]
+#: Problems of OMPL.app that are in the paper as well, each with the seed of its first search. The
+#: robot needs 46 times as long as the cloud: with these seeds it plans in minutes.
+APP_PROBLEMS = {'Home': 27, 'Twistycool': 7}
 #: Bytes of an answer with grasps, and what headers of WireGuard, UDP and DDS add to each byte.
 ANSWER, PACKETS = 4000, 1.08
+#: How the tables were made.
+NOTE = ('the link carries 10 Mbit/s; the cloud is a container with all cores, the robot is held '
+        'to as much less as "ratio of compute" says.')
 #: What the codecs are called in the paper.
 NAMES = {'': '', 'raw': 'raw', 'png': 'compressed (PNG)', 'jpeg': 'compressed (JPEG)',
          'h264': 'H.264', 'grey': 'H.264, grey'}
+
+
+def app_scenarios(folder: Path) -> list[Scenario]:
+    """Return the scenarios of OMPL.app's problems, whose files are in ``folder``."""
+    like = next(scenario for scenario in SCENARIOS if scenario.table == 'IV')
+    return [dataclasses.replace(
+        like, name=f'motion planning: {name}', trials=2, held_trials=2,
+        parameters=(f'seed:={seed}', 'workers:=2', 'time:=900.0'),
+        asks=(f'environment:={folder / name}.cfg',))
+        for name, seed in APP_PROBLEMS.items()]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,6 +129,7 @@ class Result:
     :param limit: what the network's part takes at the least: the bytes at the link's rate, the
         codec and the hops, each measured alone; 0 where it goes on beside the computing.
     :param errors: of trajectories; None where there are none.
+    :param computer: that it was measured on.
     """
 
     scenario: str
@@ -130,6 +147,7 @@ class Result:
     trials: int
     held_trials: int
     errors: Optional[Errors] = None
+    computer: str = ''
 
 
 # --- the robot ----------------------------------------------------------------------------------
@@ -394,7 +412,7 @@ def table(results: Sequence[Result], note: str) -> str:
     lines = ['# Applications on the robot alone, and with the cloud', '', note]
     for name, title in (('II', 'Visual SLAM, s a frame'),
                         ('III', 'Grasp planning, s a grasp; H.264 for depth is FFV1, lossless'),
-                        ('IV', 'Motion planning, s a plan')):
+                        ('IV', 'Motion planning, s a plan; the paper: one of its scenarios')):
         rows = [r for r in results if r.table == name]
         if not rows:
             continue
@@ -444,9 +462,22 @@ def before() -> Iterator[Result]:
     from trajectories import Errors
 
     path = RESULTS / 'applications-table.json'
-    for row in json.loads(path.read_text())['rows'] if path.exists() else []:
+    written = json.loads(path.read_text()) if path.exists() else {'note': '', 'rows': []}
+    for row in written['rows']:
         errors = row.pop('errors')
+        # all rows were of one computer before each said which
+        row.setdefault('computer', written['note'].partition(';')[0])
         yield Result(**row, errors=errors and Errors(**errors))
+
+
+def computers(results: Sequence[Result]) -> str:
+    """Return the computers that rows were measured on, and if there are several, which rows."""
+    found: dict[str, dict[str, None]] = {}
+    for result in results:
+        found.setdefault(result.computer, {})[result.scenario] = None
+    if len(found) == 1:
+        return next(iter(found))
+    return '; '.join(f"{', '.join(names)}: {computer}" for computer, names in found.items())
 
 
 def others() -> Iterator[Callable[..., Sequence[Result]]]:
@@ -460,7 +491,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--short', action='store_true')
     parser.add_argument('--only', default='', help='scenarios whose name has this in it')
+    parser.add_argument('--ompl-app', type=Path, metavar='FOLDER',
+                        help="of OMPL.app's Home.cfg, Twistycool.cfg and their meshes")
     arguments = parser.parse_args()
+    scenarios = SCENARIOS + (app_scenarios(arguments.ompl_app) if arguments.ompl_app else [])
     from figures import machine as computer
     from figures import RESULTS, write
     from streaming import Link
@@ -478,7 +512,7 @@ def main() -> None:
         machine = launch.up(MachineSpec(f'bench-applications-{os.getpid()}', 'container'))
         prepare(machine)
         link = Link(launch, machine)
-        for scenario in SCENARIOS:
+        for scenario in scenarios:
             if arguments.only in scenario.name and not (
                     arguments.short and scenario.name.endswith('Apartment')):
                 for result in measured(scenario, arguments.short, launch, machine, link):
@@ -491,19 +525,20 @@ def main() -> None:
             link.close()
         for error in launch.down():
             print(error, file=sys.stderr)
-    note = (f'{computer()}; the link carries 10 Mbit/s; the cloud is a container with all cores, '
-            'the robot is held to as much less as "ratio of compute" says.')
-    text = table(results, note)
+    text = table(results, f'{computer()}; {NOTE}')
     print(text)
     print(f'took {(time.monotonic() - begin) / 60:.1f} min\n')
     for name in ('slam', 'grasp', 'planning'):
         print(f'ros2 launch fogros2_examples {name}.launch.py machine:=aws')
     if not arguments.short:
         measured_now = {result.scenario for result in results}
+        results = [dataclasses.replace(one, computer=computer()) for one in results]
         results += [one for one in before() if one.scenario not in measured_now]
         results.sort(key=lambda one: one.table)
+        note = f'{computers(results)}; {NOTE}'
         text = table(results, note)
-        write('applications', 'Applications with the cloud', list(rows(results)))
+        write('applications', 'Applications with the cloud', list(rows(results)),
+              computer=computers(results))
         (RESULTS / 'applications-table.md').write_text(text)
         (RESULTS / 'applications-table.json').write_text(json.dumps(
             {'note': note, 'rows': [dataclasses.asdict(r) for r in results]}, indent=1) + '\n')

@@ -73,13 +73,20 @@ def machine() -> str:
             f'Python {platform.python_version()}')
 
 
-def write(name: str, title: str, rows: Sequence[Row], results: Path = RESULTS) -> None:
-    """Write the figures as JSON, Markdown and a plot, and print the table."""
+def write(
+    name: str, title: str, rows: Sequence[Row], results: Path = RESULTS, computer: str = '',
+) -> None:
+    """
+    Write the figures as JSON, Markdown and a plot, and print the table.
+
+    :param computer: that the rows were measured on, '' for this one.
+    """
     results.mkdir(parents=True, exist_ok=True)
     date = datetime.date.today().isoformat()
-    data = {'machine': machine(), 'date': date, 'rows': [dataclasses.asdict(r) for r in rows]}
+    computer = computer or machine()
+    data = {'machine': computer, 'date': date, 'rows': [dataclasses.asdict(r) for r in rows]}
     (results / f'{name}.json').write_text(json.dumps(data, indent=1) + '\n')
-    text = markdown(title, rows, f'{machine()}; {date}')
+    text = markdown(title, rows, f'{computer}; {date}')
     (results / f'{name}.md').write_text(text)
     print(text)
     plot(results / f'{name}.png', title, rows)
