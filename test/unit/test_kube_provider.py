@@ -23,6 +23,7 @@ from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.kubernetes import (
     boot,
+    container_of,
     exposure,
     hints,
     kind_of,
@@ -194,6 +195,7 @@ def test_options_reach_the_pod():
     assert pod['imagePullSecrets'] == [{'name': 'registry'}]
     assert pod['serviceAccountName'] == 'machines'
     assert kind_of(job) == '2 amd.com/gpu, 1500m cpu, 2048Mi memory, slam:1'
+    assert container_of(job)['image'].endswith('/slam:1')
 
 
 def test_a_zone_that_the_cluster_lacks_keeps_nothing_from_running():

@@ -425,6 +425,15 @@ def test_a_machine_cannot_lead_the_robot_elsewhere_by_its_host_key(tmp_path, mon
     assert provider._host_key(engine, entry) == 'ssh-ed25519 AAAA+/='
 
 
+@pytest.mark.parametrize('image', ['docker.io/library/ros:jazzy', ''])
+def test_machine_has_the_image_of_its_container(image):
+    entry = {'Id': 'c' * 64, 'Created': '2026-01-01T00:00:00Z', 'State': {'Status': 'running'},
+             'NetworkSettings': {'Networks': {}}, 'Config': {'Image': image, 'Labels': {
+                 container_machine.ATTEMPT: 'token', container_machine.MACHINE: 'planner'}}}
+    made = container_machine.machine_of(container_engine.named('podman'), entry, None)
+    assert (made.name, made.image, made.key, made.disk_gb) == ('planner', image, '', None)
+
+
 def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
     def run(command, *, cancel=None, **more):
         if 'create' in command.argv:
