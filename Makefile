@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning test test-fast test-kubernetes test-minimum lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning cloud-check test test-fast test-kubernetes test-minimum lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -18,6 +18,11 @@ demo-video:
 demo-slam demo-grasp demo-planning: demo-%:
 	@tools/setup.sh bench
 	@tools/run.sh best -- ros2 launch fogros2_examples $*.launch.py picture:=$(CURDIR)/.cache/$*.png
+
+## cloud-check   PROVIDER=aws|kubernetes: the talker on the smallest machine of your own account
+cloud-check:
+	@tools/setup.sh cloud
+	@tools/run.sh best -- python tools/cloud_check.py $(PROVIDER) $(if $(OPTIONS),--options '$(OPTIONS)')
 
 ## test   all tests, on the embedded default and, where it is installed, on ROS 2
 test:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Makes this computer ready for `make demo`, `make test` or `make lint`, and says what it does.
 #
-#   tools/setup.sh demo|test|lint|bench
+#   tools/setup.sh demo|cloud|test|lint|bench
 #
 # Touches two things: system packages, through apt and only those that are missing, and a virtual
 # environment in this folder (.venv; .venv-ros on top of ROS 2 Jazzy where that is installed).
@@ -80,7 +80,7 @@ LIST
         have chromium || have google-chrome || ! known chromium || echo chromium
     fi
     # FFmpeg's own programs judge the streams that ours make
-    [ "$target" = demo ] || have ffmpeg || echo ffmpeg
+    case $target in demo|cloud) ;; *) have ffmpeg || echo ffmpeg ;; esac
     # Podman's networks: netavark since 4.0, the CNI plugins before; its package may bring neither.
     if ! [ -x /usr/lib/podman/netavark ] && ! [ -x /usr/libexec/podman/netavark ] \
             && ! [ -x /usr/lib/cni/bridge ] && ! [ -x /usr/libexec/cni/bridge ]; then
@@ -198,6 +198,7 @@ pip_in() {
 # What goes in beside the package itself; each includes the one before.
 case $target in
     demo) extras=none ;;
+    cloud) extras=aws,kubernetes ;;
     bench) extras=test,bench ;;
     *) extras=test ;;
 esac
@@ -205,6 +206,7 @@ esac
 enough() {
     case "$1 $extras" in
         'none none'|'test none'|'test,bench '*|'test test') return 0 ;;
+        'aws,kubernetes none'|'aws,kubernetes aws,kubernetes'|'test aws,kubernetes') return 0 ;;
         *) return 1 ;;
     esac
 }
