@@ -21,6 +21,7 @@ import shlex
 import threading
 from typing import Literal, Optional
 
+from fogros2 import dependencies as needs
 from fogros2 import host, process
 from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
@@ -125,14 +126,15 @@ def dependencies(spec: MachineSpec, under: Underlay) -> str:
     embedded = any(
         next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
         for prefix in under.prefixes)
-    needs = {
+    wanted = {
         'distro': under.environment.get('ROS_DISTRO') or DISTRO,
         'bootstrap': spec.bootstrap,
         'kind': 'embedded' if embedded else 'ros',
         'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
         'workspace': workspaces.dependencies(spec.workspace) if spec.workspace else [],
+        'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
     }
-    return hashlib.sha256(json.dumps(needs, sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def ensure(
@@ -172,6 +174,10 @@ def ensure(
                 f"what '{spec.name}' lacks can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, workspace)
+    pip = needs.PipFolder.of(spec, facts)
+    if spec.pip:
+        todo = dataclasses.replace(todo, install=dataclasses.replace(
+            todo.install, environment=pip.found_by(todo.install.environment)))
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
     on_plan(todo.install)
@@ -180,9 +186,15 @@ def ensure(
                   timeout=timeout, cancel=cancel)
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
-    for command in todo.commands:
+    more = []
+    if spec.apt and todo.mode != 'apt':
+        lacking = shell.run(needs.missing(spec.apt), timeout=timeout, cancel=cancel).stdout.split()
+        more += _apt_wanted(spec, facts, lacking)
+    if spec.pip and pip.done not in facts.installed:
+        more.append(pip.fill(todo.install.environment, spec.environment, todo.install.setup))
+    for command in (*todo.commands, *more):
         shell.run(command, timeout=timeout, cancel=cancel)
-    return todo.install, todo.note
+    return todo.install, ', '.join([todo.note, *(command.what for command in more)])
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:
@@ -276,7 +288,7 @@ def plan(
             'make room there' if 'are free' in no_embedded else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
-        todo = _apt(facts, wheels, workspace, under.rmw)
+        todo = _apt(facts, wheels, workspace, (*apt_packages(under.rmw), *spec.apt))
     else:
         reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
         raise PrerequisiteError(
@@ -335,6 +347,21 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
     if not packages:
         return ()
     return (_apt_install(packages, f"install {', '.join(packages)}"),)
+
+
+def _apt_wanted(spec: MachineSpec, facts: HostFacts, lacking: Sequence[str]) -> list[Command]:
+    """
+    Return what installs the Debian packages that a launch file names.
+
+    :raises PrerequisiteError: nothing may be installed there, or not by this user.
+    """
+    if not lacking:
+        return []
+    if spec.bootstrap == 'none' or not facts.root or 'apt-get' not in facts.programs:
+        raise PrerequisiteError(
+            f"machine '{spec.name}' lacks the packages {', '.join(lacking)} of apt=",
+            f"on the machine: apt-get install {' '.join(lacking)}")
+    return [_apt_install(lacking, f"install {', '.join(lacking)}")]
 
 
 def _why_not_embedded(
@@ -453,11 +480,11 @@ def _ros(
 
 def _apt(
     facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
-    rmw: str,
+    packages: Sequence[str],
 ) -> Preparation:
-    """Return what installs ROS 2's packages, then adds this one."""
+    """Return what installs ROS 2's packages and the user's, then adds this one."""
     ours = _ros(facts, wheels, workspace)
-    commands = [_apt_install(apt_packages(rmw), f'install ROS 2 {DISTRO}')]
+    commands = [_apt_install(packages, f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
         commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
     return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))

@@ -52,6 +52,7 @@ class MachineSpec:
     :param on_interrupt: when the provider takes the machine away while its nodes run: end the
         launch, or run the nodes on the robot.
     :param monitor_allow: networks (CIDR) that reach its bridge to Foxglove besides the robot.
+    :param apt: Debian packages that it has to have, ``pip`` Python packages as pip takes them.
     """
 
     name: str
@@ -68,6 +69,8 @@ class MachineSpec:
     vpn: str = 'wireguard'
     on_interrupt: OnInterrupt = 'shutdown'
     monitor_allow: tuple[str, ...] = ()
+    apt: tuple[str, ...] = ()
+    pip: tuple[str, ...] = ()
 
     @property
     def monitored(self) -> bool:

@@ -104,7 +104,9 @@ for name, names, oldest, package in json.loads(sys.argv[1]):
 libc = ' '.join(platform.libc_ver())
 print(json.dumps([sys.version_info[:2], platform.machine(), libc, missing]))
 """
-_INSTALL = """\
+#: Makes an empty folder, and ``"$@"`` the words that run pip, with the nodes' own Python.
+PIP = """\
+set -e
 mkdir -p {folder}
 cd {folder}
 rm -rf site
@@ -114,8 +116,7 @@ else
     python3 -m venv --clear pip
     set -- pip/bin/python -m pip
 fi
-"$@" install --quiet --no-deps --no-compile --disable-pip-version-check --target site {names}
-rm -rf pip
+set -- "$@" install --quiet --no-compile --disable-pip-version-check --target site
 """
 
 
@@ -183,7 +184,7 @@ def ask(
     words = ['python3', '-c', _ASK, json.dumps([
         (name, MODULES[name].distributions, MODULES[name].oldest, MODULES[name].replaced_by)
         for name in names])]
-    return _among_nodes(
+    return among_nodes(
         environment, setup, f'{_path([site]) if site else ""}exec {shlex.join(words)}',
         'look for Python modules')
 
@@ -262,8 +263,9 @@ def install(
 ) -> Command:
     """Return what installs them from the machine's index, into ``target``/site."""
     names = [MODULES[name].requirement for name in missing]
-    return _among_nodes(environment, setup, 'set -e\n' + _INSTALL.format(
-        folder=shlex.quote(target), names=shlex.join(names)), 'install Python modules')
+    return among_nodes(environment, setup, PIP.format(folder=shlex.quote(target)) +
+                       f'"$@" --no-deps {shlex.join(names)}\nrm -rf pip\n',
+                       'install Python modules')
 
 
 def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:
@@ -286,7 +288,7 @@ def _path(sites: Iterable[str]) -> str:
     return f'export PYTHONPATH={path}${{PYTHONPATH:+:$PYTHONPATH}}\n'
 
 
-def _among_nodes(
+def among_nodes(
     environment: Mapping[str, str], setup: Sequence[str], script: str, what: str,
 ) -> Command:
     """Return a command that runs a script as nodes run; a workspace may not be there yet."""

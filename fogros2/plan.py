@@ -34,6 +34,17 @@ PLAIN_VARIABLES = (
     'RCUTILS_CONSOLE_OUTPUT_FORMAT')
 
 
+def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
+    """
+    Return variables with a user's on top; lists of folders come before those that are there.
+
+    :param base: what nodes need, ``given`` what a launch file says.
+    """
+    longer = {name: os.pathsep.join(filter(None, [given[name], base[name]]))
+              for name in _PATH_VARIABLES if name in given and name in base}
+    return {**base, **given, **longer}
+
+
 def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
     """
     Return the RMW of all nodes of the launch: the user's, or Cyclone's.

@@ -9,9 +9,10 @@ import difflib
 import inspect
 import os
 import re
+import shlex
 from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
-from fogros2 import containers
+from fogros2 import containers, dependencies
 from fogros2.actions import names, networks, words
 from fogros2.errors import ConfigurationError
 from fogros2.model import (
@@ -58,7 +59,11 @@ class CloudInstance:
     :param robot_timeout: how long the launch may be silent before the machine stops its nodes;
         seconds or as above.
     :param bootstrap: how ROS 2 gets there: 'auto', 'apt', 'embedded', 'none'.
-    :param environment: variables for every node on the machine.
+    :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
+        of folders come before the machine's own.
+    :param apt: Debian packages that the machine has to have, such as 'libzbar0'.
+    :param pip: Python packages that it has to have, as pip takes them ('pyzbar>=0.1.9'). They lie
+        behind the system's own: a package that both have is the system's.
     :param on_interrupt: when the provider takes the machine away while its nodes run: 'shutdown'
         ends the launch, with an exit status other than zero; 'robot' starts them anew on the
         robot, which has to have their programs: with the same names and parameters, without
@@ -84,6 +89,8 @@ class CloudInstance:
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         on_interrupt: SomeSubstitutionsType = 'shutdown',
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
+        apt: Optional[Sequence[SomeSubstitutionsType]] = None,
+        pip: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -106,6 +113,7 @@ class CloudInstance:
         self._foxglove = launch_foxglove
         self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
+        self._packages = {'apt': _packages('apt', apt), 'pip': _packages('pip', pip)}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # what is plain is checked where it is written
@@ -182,6 +190,24 @@ class CloudInstance:
             'vpn_ip': self.vpn_ip,
         }
 
+    def apt_install(self, args: str) -> None:
+        """
+        Have the machine install Debian packages before its nodes start, as ``apt=`` does.
+
+        :param args: their names, with spaces between them.
+        :raises ConfigurationError: one is no package's name.
+        """
+        self._packages['apt'] += _packages('apt', shlex.split(args))
+
+    def pip_install(self, args: str) -> None:
+        """
+        Have the machine install Python packages before its nodes start, as ``pip=`` does.
+
+        :param args: requirements, with spaces between them.
+        :raises ConfigurationError: one is no requirement, or is part of FogROS2.
+        """
+        self._packages['pip'] += _packages('pip', shlex.split(args))
+
     def add_docker_container(
         self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
     ) -> None:
@@ -253,8 +279,14 @@ class CloudInstance:
                 launch_foxglove=self._resolved(
                     context, 'launch_foxglove', words.Truth(self._foxglove)),
                 monitor_allow=networks.resolve(context, self._monitor_allow),
+                apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
                 **values)
         return self._spec
+
+    def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
+        values = [value for some in self._packages[program]
+                  for value in words.resolve(context, some)]
+        return tuple(dict.fromkeys(_PACKAGE_CHECKS[program](value) for value in values))
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with _named(keyword):
@@ -398,6 +430,25 @@ def _choice(kind: Any) -> Any:
                 f"use one of {', '.join(get_args(kind))}")
         return cast(str, value)
     return check
+
+
+_PACKAGE_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
+
+
+def _packages(program: str, values: Any) -> list[Union[words.Items, words.Listed]]:
+    """
+    Return what ``apt=`` or ``pip=`` takes, each checked as far as it is known.
+
+    :raises ConfigurationError: it is no list of packages.
+    """
+    if isinstance(values, str):
+        raise ConfigurationError(f'{program}={values!r} is no list',
+                                 f'{program}=[{values!r}]')
+    found = words.items(values)
+    for value in found if isinstance(found, words.Items) else ():
+        if isinstance(value, str):
+            _PACKAGE_CHECKS[program](value)
+    return [] if found is None else [found]
 
 
 _CHECKS: dict[str, Any] = {

@@ -10,7 +10,7 @@ import sys
 import threading
 from typing import Optional
 
-from fogros2 import bootstrap, modules
+from fogros2 import bootstrap, modules, plan
 from fogros2.deploy.job import Job
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, NodeSpec
@@ -31,7 +31,7 @@ class Equipment:
     def __init__(self, job: Job, shell: Shell, ros: bootstrap.RosInstall) -> None:
         self._job = job
         self._shell = shell
-        self._environment = {**ros.environment, **job.spec.environment}
+        self._environment = plan.extended(ros.environment, job.spec.environment)
         self._setup = ros.setup
         self._home = ros.facts.home
         self._lock = threading.Lock()

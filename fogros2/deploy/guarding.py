@@ -190,7 +190,7 @@ class Guard:
                            'peer': robot.address},
                 environment={
                     'FOGROS2_VPN_ADDRESS': interface.address,
-                    **ros.environment, **dds, **job.spec.environment},
+                    **plan.extended({**ros.environment, **dds}, job.spec.environment)},
                 setup=list(ros.setup), ros_command=list(ros.command))
         except AgentError as error:
             if 'in use' in str(error):

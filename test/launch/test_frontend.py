@@ -172,7 +172,9 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'truth': ('true'
             'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'name': 'planner'}
-LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1'])}
+LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
+         'apt': ('libzbar0, g++', ['libzbar0', 'g++']),
+         'pip': ('pyzbar==0.1.9, qrcode', ['pyzbar==0.1.9', 'qrcode'])}
 
 
 @pytest.mark.parametrize('provider', sorted(CLASSES))

@@ -87,7 +87,7 @@ def test_substitutions_are_resolved_when_executed(context):
      "ContainerInstance has no attribute 'imge' (did you mean 'image'?)"),
     (lambda: ContainerInstance(lifetme=3), "did you mean 'lifetime'?"),
     (lambda: SSHInstance('host', hostkey='k'), "did you mean 'host_key'?"),
-    (lambda: ContainerInstance(zzz=1), 'there are: bootstrap, containers, cpus, devices'),
+    (lambda: ContainerInstance(zzz=1), 'there are: apt, bootstrap, containers, cpus'),
     (lambda: ContainerInstance(name='two words'), "'two words' is no name for a machine"),
     (lambda: ContainerInstance(name='$(reboot)'), 'is no name for a machine'),
     (lambda: ContainerInstance(name='x' * 41), 'is no name for a machine'),
@@ -98,11 +98,27 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
     (lambda: ContainerInstance(robot_timeout=0), 'is no duration'),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
+    (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
+    (lambda: ContainerInstance(apt=['libzbar0 -y']), 'no name of a Debian package'),
+    (lambda: ContainerInstance(pip=['fogros2']), "'fogros2' is part of FogROS2"),
+    (lambda: ContainerInstance().apt_install('--yes x'), 'no name of a Debian package'),
+    (lambda: ContainerInstance().pip_install('-r all.txt'), 'names no Python package'),
 ])
 def test_mistakes_are_found_where_they_are_written(make, message):
     with pytest.raises(ConfigurationError) as caught:
         make()
     assert message in str(caught.value)
+
+
+def test_packages_of_fogros2s_methods_are_the_keywords(context):
+    from launch.substitutions import TextSubstitution
+    machine = ContainerInstance(
+        apt=['libzbar0', TextSubstitution(text='g++')], pip=['pyzbar>=0.1'])
+    machine.apt_install('ffmpeg libzbar0')
+    machine.pip_install("'qrcode>=7,<8' pyzbar")
+    spec = machine.spec(context)
+    assert spec.apt == ('libzbar0', 'g++', 'ffmpeg')
+    assert spec.pip == ('pyzbar>=0.1', 'qrcode>=7,<8', 'pyzbar')
 
 
 def test_mistakes_in_substitutions(context):

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""apt and pip packages on a container machine, from a repository and a folder of this test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+import hashlib
+from pathlib import Path
+import shutil
+import time
+import uuid
+import zipfile
+
+import pytest
+
+from fogros2.deploy import Launch
+from fogros2.errors import CommandError
+from fogros2.model import Command, MachineSpec, NodeSpec
+from fogros2.process import run
+from fogros2.report import StepDone
+from fogros2.waiting import wait_until
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+    pytest.mark.skipif(shutil.which('dpkg-deb') is None, reason='needs dpkg'),
+]
+
+#: What apt reads in place of this computer's own sources.
+APT = 'Dir::Etc::sourcelist "/fogt/sources.list";\nDir::Etc::sourceparts "-";\n'
+#: What the node says of the packages, and of a variable that it needs besides.
+NODE = ('import fogt_one, os, shutil; '
+        'print(fogt_one.name, shutil.which("fogt-hello"), os.environ["PYTHONPATH"], flush=True)')
+
+
+@pytest.fixture(scope='module')
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a folder with a Debian package, apt's list of it, and a wheel."""
+    folder = tmp_path_factory.mktemp('packages')
+    folder.chmod(0o755)
+    tree = folder / 'tree'
+    (tree / 'DEBIAN').mkdir(parents=True)
+    (tree / 'usr/bin').mkdir(parents=True)
+    control = ('Package: fogt-hello\nVersion: 1\nArchitecture: all\n'
+               'Maintainer: A <a@example.com>\nDescription: for a test\n')
+    (tree / 'DEBIAN/control').write_text(control)
+    (tree / 'usr/bin/fogt-hello').write_text('#!/bin/sh\n')
+    (tree / 'usr/bin/fogt-hello').chmod(0o755)
+    deb = folder / 'fogt-hello.deb'
+    run(Command(('dpkg-deb', '--root-owner-group', '--build', str(tree), str(deb))), timeout=30.0)
+    data = deb.read_bytes()
+    (folder / 'Packages').write_text(
+        f'{control}Filename: ./{deb.name}\nSize: {len(data)}\n'
+        f'SHA256: {hashlib.sha256(data).hexdigest()}\n')
+    (folder / 'sources.list').write_text('deb [trusted=yes] file:/fogt ./\n')
+    (folder / 'apt.conf').write_text(APT)
+    with zipfile.ZipFile(folder / 'fogt_one-1-py3-none-any.whl', 'w') as archive:
+        archive.writestr('fogt_one.py', 'name = "from-pip"')
+        archive.writestr('fogt_one-1.dist-info/METADATA',
+                         'Metadata-Version: 2.1\nName: fogt-one\nVersion: 1\n')
+        archive.writestr('fogt_one-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
+                         'Root-Is-Purelib: true\nTag: py3-none-any\n')
+        archive.writestr('fogt_one-1.dist-info/RECORD', '')
+    yield folder
+
+
+@pytest.fixture
+def spec(cloud_network: str, packages: Path) -> MachineSpec:
+    return MachineSpec(
+        f'needs-{uuid.uuid4().hex[:6]}', 'container', {
+            'network': cloud_network,
+            'mounts': [f'{packages}:/fogt', f'{packages}/apt.conf:/etc/apt/apt.conf.d/99fogt']},
+        environment={'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': '/fogt', 'PYTHONPATH': '/mine'},
+        apt=('fogt-hello',), pip=('fogt-one',))
+
+
+def said(machine) -> str:
+    """Run the node; return what it printed."""
+    heard = []
+    machine.subscribe(heard.append)
+    node = NodeSpec(f'n-{time.monotonic_ns()}', 'node', arguments=('python3', '-c', NODE))
+    machine.start([node])
+    wait_until(lambda: any(e['event'] == 'exited' and e['node'] == node.id for e in heard),
+               timeout=30, what='the node to end')
+    return ' '.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == node.id)
+
+
+def test_node_finds_what_its_machine_was_asked_for(spec):
+    events = []
+    launch = Launch(report=events.append)
+    try:
+        name, program, path = said(launch.up(spec)).split()
+        assert name == 'from-pip' and program == '/usr/bin/fogt-hello'
+        # the user's folder comes first, and takes nothing away
+        assert path.startswith('/mine:') and path.endswith('/last')
+    finally:
+        assert launch.down() == []
+    (detail,) = [e.detail for e in events if isinstance(e, StepDone) and e.step == 'ROS 2']
+    assert 'install fogt-hello' in detail and 'install Python packages' in detail
+
+
+def test_package_that_does_not_exist_is_named(spec):
+    launch = Launch()
+    with pytest.raises(CommandError, match='fogt-none'):
+        launch.up(dataclasses.replace(spec, apt=('fogt-none',)))
+    assert launch.down() == []

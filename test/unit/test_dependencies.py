@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""apt and pip packages that a launch file names for a machine: checked, missing, installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+from fogros2 import bootstrap, dependencies, plan
+from fogros2.dependencies import PipFolder
+from fogros2.errors import ConfigurationError
+from fogros2.host import HostFacts
+from fogros2.model import MachineSpec
+
+RUNS_PIP = pytest.mark.skipif(
+    importlib.util.find_spec('pip') is None, reason='needs pip in this environment')
+
+
+@pytest.mark.parametrize('name', ['libzbar0', 'g++', 'ros-jazzy-slam-toolbox', 'libc6:arm64',
+                                  'ffmpeg=7:5.1.6-0+deb12u1'])
+def test_names_of_debian_packages_are_taken(name: str) -> None:
+    assert dependencies.check_apt(name) == name
+
+
+@pytest.mark.parametrize('name', ['', '-y', 'Zbar', 'a b', 'a;reboot', '$(reboot)', 'x='])
+def test_what_is_no_debian_package_is_refused(name: str) -> None:
+    with pytest.raises(ConfigurationError, match='no name of a Debian package'):
+        dependencies.check_apt(name)
+
+
+@pytest.mark.parametrize('requirement', [
+    'pyzbar', 'pyzbar>=0.1.9', 'pyzbar[scripts]==0.1.9', 'a.b_c ~= 2.0 ; python_version < "3.13"',
+    'pyzbar @ https://example.com/pyzbar-1-py3-none-any.whl'])
+def test_requirements_are_taken(requirement: str) -> None:
+    assert dependencies.check_pip(requirement) == requirement
+
+
+@pytest.mark.parametrize('requirement', [
+    '', '-r file', '--index-url=https://example.com', '/tmp/x.whl', 'https://example.com/x.whl'])
+def test_what_is_no_requirement_is_refused(requirement: str) -> None:
+    with pytest.raises(ConfigurationError, match='names no Python package'):
+        dependencies.check_pip(requirement)
+
+
+@pytest.mark.parametrize('requirement', ['fogros2', 'FogROS2[aws]', 'ros2_embedded==9',
+                                         'image.transport.h264 @ https://example.com/x.whl'])
+def test_package_named_like_ours_is_refused(requirement: str) -> None:
+    with pytest.raises(ConfigurationError, match='is part of FogROS2'):
+        dependencies.check_pip(requirement)
+
+
+@pytest.mark.skipif(shutil.which('dpkg-query') is None, reason='needs dpkg')
+def test_missing_debian_packages_are_found() -> None:
+    version = subprocess.run(['dpkg-query', '-W', '-f', '${Version}', 'dpkg'],
+                             capture_output=True, text=True, check=True).stdout
+    command = dependencies.missing(
+        ['dpkg', 'fogt-none', f'dpkg={version}', 'dpkg=0.1', 'libc6:s390x'])
+    said = subprocess.run(command.argv, capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ['fogt-none', 'dpkg=0.1', 'libc6:s390x']
+
+
+def test_folder_follows_the_requirements_and_the_interpreters() -> None:
+    def path(*pip: str, home: str = '/home/a', python: str = 'python 3 12 1 /usr/bin/python3',
+             ) -> str:
+        facts = bootstrap.host.parse_facts(f'home {home}\n{python}\n')
+        return PipFolder.of(MachineSpec('a', 'fake', pip=pip), facts).path
+
+    assert path('x', 'y') == path('y', 'x') and path('x').startswith('/home/a/.local/share/')
+    assert len({path('x'), path('y'), path('x', python='python 3 11 1 /usr/bin/python3')}) == 3
+
+
+def test_packages_count_for_the_image() -> None:
+    under = plan.underlay({}, None, '/usr/bin/ros2')
+    found = {bootstrap.dependencies(MachineSpec('a', 'fake', **more), under) for more in (
+        {}, {'apt': ('x',)}, {'pip': ('x',)}, {'apt': ('x', 'y')}, {'apt': ('y', 'x')})}
+    assert len(found) == 4
+
+
+def wheel(folder: Path, name: str, **modules: str) -> None:
+    """Write a wheel of some modules."""
+    with zipfile.ZipFile(folder / f'{name}-1-py3-none-any.whl', 'w') as archive:
+        for module, text in modules.items():
+            archive.writestr(f'{module}.py', text)
+        info = f'{name}-1.dist-info'
+        archive.writestr(f'{info}/METADATA', f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
+        archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
+                                          'Tag: py3-none-any\n')
+        archive.writestr(f'{info}/RECORD', '')
+
+
+def installed(tmp_path: Path, *names: str) -> tuple[PipFolder, subprocess.CompletedProcess[str]]:
+    """Install wheels as on a machine, with this interpreter as that of the nodes."""
+    folder = PipFolder.of(MachineSpec('a', 'fake', pip=names), HostFacts(home=str(tmp_path)))
+    command = folder.fill(
+        {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
+        {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)}, ())
+    return folder, subprocess.run(command.argv, capture_output=True, text=True)
+
+
+@RUNS_PIP
+def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
+    wheel(tmp_path, 'fogt_one', fogt_one='name = "pip"', colorsys='raise ImportError("pip")',
+          pytest='raise ImportError("pip")')
+    folder, done = installed(tmp_path, 'fogt-one')
+    assert done.returncode == 0, done.stderr
+    assert Path(folder.path, 'complete').exists() and not Path(folder.path, 'pip').exists()
+    system = tmp_path / 'system'
+    system.mkdir()
+    (system / 'sitecustomize.py').write_text('import builtins; builtins.before = True')
+    code = ('import colorsys, fogt_one, pytest, sys; '
+            'print(fogt_one.name, before, sys.path[-1].endswith("/site"))')
+    found = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True,
+        env={**folder.found_by({}), 'PYTHONPATH': f'{folder.path}/last:{system}'})
+    assert found.stdout.split() == ['pip', 'True', 'True'], found.stderr
+
+
+@RUNS_PIP
+def test_package_that_brings_a_module_of_ours_is_not_kept(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / 'harmless-1-py3-none-any.whl', 'w') as archive:
+        archive.writestr('fogros2/__init__.py', '')
+        archive.writestr('harmless-1.dist-info/METADATA',
+                         'Metadata-Version: 2.1\nName: harmless\nVersion: 1\n')
+        archive.writestr('harmless-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
+                         'Root-Is-Purelib: true\nTag: py3-none-any\n')
+        archive.writestr('harmless-1.dist-info/RECORD', '')
+    folder, done = installed(tmp_path, 'harmless')
+    assert done.returncode == 1 and "brings 'fogros2'" in done.stderr
+    assert not Path(folder.path, 'site').exists() and not Path(folder.path, 'complete').exists()
+
+
+@pytest.mark.parametrize(('base', 'given', 'expected'), [
+    ({'PYTHONPATH': '/agent'}, {'PYTHONPATH': '/mine'}, {'PYTHONPATH': '/mine:/agent'}),
+    ({}, {'PYTHONPATH': '/mine'}, {'PYTHONPATH': '/mine'}),
+    ({'PATH': '/bin'}, {'PATH': '/mine/bin', 'A': 'b'}, {'PATH': '/mine/bin:/bin', 'A': 'b'}),
+    ({'PYTHONPATH': '/agent'}, {'PYTHONPATH': ''}, {'PYTHONPATH': '/agent'}),
+    ({'ROS_DOMAIN_ID': '1'}, {'ROS_DOMAIN_ID': '2'}, {'ROS_DOMAIN_ID': '2'})])
+def test_a_users_paths_extend_the_machines(
+    base: dict[str, str], given: dict[str, str], expected: dict[str, str],
+) -> None:
+    assert plan.extended(base, given) == expected
