@@ -3,18 +3,21 @@
 Images from a camera here to a node on a container machine, which answers each: by transport.
 
 Between the two is WireGuard over a relay that limits the link to 10 Mbit/s both ways. The scene is
-``fogros2_examples.scene``, or a video file (``--video``); its frames are rendered beforehand, as
-a camera takes no time of the computer's, and shown forwards and backwards in turn. ``--short``
-takes a tenth of the images and the small size alone.
+``fogros2_examples.scene``, or a video file (``--video``, with results of its own); its frames are
+rendered beforehand, as a camera takes no time of the computer's, and shown forwards and backwards
+in turn. ``--short`` takes a tenth of the images and the small size alone; ``--only`` replaces the
+rows of some cases in the results.
 """
 
 from __future__ import annotations
 
 import argparse
 import array
+from collections import defaultdict, deque
 from collections.abc import Iterator
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import os
@@ -31,10 +34,16 @@ from typing import Any, Optional
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 FOLDER = '/tmp/fogros2-bench'
+#: A machine has its own /tmp.
+VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
 FRAMES, SAMPLE = 60, 23
+#: Lines of output that are shown with an error.
+LAST_LINES = 20
+#: A machine starts no node twice under one name.
+RUNS = itertools.count()
 #: Images before those that count: discovery, the first key, warm caches.
 WARM_UP = 45
 sys.path.insert(0, str(ROOT))
@@ -49,8 +58,6 @@ def frames(width: int, height: int, video: str) -> list[Any]:
         from fogros2_examples.scene import Scene
         scene = Scene(width, height, RATE)
         return [scene.frame(number) for number in range(FRAMES)]
-    import itertools
-
     from fogros2_examples.camera import captured
     return list(itertools.islice(captured(video, width, height), FRAMES))
 
@@ -100,6 +107,9 @@ def camera(arguments: argparse.Namespace) -> None:
             len(sent) < total or (total - 1 not in answered
                                   and time.perf_counter() < sent[-1] + 2)):
         rclpy.spin_once(node, timeout_sec=0.1)
+    if len(sent) < total:
+        raise SystemExit(f'{len(sent)} of {total} images sent: '
+                         f'{publisher.get_subscription_count()} nodes subscribe to them')
     times = [when - sent[number] for number, when in sorted(answered.items())
              if number >= WARM_UP]
     print(json.dumps({'sent': len(sent) - WARM_UP, 'times': times,
@@ -107,7 +117,7 @@ def camera(arguments: argparse.Namespace) -> None:
 
 
 def cloud(arguments: argparse.Namespace) -> None:
-    """Answer each image; on SIGTERM hold some of them against the original and print JSON."""
+    """Answer each image; when interrupted, leave some of them in a file for :func:`compare`."""
     import numpy
     import rclpy
     from rclpy.executors import ExternalShutdownException
@@ -135,13 +145,24 @@ def cloud(arguments: argparse.Namespace) -> None:
     print(json.dumps({'ready': True}), flush=True)
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
+    # no more than this: a launch kills what has not ended 10 s after its interrupt
+    with open(arguments.result, 'wb') as file:
+        numpy.savez(file, received=received, numbers=list(samples),
+                    images=list(samples.values()))
+
+
+def compare(arguments: argparse.Namespace) -> None:
+    """Hold the images that :func:`cloud` left against the originals; print a JSON line."""
+    import numpy
+
+    with numpy.load(arguments.result) as left:
+        received, numbers, images = int(left['received']), left['numbers'], left['images']
     originals = frames(arguments.width, arguments.height, arguments.video)
-    pairs = [(originals[shown(number)], sample) for number, sample in samples.items()]
-    quality = {'psnr': statistics.fmean(psnr(a, b) for a, b in pairs) if pairs else math.nan,
-               'ssim': statistics.fmean(ssim(a, b) for a, b in pairs) if pairs else math.nan,
-               'received': received,
-               'worst': min((psnr(a, b) for a, b in pairs), default=math.nan)}
-    Path(arguments.result).write_text(json.dumps(quality))
+    pairs = [(originals[shown(int(number))], image) for number, image in zip(numbers, images)]
+    ratios = [psnr(a, b) for a, b in pairs] or [math.nan]
+    print(json.dumps({
+        'received': received, 'psnr': statistics.fmean(ratios), 'worst': min(ratios),
+        'ssim': statistics.fmean(ssim(a, b) for a, b in pairs) if pairs else math.nan}))
 
 
 def psnr(a: Any, b: Any) -> float:
@@ -228,6 +249,52 @@ class Link:
         self.process.wait(10)
 
 
+# --- what the processes say ---------------------------------------------------------------------
+
+class Output:
+    """The last lines that each node of the machine wrote, and which nodes have ended."""
+
+    def __init__(self) -> None:
+        self.lines: dict[str, deque[str]] = defaultdict(lambda: deque(maxlen=LAST_LINES))
+        self.ended: set[str] = set()
+
+    def heard(self, event: dict[str, Any]) -> None:
+        """Take an event of the machine's agent."""
+        if event['event'] == 'output':
+            self.lines[event['node']] += event['text'].splitlines()
+        elif event['event'] == 'refused':
+            self.lines[event['node']].append(event['error'])
+        if event['event'] in ('refused', 'exited'):
+            self.ended.add(event['node'])
+
+    def last(self, *nodes: str) -> str:
+        """Return what nodes wrote last."""
+        return '\n'.join(f'{node}: {line}' for node in nodes for line in self.lines[node])
+
+
+def answer_of(process: subprocess.Popen[str], what: str, timeout: float) -> dict[str, Any]:
+    """
+    Return the JSON object in the last line that a process prints.
+
+    :raises RuntimeError: it did not end in time, or printed none; with its last errors.
+    """
+    late = ''
+    try:
+        output, errors = process.communicate(timeout=timeout)
+    except subprocess.TimeoutExpired:
+        late = f' within {timeout:.0f} s'
+        process.kill()
+        output, errors = process.communicate()
+    try:
+        answer: dict[str, Any] = json.loads(output.splitlines()[-1])
+        if not late:
+            return answer
+    except (IndexError, ValueError):
+        pass
+    last = '\n'.join(errors.splitlines()[-LAST_LINES:])
+    raise RuntimeError(f'{what} gave no result{late} (exit status {process.returncode})\n{last}')
+
+
 # --- one run ------------------------------------------------------------------------------------
 
 @dataclasses.dataclass(frozen=True)
@@ -303,30 +370,34 @@ def cpu(*programs: str) -> float:
     return ticks / os.sysconf('SC_CLK_TCK')
 
 
-def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: str) -> Outcome:
+def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count: int,
+        video: str) -> Outcome:
     """Run a case to its end."""
-    from fogros2.model import NodeSpec
+    from fogros2.errors import FogError
+    from fogros2.model import Command, NodeSpec
+    from fogros2.waiting import wait_until
 
     width, height = SIZES[case.size]
     environment = {**os.environ, **launch.robot_environment(), 'PYTHONPATH': str(ROOT)}
     here, there = pair(case)
-    size = ['--width', str(width), '--height', str(height), '--video', video]
+    size = ['--width', str(width), '--height', str(height)]
     result = f'{FOLDER}/result.json'
     machine.shell.put(b'', result, mode=0o666)
     link.change(rate=LINK, delay=case.delay, loss=case.loss)
-    mark = case.codec + case.name
+    run_number = next(RUNS)
+    decoder, viewer = (f'{what}-{run_number}' for what in ('decoder', 'cloud'))
+    program = [sys.executable, f'{FOLDER}/streaming.py']
     machine.start([
-        NodeSpec(f'{what}-{mark}', what, arguments=tuple(words),
-                 environment={'PYTHONPATH': FOLDER})
-        for what, words in (('decoder', there), ('cloud', [
-            sys.executable, f'{FOLDER}/streaming.py', '--cloud', '--topic', '/decoded',
-            '--result', result, *size]))])
+        NodeSpec(node, node, arguments=tuple(words), environment={'PYTHONPATH': FOLDER})
+        for node, words in ((decoder, there), (viewer, [
+            *program, '--cloud', '--topic', '/decoded', '--result', result, *size]))])
     encoder = source = None
     try:
         encoder = subprocess.Popen(here, env=environment)
         source = subprocess.Popen(
-            [sys.executable, __file__, '--camera', '--count', str(count), *size],
-            env=environment, stdout=subprocess.PIPE, text=True)
+            [sys.executable, __file__, '--camera', '--count', str(count), *size,
+             '--video', video],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert source.stdout is not None
         source.stdout.readline()
         names = [('image_transport_h264.encoder ',), ('image_transport_h264.decoder ',)]
@@ -334,7 +405,7 @@ def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: st
             # FFmpeg's own program encodes
             names = [('theora.py\0encode', 'libtheora'), ('theora.py\0decode',)]
         begin = time.monotonic(), link.sent(), cpu(*names[0]), cpu(*names[1])
-        told = json.loads(source.communicate(timeout=count / RATE + 120)[0].splitlines()[-1])
+        told = answer_of(source, 'the camera', count / RATE + 120)
         seconds = time.monotonic() - begin[0]
         load = [100 * (cpu(*names[i]) - begin[2 + i]) / seconds for i in (0, 1)]
         sent = link.sent() - begin[1]
@@ -342,12 +413,19 @@ def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: st
         end(source)
         end(encoder)
         # what still runs there would be in the way of the next case
-        machine.stop([f'decoder-{mark}', f'cloud-{mark}'])
+        machine.stop([decoder, viewer])
+        wait_until(lambda: {decoder, viewer} <= output.ended, timeout=60.0,
+                   what='the nodes on the machine to end')
     counters = link.change(rate=0.0, delay=0.0, loss=0.0)
     # no packet is larger than the VPN's 1420 bytes
     if (counters['passed'] + counters['lost']) * 1420 < sent:
         raise RuntimeError(f'packets go past the relay: {counters}, {sent} bytes sent')
-    quality = json.loads(machine_file(machine, result))
+    try:
+        quality = json.loads(machine.shell.run(Command(
+            (*program, '--compare', '--result', result, *size, '--video', video and VIDEO),
+            environment={'PYTHONPATH': FOLDER}, what='compare the images'), timeout=300).stdout)
+    except (FogError, ValueError) as error:
+        raise RuntimeError(f'{error}\n{output.last(decoder, viewer)}') from error
     times = sorted(1e3 * t for t in told['times']) or [math.nan]
 
     def at(share: float) -> float:
@@ -360,14 +438,14 @@ def run(case: Case, launch: Any, machine: Any, link: Link, count: int, video: st
         load[0], load[1])
 
 
-def tried(case: Case, launch: Any, machine: Any, link: Link, count: int,
+def tried(case: Case, launch: Any, machine: Any, link: Link, output: Output, count: int,
           video: str) -> Optional[Outcome]:
     """Run a case, once more if it fails; None if it fails again, so that the others have a run."""
     from fogros2.errors import FogError
 
     for _ in range(2):
         try:
-            return run(case, launch, machine, link, count, video)
+            return run(case, launch, machine, link, output, count, video)
         except (FogError, OSError, RuntimeError, ValueError, IndexError,
                 subprocess.SubprocessError) as error:
             print(f'{case.name}: {type(error).__name__}: {error}', file=sys.stderr, flush=True)
@@ -385,14 +463,6 @@ def end(process: Optional[subprocess.Popen[Any]]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait(15)
-
-
-def machine_file(machine: Any, path: str) -> str:
-    """Return a file's text, once its writer is done with it."""
-    from fogros2.model import Command
-    script = (f'for i in $(seq 100); do [ -s {path} ] && break; sleep 0.2; done; cat {path}')
-    text: str = machine.shell.run(Command.script(script), timeout=60).stdout
-    return text
 
 
 # --- the limit, each part measured alone --------------------------------------------------------
@@ -446,9 +516,9 @@ def limit(launch: Any, outcome: Outcome) -> float:
 
 # --- all of it ----------------------------------------------------------------------------------
 
-def table(outcomes: list[Outcome], limits: dict[str, float], note: str) -> str:
+def table(title: str, outcomes: list[Outcome], limits: dict[str, float], note: str) -> str:
     """Return the side-by-side table as Markdown."""
-    lines = ['# Streaming images over 10 Mbit/s', '', note, '',
+    lines = [f'# {title}', '', note, '',
              '| | FPS | round trip, ms: median | p95 | p99 | limit | lost | bytes/image | '
              'PSNR, dB | worst | SSIM | CPU robot, % | CPU cloud, % | the paper |',
              '|---' * 14 + '|']
@@ -462,11 +532,28 @@ def table(outcomes: list[Outcome], limits: dict[str, float], note: str) -> str:
     return '\n'.join([*lines, ''])
 
 
-def rows(outcomes: list[Outcome], limits: dict[str, float]) -> Iterator[Any]:
+def merged(
+    path: Path, outcomes: list[Outcome], limits: dict[str, float], note: str,
+) -> tuple[list[Outcome], dict[str, float], str]:
+    """Return earlier results with some replaced; their note names the rows that are newer."""
+    before = json.loads(path.read_text())
+    found = {o.case.name: o for o in outcomes}
+    for row in before['rows']:
+        values = {key: math.nan if value is None else value for key, value in row.items()}
+        found.setdefault(row['case']['name'], Outcome(**{**values, 'case': Case(**row['case'])}))
+    newer = ', '.join(o.case.name for o in outcomes)
+    return ([found[case.name] for case in CASES if case.name in found],
+            {**before['limits'], **limits}, f"{before['note']} Measured later: {newer}: {note}")
+
+
+def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iterator[Any]:
     """Yield the figures that have targets, and the others of their kind."""
     from figures import Row
 
     targets: dict[str, dict[str, float]] = {
+        'raw': {'fps': 1.0},
+        # four fifths of what the link carries of such images
+        'compressed, JPEG 80': {'fps': 16.0 if video else 24.0},
         'H.264': {'fps': 30.0, 'median': 14.0, 'p99': 25.0, 'psnr': 35.0},
         'H.264, 20 ms and 2 % loss': {'fps': 29.5, 'p95': 60.0},
         'H.264 1080p': {'fps': 30.0, 'median': 60.0}}
@@ -491,8 +578,10 @@ def rows(outcomes: list[Outcome], limits: dict[str, float]) -> Iterator[Any]:
                       1.3)
 
 
-def prepare(machine: Any) -> None:
+def prepare(machine: Any, video: str) -> None:
     """Put onto the machine what its nodes need."""
+    if video:
+        machine.shell.put(Path(video).read_bytes(), VIDEO, mode=0o644)
     for package in ('image_transport_h264', 'fogros2_examples'):
         for path in sorted((ROOT / package).glob('*.py')):
             machine.shell.put(path.read_bytes(), f'{FOLDER}/{package}/{path.name}', mode=0o644)
@@ -507,7 +596,7 @@ def main() -> None:
     parser.add_argument('--count', type=int, default=3000)
     parser.add_argument('--only', default='', help='cases whose name has this in it')
     parser.add_argument('--video', default='', help='a video file instead of the scene')
-    for hidden in ('--camera', '--cloud'):
+    for hidden in ('--camera', '--cloud', '--compare'):
         parser.add_argument(hidden, action='store_true', help=argparse.SUPPRESS)
     for hidden, default in (('--width', 640), ('--height', 480)):
         parser.add_argument(hidden, type=int, default=default, help=argparse.SUPPRESS)
@@ -518,6 +607,8 @@ def main() -> None:
         return camera(arguments)
     if arguments.cloud:
         return cloud(arguments)
+    if arguments.compare:
+        return compare(arguments)
     from figures import machine as computer
     from figures import RESULTS, write
 
@@ -538,10 +629,12 @@ def main() -> None:
     link: Optional[Link] = None
     try:
         machine = launch.up(MachineSpec('bench-streaming', 'container'))
-        prepare(machine)
+        prepare(machine, arguments.video)
+        output = Output()
+        machine.subscribe(output.heard)
         link = Link(launch, machine)
         for case in cases:
-            outcome = tried(case, launch, machine, link, count, arguments.video)
+            outcome = tried(case, launch, machine, link, output, count, arguments.video)
             if outcome is None:
                 failed.append(case.name)
                 continue
@@ -554,16 +647,21 @@ def main() -> None:
             link.close()
         for error in launch.down():
             print(error, file=sys.stderr)
-    note = (f'{computer()}; {count} images of each at 30 Hz; '
-            + (f'video {Path(arguments.video).name}' if arguments.video else
-               'the scene of `fogros2_examples/scene.py`') + '.')
-    text = table(outcomes, limits, note)
+    scene = (f'video {Path(arguments.video).name}' if arguments.video else
+             'the scene of `fogros2_examples/scene.py`')
+    note = f'{computer()}; {count} images of each at 30 Hz; {scene}.'
+    name = 'streaming-video' if arguments.video else 'streaming'
+    path = RESULTS / f'{name}-table.json'
+    if arguments.only and path.exists():
+        outcomes, limits, note = merged(path, outcomes, limits, note)
+    title = 'Streaming images over 10 Mbit/s' + (f', {scene}' if arguments.video else '')
+    text = table(title, outcomes, limits, note)
     print(text)
     print(f'took {(time.monotonic() - begin) / 60:.1f} min')
-    if not (arguments.only or arguments.short):
-        write('streaming', 'Streaming images over 10 Mbit/s', list(rows(outcomes, limits)))
-        (RESULTS / 'streaming-table.md').write_text(text)
-        (RESULTS / 'streaming-table.json').write_text(json.dumps({
+    if outcomes and not arguments.short:
+        write(name, title, list(rows(outcomes, limits, bool(arguments.video))))
+        path.with_suffix('.md').write_text(text)
+        path.write_text(json.dumps({
             'note': note, 'limits': limits,
             'rows': [{key: None if isinstance(value, float) and math.isnan(value) else value
                       for key, value in dataclasses.asdict(o).items()} for o in outcomes]},

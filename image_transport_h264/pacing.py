@@ -17,7 +17,7 @@ import dataclasses
 
 #: Images under way at the most; the publisher keeps as many, to repeat parts of them.
 MOST = 8
-#: Acknowledgements of a full window between two decisions: one of them was late by chance, not all.
+#: Acknowledgements of a full window between two decisions: chance delays some, a queue all.
 ROUND = 4
 #: Images that wait in the link's queue: below the first the window grows, above the second it
 #: shrinks.
