@@ -245,8 +245,9 @@ def plan_alike(
     install = RosInstall(
         'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
-    return Preparation('none', _with_workspace(install, workspace, spec.name),
-                       _tools(facts, spec.bootstrap, spec.name))
+    return Preparation(
+        'none', _with_workspace(install, workspace, spec.name, _builds(facts)),
+        _tools(facts, spec.bootstrap, spec.name))
 
 
 def plan(
@@ -272,7 +273,7 @@ def plan(
     no_apt = _why_not_apt(facts)
     if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
-            or mode == 'apt' and {'colcon', 'rosdep'} <= facts.programs):
+            or mode == 'apt' and _builds(facts)):
         todo = _ros(facts, wheels, workspace)
     elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
             and under.rmw == DEFAULT_RMW):
@@ -298,18 +299,24 @@ def plan(
         todo.install, facts=facts, robot=robot,
         environment=_merged(todo.install, under, workspace))
     return dataclasses.replace(
-        todo, tools=tools, install=_with_workspace(install, workspace, spec.name))
+        todo, tools=tools, install=_with_workspace(
+            install, workspace, spec.name, todo.mode == 'apt' or _builds(facts)))
+
+
+def _builds(facts: HostFacts) -> bool:
+    """Return whether a machine has what builds a workspace."""
+    return {'colcon', 'rosdep'} <= facts.programs
 
 
 def _with_workspace(
-    install: RosInstall, workspace: Optional[workspaces.Workspace], name: str,
+    install: RosInstall, workspace: Optional[workspaces.Workspace], name: str, can_build: bool,
 ) -> RosInstall:
     """Add how the workspace gets there; one that is built there brings its setup script."""
     if workspace is None:
         return install
     way = workspaces.plan(
         workspace, install.facts, install.robot, ros_setup=install.setup,
-        can_build=install.kind == 'ros', name=name)
+        can_build=install.kind == 'ros' and can_build, name=name)
     setup = (*install.setup, way.setup) if way.commands else install.setup
     return dataclasses.replace(install, workspace=way, setup=setup)
 

@@ -202,6 +202,7 @@ class ObeyAgent(Action):
         if not shell:
             path = environment.get('PATH', os.environ.get('PATH', os.defpath))
             check_program(words[0], path, cwd)
+            words = [*spec.get('prefix', []), *interpreter(arguments), *arguments]
         return ExecuteProcess(
             cmd=words,
             name=re.sub(r'-\d+$', '', spec['name']),
@@ -386,7 +387,9 @@ def prefix_of(package: str) -> str:
         return str(get_package_prefix(package))
     except (PackageNotFoundError, ValueError) as error:
         import difflib
-        near = difflib.get_close_matches(package, get_packages_with_prefixes(), n=1)
+        # the index lists a link that leads nowhere, too
+        others = [name for name in get_packages_with_prefixes() if name != package]
+        near = difflib.get_close_matches(package, others, n=1, cutoff=0.75)
         hint = f"did you mean '{near[0]}'?" if near else 'is its workspace the one that travels?'
         raise RefusedNode(f"package '{package}' not found on the machine", hint) from error
 
@@ -423,6 +426,30 @@ def check_program(program: str, path: str, cwd: Optional[str]) -> None:
     if there:
         raise RefusedNode(f"'{there[0]}' isn't executable on the machine")
     raise RefusedNode(f"'{program}' not found on the machine")
+
+
+def interpreter(command: Sequence[str]) -> list[str]:
+    """
+    Return the words before a command that start a Python program with this machine's Python.
+
+    A build in a virtual environment writes that environment's Python into the first line of each
+    program. A machine may lack that Python.
+
+    :raises RefusedNode: the first line names a missing interpreter that isn't Python.
+    """
+    try:
+        with open(command[0], 'rb') as file:
+            line = file.readline(1024)
+    except (IndexError, OSError):
+        return []
+    match = re.match(rb'#!\s*(/\S+)', line)
+    if match is None or os.path.exists(match[1]):
+        return []
+    named = os.fsdecode(match[1])
+    if re.fullmatch(r'python[\d.]*', os.path.basename(named)):
+        return [sys.executable]
+    raise RefusedNode(f"'{command[0]}' is for the interpreter '{named}', "
+                      'which is not on the machine', 'install it there')
 
 
 def main() -> int:

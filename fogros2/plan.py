@@ -13,6 +13,7 @@ from pathlib import Path
 import sys
 from typing import Any, Optional
 
+from fogros2 import workspace
 from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
 from fogros2.model import Machine, MachineSpec, Peer, VpnInterface
 
@@ -255,15 +256,17 @@ def _below(path: str, roots: Iterable[str]) -> bool:
 
 
 def check_program(
-    package: str, executable: str, prefixes: Sequence[str],
+    package: str, executable: str, prefixes: Sequence[str], travelling: Optional[str] = None,
 ) -> None:
     """
-    Look a node's program up in the ament index of the robot (and so of what travels).
+    Look a node's program up in the ament index of the robot, and of the workspace that travels.
 
-    :param prefixes: ament prefixes.
+    :param prefixes: the robot's ament prefixes.
+    :param travelling: the workspace, which need not be sourced.
     :raises WorkspaceError: no such package or executable, with the nearest name there is.
     """
     index = 'share/ament_index/resource_index/packages'
+    prefixes = [*workspace.prefixes(travelling), *prefixes]
     for prefix in prefixes:
         if not Path(prefix, index, package).exists():
             continue
@@ -274,16 +277,21 @@ def check_program(
         raise WorkspaceError(
             f"package '{package}' has no executable '{executable}'",
             _nearest(executable, names) or f'{folder} has none')
+    source = workspace.inspect(travelling).sources.get(package) if travelling else None
+    if source is not None:
+        raise WorkspaceError(f"package '{package}' in {source} is not built",
+                             f'run colcon build in {travelling}')
     known = {
         path.name for prefix in prefixes if Path(prefix, index).is_dir()
         for path in Path(prefix, index).iterdir()}
     raise WorkspaceError(
         f"no package is called '{package}'",
-        _nearest(package, sorted(known)) or 'is the workspace built, and its setup.bash sourced?')
+        _nearest(package, sorted(known)) or 'source the setup.bash of its workspace, or name that '
+        'workspace with ros_workspace=')
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, names, n=1)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.75)
     if near:
         return f"did you mean '{near[0]}'?"
     return f"there are: {', '.join(names[:8])}" if names and len(names) <= 8 else ''

@@ -15,9 +15,10 @@ import os
 from pathlib import Path
 import shlex
 import threading
-from typing import Optional, Protocol
+from typing import Optional, Protocol, TypedDict
 import xml.etree.ElementTree as ElementTree
 
+from fogros2 import process
 from fogros2.errors import WorkspaceError
 from fogros2.host import DISTRO, HostFacts
 from fogros2.model import Command
@@ -42,6 +43,9 @@ class Workspace:
     :param links: what the install space reaches outside of itself, through links and through the
         paths that ``--symlink-install`` writes; files and folders in the workspace.
     :param outside: the same where it leads out of the workspace: it can't travel.
+    :param linked: folders outside of the workspace that links below ``src`` lead to, with packages
+        in them; those that the install space reaches.
+    :param linked_sources: all such folders.
     :param compiled: one of the shared libraries or compiled programs in the install space, None
         where all is Python.
     :param python: version in the install space's own paths (``python3.12``), '' where none.
@@ -52,6 +56,8 @@ class Workspace:
     sources: Mapping[str, Path]
     links: tuple[Path, ...] = ()
     outside: tuple[Path, ...] = ()
+    linked: tuple[Path, ...] = ()
+    linked_sources: tuple[Path, ...] = ()
     compiled: Optional[Path] = None
     python: str = ''
 
@@ -81,6 +87,7 @@ class WorkspacePlan:
 
     :param source: folder on the robot, ``target`` the same path on the machine.
     :param includes: rsync patterns that win over ``excludes``.
+    :param linked: folders outside of the workspace that travel too, to the same paths.
     :param commands: build it there, after the sync; none where it travels built.
     :param setup: script to source on the machine, after ROS's own.
     :param reason: why it is built there, '' where it isn't.
@@ -90,6 +97,7 @@ class WorkspacePlan:
     target: str
     includes: tuple[str, ...]
     excludes: tuple[str, ...]
+    linked: tuple[Path, ...]
     commands: tuple[Command, ...]
     setup: str
     reason: str = ''
@@ -113,8 +121,36 @@ def inspect(path: str | os.PathLike[str]) -> Workspace:
         if (root.parent / 'install').is_dir():
             hint = f'did you mean {root.parent}?'
         raise WorkspaceError(f'{root} is no colcon workspace: no ROS package in it', hint)
-    links, outside, compiled, python = _look_through(install, root)
-    return Workspace(root, installed, sources, links, outside, compiled, python)
+    ways = {_way_out(folder, root) for folder in sources.values()}
+    linked = sorted({Path(os.path.realpath(way)) for way in ways if way is not None})
+    return Workspace(root, installed, sources, linked_sources=tuple(linked),
+                     **_look_through(install, root, linked))
+
+
+def prefixes(path: Optional[str]) -> list[str]:
+    """Return the ament prefixes of a workspace's install space; none for no workspace."""
+    if path is None:
+        return []
+    install = Path(os.path.abspath(os.path.expanduser(path))) / 'install'
+    return list(dict.fromkeys(str(prefix) for _, prefix in _installed(install)))
+
+
+def sourced(path: Optional[str], environment: Mapping[str, str]) -> Mapping[str, str]:
+    """
+    Return an environment in which a workspace is sourced, after what was sourced before.
+
+    :raises CommandError: its set-up script fails.
+    """
+    found = set(environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    missing = [prefix for prefix in prefixes(path) if prefix not in found]
+    script = Path(os.path.abspath(os.path.expanduser(path or ''))) / 'install' / 'local_setup.sh'
+    if not missing or not script.is_file():
+        return environment
+    command = Command.script(
+        f'. {shlex.quote(str(script))} >&2\nexec env -0', what=f'source {script}')
+    lines = process.run(
+        dataclasses.replace(command, environment=environment), timeout=30.0).stdout.split('\0')
+    return dict(line.split('=', 1) for line in lines if '=' in line)
 
 
 def dependencies(path: str | os.PathLike[str]) -> list[str]:
@@ -160,7 +196,8 @@ def plan(
         includes = tuple(_include(workspace.links, root))
         return WorkspacePlan(
             root, str(root), includes,
-            (*EXCLUDES, '/log', *(f'/{top}/***' for top in ('build', 'src'))), (), setup)
+            (*EXCLUDES, '/log', *(f'/{top}/***' for top in ('build', 'src'))), workspace.linked,
+            (), setup)
     if not workspace.sources:
         raise WorkspaceError(
             f"{root} can't go to machine '{name}' as it is ({reason}), and has no src/ to build",
@@ -170,7 +207,7 @@ def plan(
             f"{root} would have to be built on machine '{name}' ({reason}), which has no colcon",
             'run colcon build here first')
     return WorkspacePlan(
-        root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)),
+        root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)), workspace.linked_sources,
         tuple(_build(workspace, ros_setup)), setup, reason)
 
 
@@ -202,20 +239,24 @@ def transfer(
     if way is None or way.source != Path(os.path.abspath(path.expanduser())):
         raise WorkspaceError(f'{path} is not the workspace that was planned for',
                              'name the same one when planning and when sending')
-    target = shlex.quote(way.target)
-    # the login user may not write to where the robot's user has their workspace
-    shell.run(Command.script(
-        f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
-        f'{{ sudo -n mkdir -p {target} && sudo -n chown "$(id -u):$(id -g)" {target}; }}',
-        what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
-    report = shell.sync(
+    for target in map(shlex.quote, (way.target, *map(str, way.linked))):
+        # the login user may not write to where the robot's user has their workspace
+        shell.run(Command.script(
+            f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
+            f'{{ sudo -n mkdir -p {target} && sudo -n chown "$(id -u):$(id -g)" {target}; }}',
+            what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
+    reports = [shell.sync(
         way.source, way.target, includes=way.includes, excludes=way.excludes,
-        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
+        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)]
+    reports += [shell.sync(
+        folder, str(folder), excludes=EXCLUDES, timeout=timeouts.sync, cancel=cancel,
+        on_progress=on_progress) for folder in way.linked]
     if way.commands:
         before_build()
     for command in way.commands:
         shell.run(command, timeout=timeouts.build, cancel=cancel, on_output=on_output)
-    sent = f'{report.files} files, {_size(report.bytes)}'
+    sent = (f'{sum(report.files for report in reports)} files, '
+            f'{_size(sum(report.bytes for report in reports))}')
     return f'{sent}, built there: {way.reason}' if way.commands else sent
 
 
@@ -311,12 +352,26 @@ def _build_type(folder: Path) -> str:
     return (export.findtext('build_type') or '').strip() if export is not None else ''
 
 
-def _look_through(
-    install: Path, root: Path,
-) -> tuple[tuple[Path, ...], tuple[Path, ...], Optional[Path], str]:
-    """Walk the install space and what it reaches: links, ways out, a binary, Python's version."""
-    links: dict[Path, None] = {}
-    outside: dict[Path, None] = {}
+class _Found(TypedDict):
+    """Fields of Workspace that a walk through the install space finds."""
+
+    links: tuple[Path, ...]
+    outside: tuple[Path, ...]
+    linked: tuple[Path, ...]
+    compiled: Optional[Path]
+    python: str
+
+
+def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
+    """
+    Walk the install space and what it reaches.
+
+    :param sources: folders outside of the workspace that may travel.
+    """
+    links: set[Path] = set()
+    outside: set[Path] = set()
+    linked: set[Path] = set()
+    seen: set[Path] = set()
     compiled: Optional[Path] = None
     python = ''
     todo = [install]
@@ -333,14 +388,36 @@ def _look_through(
             if not python and '/site-packages/' in entry.path:
                 python = entry.path.split('/site-packages/')[0].rpartition('/')[2]
         for path in reached:
-            if not path.is_relative_to(root):
-                # ROS and the system are on the machine too
-                if not path.is_relative_to('/opt/ros') and not path.is_relative_to('/usr'):
-                    outside[path] = None
-            elif not path.is_relative_to(install) and path not in links:
-                links[path] = None
+            if path in seen or path.is_relative_to(install):
+                continue
+            seen.add(path)
+            way = _way_out(path, root) if path.is_relative_to(root) else path
+            if way is None:
+                links.add(path)
                 todo.append(path)
-    return tuple(sorted(links)), tuple(sorted(outside)), compiled, python
+                continue
+            real = Path(os.path.realpath(way))
+            folders = [folder for folder in sources if real.is_relative_to(folder)]
+            if folders:
+                linked.update(folders)
+                links.update([way] if way.is_relative_to(root) else [])
+                todo.append(path)
+            elif not real.is_relative_to('/opt/ros') and not real.is_relative_to('/usr'):
+                # ROS and the system are on the machine too
+                outside.add(real)
+    return _Found(links=tuple(sorted(links)), outside=tuple(sorted(outside)),
+                  linked=tuple(sorted(linked)), compiled=compiled, python=python)
+
+
+def _way_out(path: Path, root: Path) -> Optional[Path]:
+    """Return the first link on the way from a workspace to a path that leaves the workspace."""
+    top = os.path.realpath(root)
+    here = root
+    for part in path.relative_to(root).parts:
+        here /= part
+        if here.is_symlink() and not Path(os.path.realpath(here)).is_relative_to(top):
+            return here
+    return None
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:

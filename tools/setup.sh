@@ -268,8 +268,7 @@ if [ -n "$ros" ] && [ "$target" != lint ]; then
         prepare "$VENV_ROS" "$interpreter" --system-site-packages "ROS 2 $ROS_DISTRO" \
             .cache/source
         # ROS's own ros2 has /usr/bin/python3 in its first line, which wouldn't see ours
-        printf '#!%s\nimport sys\nfrom ros2cli.cli import main\nsys.exit(main())\n' \
-            "$VENV_ROS/bin/python" >"$VENV_ROS/bin/ros2"
+        { printf '#!%s\n' "$VENV_ROS/bin/python"; cat tools/ros2.py; } >"$VENV_ROS/bin/ros2"
         chmod 755 "$VENV_ROS/bin/ros2"
         teach_activate "$VENV_ROS" "$ros"
     )

@@ -62,10 +62,6 @@ class CloudGroup(GroupAction):
             return  # launch leaves it out
         if isinstance(entity, ExecuteLocal) and not isinstance(
                 entity, (RemoteProcess, RobotCarrier)):
-            # before the action's own execution, which may make a ROS node in this process
-            coordinator = Coordinator.of(context)
-            if not coordinator.on_robot(self._resolved):
-                coordinator.engage()
             send(entity, self._resolved, self._streams)
         else:
             components.send(entity, self._resolved, self._streams, context)

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
 import os
 from pathlib import Path
 import re
@@ -16,7 +17,7 @@ from launch.substitutions import FindExecutable, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.substitutions import ExecutableInPackage
 
-from fogros2 import plan
+from fogros2 import plan, workspace
 from fogros2.actions import private
 from fogros2.errors import ConfigurationError
 from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
@@ -61,6 +62,23 @@ def use_names_of_programs(action: ExecuteLocal) -> None:
                 word[index] = ProgramName(part.executable, part.package, part)
             elif isinstance(part, FindExecutable):
                 word[index] = ProgramName(normalize_to_list_of_substitutions(part.name), [], part)
+
+
+@contextlib.contextmanager
+def packages_of(folder: Optional[str]) -> Iterator[None]:
+    """Let substitutions find the packages of a workspace, sourced or not, during the block."""
+    before = os.environ.get('AMENT_PREFIX_PATH')
+    known = before.split(os.pathsep) if before else []
+    more = [prefix for prefix in workspace.prefixes(folder) if prefix not in known]
+    if more:
+        os.environ['AMENT_PREFIX_PATH'] = os.pathsep.join([*more, *known])
+    try:
+        yield
+    finally:
+        if more and before is None:
+            del os.environ['AMENT_PREFIX_PATH']
+        elif more and before is not None:
+            os.environ['AMENT_PREFIX_PATH'] = before
 
 
 def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
@@ -109,7 +127,7 @@ def from_action(
         package = perform_substitutions(context, first[0].package)
         executable = final.pop(0)
         if not image and not spec.options.get('image'):
-            plan.check_program(package, executable, texts.prefixes)
+            plan.check_program(package, executable, texts.prefixes, spec.workspace)
     files: dict[str, Text] = {}
     arguments = [texts.text(word) for word in final]
     for index in range(1, len(final)):

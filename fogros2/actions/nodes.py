@@ -88,10 +88,6 @@ class Node(launch_ros.actions.Node):
             executed: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
             return executed
         assert isinstance(self, RemoteProcess)
-        coordinator = Coordinator.of(context)
-        if not coordinator.on_robot(self.machine):
-            # before a lifecycle node or a container makes a ROS node in this process
-            coordinator.engage()
         entities: list[LaunchDescriptionEntity] = super().execute(context) or []
         for entity in entities:
             components.send(entity, self.machine, self._fogros2_streams, context)

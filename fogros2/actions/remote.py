@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Optional, TYPE_CHECKING
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
@@ -209,6 +209,22 @@ def _remote_class(cls: type[ExecuteLocal]) -> type[RemoteProcess]:
     if cls not in _remote_classes:
         # ExecuteLocal itself can't stand before a class derived from it
         bases = (RemoteProcess,) if cls is ExecuteLocal else (cls, RemoteProcess)
-        _remote_classes[cls] = type(
-            cls.__name__, bases, {'__module__': cls.__module__, '__doc__': cls.__doc__})
+        remote: type[RemoteProcess] = type(cls.__name__, bases, {
+            '__module__': cls.__module__, '__doc__': cls.__doc__,
+            'execute': lambda action, context: _execute(super(remote, action), action, context)})
+        _remote_classes[cls] = remote
     return _remote_classes[cls]
+
+
+def _execute(
+    parent: Any, action: RemoteProcess, context: LaunchContext,
+) -> Optional[list[LaunchDescriptionEntity]]:
+    """Execute an action with its machine known, as launch_ros's actions do much before prepare."""
+    folder = None
+    coordinator = Coordinator.of(context)
+    if not context.is_shutdown and not coordinator.on_robot(action.machine):
+        # some actions make a ROS node in this process, which needs the launch's DDS settings
+        folder = coordinator.session(action.machine).spec.workspace
+    with node_spec.packages_of(folder):
+        entities: Optional[list[LaunchDescriptionEntity]] = parent.execute(context)
+    return entities

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import signal
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from fogros2.actions.remote import RemoteProcess
     from fogros2.actions.session import Session
 
+#: How Qt, GTK and Tk say that there is no screen.
+_NO_SCREEN = re.compile(
+    r'Qt platform plugin|could not connect to display|cannot open display|GTK backend|'
+    r'no \$DISPLAY environment variable', re.IGNORECASE)
 #: Seconds beyond a process's own time-outs that its machine has to report the end of it.
 GRACE = 10.0
 
@@ -40,6 +45,7 @@ class RemoteRun:
         self.stopping = False
         #: It exited, and its machine will start it again.
         self.respawning = False
+        self._hinted = False
         #: It is on its way to the robot, then it is there and launch's own.
         self._moving = self._here = False
         self._context = context
@@ -172,6 +178,11 @@ class RemoteRun:
             self._session.stop(self)
 
     def _on_output(self, event: dict[str, Any]) -> None:
+        if not self._hinted and _NO_SCREEN.search(event['text']):
+            self._hinted = True
+            self._logger.warning(
+                'the process opens a window, and a machine has no screen: run the node on the '
+                'robot, switch its window off, or set QT_QPA_PLATFORM=offscreen for it')
         kind = ProcessStderr if event.get('stream') == 'stderr' else ProcessStdout
         self._details.setdefault('pid', 0)
         self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))

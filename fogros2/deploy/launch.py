@@ -117,7 +117,7 @@ class Launch:
                 workspace.inspect(Path(spec.workspace))
             for package, executable in programs.get(spec.name, ()):
                 if not spec.options.get('image'):
-                    plan.check_program(package, executable, prefixes)
+                    plan.check_program(package, executable, prefixes, spec.workspace)
         choosing = [spec for spec in specs if not self._may_be_kept(spec)]
         with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
             for choice in [
@@ -209,14 +209,15 @@ class Launch:
 
     def underlay(self, workspace_root: Optional[str]) -> plan.Underlay:
         """
-        Return the robot's own ROS 2 as paths.
+        Return the robot's own ROS 2 as paths, and a workspace that need not be sourced.
 
         :raises PrerequisiteError: there is none.
         """
         ros2 = shutil.which('ros2', path=self.user_environment.get('PATH'))
         if ros2 is None:
             raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
-        return plan.underlay(self.user_environment, workspace_root, ros2)
+        return plan.underlay(
+            workspace.sourced(workspace_root, self.user_environment), workspace_root, ros2)
 
     def robot_environment(self) -> dict[str, str]:
         """

@@ -29,6 +29,8 @@ from fogros2.vpn import addresses, helped
 from ros2fog_cli.api import lan, reach
 
 Verdict = Literal['ok', 'warning', 'failed']
+#: What launches import, and Debian's package of each.
+_PACKAGES = {'paramiko': 'python3-paramiko', 'yaml': 'python3-yaml'}
 _OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
 
 
@@ -60,8 +62,8 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     :param providers: those that have to work; others are asked where they are set up.
     """
     checks: list[Callable[[], Check]] = [
-        python, programs, root, tun, wireguard, engine, overlay, firewall_program, ros, rmw,
-        cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state, clocks,
+        python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
+        rmw, cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state, clocks,
         lambda: lan_peers(lan_seconds)]
     known = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
     for name in dict.fromkeys([*known, *providers]):
@@ -115,6 +117,17 @@ def python() -> Check:
     if sys.version_info < (3, 10):
         return Check('Python', 'failed', version, 'Python 3.10 or newer is needed')
     return Check('Python', 'ok', f'{version} in {sys.prefix}')
+
+
+def packages() -> Check:
+    """Look for the Python packages that every launch imports."""
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        return Check(
+            'Python packages', 'failed', f"{', '.join(missing)} not found by {sys.executable}",
+            f"sudo apt-get install {' '.join(_PACKAGES[name] for name in missing)}, or pip "
+            'install into the virtual environment that you use')
+    return Check('Python packages', 'ok', ', '.join(_PACKAGES))
 
 
 def programs() -> Check:

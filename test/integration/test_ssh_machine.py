@@ -7,6 +7,8 @@ from importlib import metadata
 import json
 import os
 import shutil
+import subprocess
+import sys
 import textwrap
 import uuid
 
@@ -34,6 +36,8 @@ print((found.submodule_search_locations or [found.origin])[0])" 2>/dev/null); do
     done
 done
 """
+COLCON = shutil.which('colcon', path=os.pathsep.join(
+    [os.path.dirname(sys.executable), os.environ.get('PATH', '')]))
 
 
 def embedded():
@@ -251,3 +255,73 @@ def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
         sent = [path for path in sent_since(computer, '/tmp/marker') if '/modules-' in path]
         assert bool(sent) == (turn == 0)
         assert nothing_runs(computer) == []
+
+
+#: A package that reads a parameter file out of its share folder.
+ROB_TOOLS = {
+    'package.xml': '<package format="3"><name>rob_tools</name><version>1.0.0</version>'
+                   '<description>For a test.</description>'
+                   '<maintainer email="nobody@example.org">nobody</maintainer>'
+                   '<license>Apache-2.0</license>'
+                   '<export><build_type>ament_python</build_type></export></package>\n',
+    'setup.py': "from setuptools import setup\nsetup(name='rob_tools', version='1.0.0',\n"
+                "      packages=['rob_tools'], data_files=[\n"
+                "          ('share/ament_index/resource_index/packages',\n"
+                "           ['resource/rob_tools']),\n"
+                "          ('share/rob_tools', ['package.xml', 'speed.yaml'])],\n"
+                "      entry_points={'console_scripts': ['params = rob_tools.params:main']})\n",
+    'setup.cfg': '[develop]\nscript_dir=$base/lib/rob_tools\n[install]\n'
+                 'install_scripts=$base/lib/rob_tools\n',
+    'speed.yaml': '/**: {ros__parameters: {speed: 42}}\n',
+    'resource/rob_tools': '', 'rob_tools/__init__.py': '',
+    'rob_tools/params.py': """
+import rclpy
+
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('params')
+    print('speed is', node.declare_parameter('speed', 0).value, flush=True)
+    node.destroy_node()
+    rclpy.try_shutdown()
+""",
+}
+
+
+@pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
+@pytest.mark.parametrize('option', ['', '--symlink-install'])
+def test_an_unsourced_workspace_of_linked_packages_runs(computer, launch, tmp_path, option):
+    """It was built by a Python that the machine lacks, out of a folder outside the workspace."""
+    outside, root = tmp_path / 'elsewhere' / 'rob_tools', tmp_path / 'ws'
+    for name, text in ROB_TOOLS.items():
+        path = outside / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (root / 'src').mkdir(parents=True)
+    (root / 'src' / 'rob_tools').symlink_to(outside)
+    built = subprocess.run(
+        [sys.executable, COLCON, 'build', *option.split()], cwd=root, capture_output=True,
+        text=True, timeout=200, env={**os.environ, 'PYTHONWARNINGS': 'ignore'})
+    assert built.returncode == 0, built.stdout + built.stderr
+    program = root / 'install' / 'rob_tools' / 'lib' / 'rob_tools' / 'params'
+    if embedded():
+        assert program.read_text().startswith(f'#!{sys.executable}')
+        assert computer.run(f'ls {sys.executable}', check=False).returncode != 0
+    path = tmp_path / 'params.launch.py'
+    path.write_text(textwrap.dedent(f"""
+        from fogros2 import FogROSLaunchDescription, Node, SSHInstance
+        from launch_ros.substitutions import FindPackageShare
+
+
+        def generate_launch_description():
+            machine = SSHInstance(
+                '{computer.address}', '{computer.user}', key='{computer.key}',
+                host_key='{computer.host_key}', name='params-{RUN}', ros_workspace='{root}')
+            return FogROSLaunchDescription([Node(
+                machine=machine, package='rob_tools', executable='params', output='screen',
+                parameters=[[FindPackageShare('rob_tools'), '/speed.yaml']])])
+        """))
+    run = launch(str(path))
+    assert run.ended() == 0, run.text
+    assert 'speed is 42' in run.text
+    assert 'WARNING' not in run.text and run.errors == [], run.text

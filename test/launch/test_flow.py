@@ -289,6 +289,21 @@ def test_output_is_prefixed_by_machine_and_process(run, fake, planner, capfd):
     assert texts == [b'trouble\n']
 
 
+@pytest.mark.parametrize('text', [
+    'qt.qpa.xcb: could not connect to display\n', '(view): Gtk-WARNING: cannot open display: \n',
+    'Could not load the Qt platform plugin "xcb" in "" even though it was found.\n'])
+def test_a_node_that_opens_a_window_gets_one_hint(run, fake, planner, capfd, text):
+    def fails(machine, node):
+        for _ in range(2):
+            machine.say('output', node, stream='stderr', text=text)
+        machine.say('exited', node, returncode=-6, respawns=False)
+
+    fake.on_start = fails
+    assert run(LaunchDescription([talker(planner)])) == 0
+    said = capfd.readouterr()
+    assert (said.out + said.err).count('a machine has no screen: run the node on the robot') == 1
+
+
 def test_output_for_the_log_alone(run, fake, planner, capfd):
     def speaks(machine, node):
         machine.say('output', node, stream='stdout', text='for the log\n')

@@ -370,3 +370,18 @@ def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path
     prefix = Path(todo.install.environment['AMENT_PREFIX_PATH'])
     assert (prefix / 'share/ament_index/resource_index/packages/fogros2_examples').exists()
     assert os.access(prefix / 'lib/fogros2_examples/talker', os.X_OK)
+
+
+def test_an_unbuilt_workspace_says_so_where_nothing_builds_it(tmp_path: Path) -> None:
+    manifest = tmp_path / 'src/demo/package.xml'
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text('<package><name>demo</name></package>')
+    space = bootstrap.workspaces.inspect(tmp_path)
+    there = dataclasses.replace(
+        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': frozenset({'rmw_cyclonedds_cpp'})},
+        programs=TOOLS)
+    with pytest.raises(WorkspaceError) as error:
+        bootstrap.plan(MachineSpec('m', 'ssh', workspace=str(tmp_path)), there, there, UNDER,
+                       WHEELS, space)
+    assert '(it is not built), which has no colcon' in str(error.value)
+    assert error.value.hint == 'run colcon build here first'

@@ -43,6 +43,29 @@ def test_people_get_a_line_and_a_remedy(
     assert 'unset it' in lines[at + 1]
 
 
+def test_a_missing_python_package_is_named() -> None:
+    """In a process of its own: doctor itself runs without paramiko."""
+    found = subprocess.run(
+        [sys.executable, '-c', "import sys; sys.modules['paramiko'] = None\n"
+         "from ros2cli.cli import main\n"
+         "main(argv=['fog', 'doctor', '--json', '--lan-seconds', '0'])"],
+        capture_output=True, text=True, timeout=60)
+    (check,) = [check for check in json.loads(found.stdout)
+                if check['name'] == 'Python packages']
+    assert check['verdict'] == 'failed' and check['detail'].startswith('paramiko not found')
+    assert 'python3-paramiko,' in check['remedy'] and 'Traceback' not in found.stderr
+
+
+def test_ros2_without_ros_says_so_in_a_line(tmp_path: Path) -> None:
+    program = Path(__file__).parents[2] / 'tools' / 'ros2.py'
+    said = subprocess.run(
+        [sys.executable, '-I', '-S', str(program), 'topic', 'list'], capture_output=True,
+        text=True, timeout=60)
+    assert said.returncode == 1 and said.stdout == ''
+    assert said.stderr.splitlines() == [
+        'ros2: ROS 2 is not sourced here: run ". /opt/ros/jazzy/setup.bash" first']
+
+
 def test_missing_programs_are_named_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     which = process.which
     monkeypatch.setattr(process, 'which', lambda p: None if p in ('wg', 'rsync') else which(p))

@@ -15,6 +15,8 @@ import pytest
 pytest.importorskip('ament_index_python.packages', reason='needs ROS 2, or its embedded default')
 pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
 
+from launch import LaunchContext
+
 from fogros2 import cloud_launch
 from fogros2.agent_client import cloud_launch_source
 from fogros2.cloud_launch import RefusedNode, resolve
@@ -176,3 +178,39 @@ def test_start_by_hand_says_what_the_file_is_for():
     assert 'cloud.launch.py is for the agent of a cloud machine' in line
     assert 'talker.container.launch.py' in line
     assert 'Traceback' not in done.stderr and 'KeyError' not in done.stderr
+
+
+def program(folder, first, text='import sys; print(sys.executable)'):
+    path = folder / 'program'
+    path.write_text(f'#!{first}\n{text}\n')
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize('lost', ['/gone/.venv/bin/python', '/gone/bin/python3.12'])
+def test_a_python_program_of_a_lost_python_runs_with_this_one(tmp_path, obey, lost):
+    process = obey._process({
+        'id': 'p', 'name': 'p', 'arguments': [program(tmp_path, lost)]})
+    context = LaunchContext()
+    process.prepare(context)
+    said = subprocess.run(process.process_description.final_cmd, capture_output=True, text=True)
+    assert said.stdout.strip() == sys.executable, said.stderr
+
+
+def test_a_program_whose_interpreter_is_there_keeps_it(tmp_path):
+    assert cloud_launch.interpreter([program(tmp_path, '/bin/sh')]) == []
+    assert cloud_launch.interpreter([program(tmp_path, '/usr/bin/env python3')]) == []
+    assert cloud_launch.interpreter(['/bin/sh']) == cloud_launch.interpreter([]) == []
+
+
+def test_a_program_of_another_lost_interpreter_is_refused(tmp_path, obey):
+    with pytest.raises(RefusedNode, match="is for the interpreter '/gone/bin/ruby'"):
+        obey._process({'id': 'p', 'name': 'p', 'arguments': [program(tmp_path, '/gone/bin/ruby')]})
+
+
+def test_a_package_that_is_a_lost_link_gets_no_guess(prefix, tmp_path):
+    index = prefix / 'share/ament_index/resource_index/packages'
+    (index / 'rob_tools').symlink_to(tmp_path / 'gone')
+    with pytest.raises(RefusedNode) as error:
+        resolve([{'share': 'rob_tools'}], {})
+    assert error.value.hint == 'is its workspace the one that travels?'

@@ -138,6 +138,43 @@ def test_a_program_in_the_index_is_found(prefix):
     plan.check_program('arm_planning', 'planner', ['/nowhere', prefix])
 
 
+@pytest.fixture
+def unsourced(tmp_path):
+    """Return a workspace with a package that is built, and one that isn't."""
+    for name in ('rob_tools', 'unbuilt'):
+        manifest = tmp_path / 'src' / name / 'package.xml'
+        manifest.parent.mkdir(parents=True)
+        manifest.write_text(f'<package><name>{name}</name></package>')
+    prefix = tmp_path / 'install' / 'rob_tools'
+    for path in ('share/ament_index/resource_index/packages/rob_tools', 'lib/rob_tools/params'):
+        (prefix / path).parent.mkdir(parents=True)
+        (prefix / path).touch()
+    return tmp_path
+
+
+def test_a_named_workspace_need_not_be_sourced(unsourced):
+    plan.check_program('rob_tools', 'params', [], str(unsourced))
+    with pytest.raises(WorkspaceError, match="no package is called 'rob_tools'"):
+        plan.check_program('rob_tools', 'params', [])
+
+
+def test_a_package_that_is_not_built_says_so(unsourced):
+    with pytest.raises(WorkspaceError) as error:
+        plan.check_program('unbuilt', 'params', [], str(unsourced))
+    assert str(error.value) == (f"package 'unbuilt' in {unsourced}/src/unbuilt is not built "
+                                f'(run colcon build in {unsourced})')
+
+
+def test_a_weak_guess_does_not_hide_the_hint(tmp_path):
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    for name in ('tracetools', *(f'package_{number}' for number in range(9))):
+        (index / name).touch()
+    with pytest.raises(WorkspaceError) as error:
+        plan.check_program('rob_tools', 'params', [str(tmp_path)])
+    assert 'tracetools' not in str(error.value) and 'ros_workspace=' in str(error.value)
+
+
 @pytest.mark.parametrize('package, executable, words', [
     ('arm_planing', 'planner', "did you mean 'arm_planning'"),
     ('arm_planning', 'plannr', "did you mean 'planner'"),

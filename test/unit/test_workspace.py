@@ -12,6 +12,10 @@ import pytest
 from fogros2 import workspace
 from fogros2.errors import WorkspaceError
 from fogros2.host import HostFacts, Python
+from fogros2.model import Result, SyncReport
+from fogros2.shell import sync
+from fogros2.testing.fakes import FakeShell
+from fogros2.waiting import Timeouts
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 ROBOT = HostFacts(system='ubuntu', release='24.04', architecture='x86_64', pythons=(PYTHON,),
@@ -191,6 +195,82 @@ def test_a_link_that_leaves_the_workspace_is_refused(root: Path, tmp_path: Path)
     (root / 'install/alpha/share/alpha/config.yaml').symlink_to(outside)
     with pytest.raises(WorkspaceError, match=f'link to {outside}'):
         plan(workspace.inspect(root))
+
+
+class Destined:
+    """What is known of a machine: how the workspace gets there."""
+
+    def __init__(self, way: workspace.WorkspacePlan) -> None:
+        self.workspace = way
+
+
+class Elsewhere(FakeShell):
+    """A machine whose root is a folder, where commands do nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(handlers={'sh': lambda command: Result(0, '', '')})
+        self.folder = folder
+
+    def sync(self, source: Path, target: str, **arguments: object) -> SyncReport:
+        """Send it by rsync."""
+        return sync.to_folder(source, f'{self.folder}{target}', **{  # type: ignore
+            'includes': (), 'on_progress': None, **arguments})
+
+
+@pytest.fixture
+def linked(root: Path, tmp_path: Path) -> Path:
+    """Return a package outside of the workspace that ``src/far`` is a link to."""
+    outside = package(tmp_path / 'elsewhere/far', 'far')
+    write(outside / 'far/__init__.py')
+    write(outside / '.git/config')
+    (root / 'src/far').symlink_to(outside)
+    install(root, 'far')
+    site = root / 'install/far/lib/python3.12/site-packages'
+    (site / 'far.egg-link').write_text(f'{root}/src/far\n')
+    return outside
+
+
+@pytest.mark.parametrize('machine', ['alike', 'arm'])
+def test_a_linked_package_travels_with_its_link(
+        root: Path, tmp_path: Path, linked: Path, machine: str) -> None:
+    facts = ROBOT if machine == 'alike' else HostFacts(
+        system='ubuntu', release='24.04', architecture='aarch64', pythons=(PYTHON,))
+    if machine == 'arm':
+        write(root / 'install/far/lib/libfar.so', 'ELF')
+    space = workspace.inspect(root)
+    assert space.linked == (linked,) and space.outside == ()
+    way = plan(space, facts)
+    assert bool(way.commands) == (machine == 'arm')
+    shell = Elsewhere(tmp_path / 'there')
+    workspace.transfer(shell, root, Destined(way), timeouts=Timeouts())
+    def there(path: Path) -> Path:
+        return tmp_path / 'there' / str(path).lstrip('/')
+
+    assert os.readlink(there(root / 'src/far')) == str(linked)
+    assert there(linked / 'far/__init__.py').is_file() and not there(linked / '.git').exists()
+
+
+def test_a_linked_file_is_refused(root: Path, tmp_path: Path) -> None:
+    outside = write(tmp_path / 'elsewhere/config.yaml')
+    (root / 'src/alpha/config.yaml').symlink_to(outside)
+    (root / 'install/alpha/share/alpha/config.yaml').symlink_to(root / 'src/alpha/config.yaml')
+    with pytest.raises(WorkspaceError, match=f'link to {outside}'):
+        plan(workspace.inspect(root))
+
+
+def test_prefixes_are_those_of_the_install_space(root: Path) -> None:
+    assert workspace.prefixes(str(root)) == [f'{root}/install/alpha']
+    assert workspace.prefixes(None) == workspace.prefixes('/nowhere') == []
+
+
+def test_a_workspace_is_sourced_unless_it_is_already(root: Path) -> None:
+    write(root / 'install/local_setup.sh',
+          f'AMENT_PREFIX_PATH={root}/install/alpha:$AMENT_PREFIX_PATH\necho hello\n')
+    before = {'AMENT_PREFIX_PATH': '/opt/ros/jazzy', 'PATH': os.environ['PATH']}
+    after = workspace.sourced(str(root), before)
+    assert after['AMENT_PREFIX_PATH'] == f'{root}/install/alpha:/opt/ros/jazzy'
+    assert workspace.sourced(str(root), after) is after
+    assert workspace.sourced(None, before) is before
 
 
 def test_links_into_ros_itself_may_stay(root: Path) -> None:

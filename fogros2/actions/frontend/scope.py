@@ -39,7 +39,8 @@ def _parse_action(parser: Parser, entity: Entity) -> Action:
             'machine', data_type=None, optional=True) is not None:
         from fogros2.actions.frontend import parsing
         cls, kwargs = parsing.node(entity, parser, _NODES[entity.type_name])
-        return cls(**kwargs)
+        node: Action = cls(**kwargs)
+        return node
     action = type(parser).parse_action(parser, entity)
     if isinstance(action, IncludeLaunchDescription):
         _reach([action])
