@@ -161,11 +161,11 @@ def varint(data: bytes, at: int) -> tuple[int, int]:
             return value, at
 
 
-async def foxglove(port: int, what: str, seen: Seen) -> None:
+async def foxglove(url: str, what: str, seen: Seen) -> None:
     """Watch a topic by Foxglove's protocol."""
     from websockets.asyncio.client import connect
-    async with connect(f'ws://127.0.0.1:{port}', subprotocols=['foxglove.sdk.v1'],
-                       max_size=None, compression=None) as link:
+    async with connect(url, subprotocols=['foxglove.sdk.v1'], max_size=None,
+                       compression=None) as link:
         async for message in link:
             if isinstance(message, bytes):
                 if message[0] == 1:
@@ -178,10 +178,10 @@ async def foxglove(port: int, what: str, seen: Seen) -> None:
                         {'id': 1, 'channelId': channel['id']}]}))
 
 
-async def rosbridge(port: int, what: str, seen: Seen) -> None:
+async def rosbridge(url: str, what: str, seen: Seen) -> None:
     """Watch a topic by rosbridge's protocol."""
     from websockets.asyncio.client import connect
-    async with connect(f'ws://127.0.0.1:{port}', max_size=None, compression=None) as link:
+    async with connect(url, max_size=None, compression=None) as link:
         await link.send(json.dumps({'op': 'subscribe', 'topic': f'/{what}'}))
         async for message in link:
             told = json.loads(message)['msg']
@@ -194,12 +194,12 @@ async def rosbridge(port: int, what: str, seen: Seen) -> None:
 
 
 async def watch(
-    viewer: Callable[..., Any], port: int, what: str, count: int, seconds: float,
+    viewer: Callable[..., Any], url: str, what: str, count: int, seconds: float,
     processes: list[subprocess.Popen[bytes]],
 ) -> tuple[list[Seen], float]:
     """Return what viewers have got, and the servers' CPU (%)."""
     crowd = [Seen() for _ in range(count)]
-    tasks = [asyncio.ensure_future(viewer(port, what, seen)) for seen in crowd]
+    tasks = [asyncio.ensure_future(viewer(url, what, seen)) for seen in crowd]
     try:
         deadline = time.monotonic() + PATIENCE
         while not all(len(seen.sizes) > WARM_UP for seen in crowd):
@@ -276,11 +276,15 @@ def listens(port: int) -> None:
 def by_bridge(what: str, count: int, seconds: float) -> tuple[list[Seen], float]:
     """Watch what a node publishes through the bridge and its gate."""
     port = free_port()
-    with process(__file__, '--publish', what), process(
-            '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}') as served:
+    with tempfile.TemporaryDirectory() as folder, \
+            process(__file__, '--publish', what), process(
+                '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}',
+                '--secrets', folder) as served:
         listens(port)
         time.sleep(1.0)  # the bridge itself, behind the gate
-        return asyncio.run(watch(foxglove, port, what, count, seconds, [served]))
+        token = Path(folder, 'token').read_text().strip()
+        return asyncio.run(watch(foxglove, f'ws://127.0.0.1:{port}/?token={token}', what, count,
+                                 seconds, [served]))
 
 
 def by_rosbridge(what: str, seconds: float) -> tuple[list[Seen], float]:
@@ -291,7 +295,7 @@ def by_rosbridge(what: str, seconds: float) -> tuple[list[Seen], float]:
             str(ROOT / 'benchmarks/figures/rosbridge.py'), f'/{what}', *kind,
             str(port)) as served:
         listens(port)
-        return asyncio.run(watch(rosbridge, port, what, 1, seconds, [served]))
+        return asyncio.run(watch(rosbridge, f'ws://127.0.0.1:{port}', what, 1, seconds, [served]))
 
 
 def median(crowd: list[Seen], share: float = 0.5) -> float:

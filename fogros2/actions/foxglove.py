@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 import logging
+import os
+import shutil
 from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import OpaqueFunction, RegisterEventHandler
-from launch.event_handlers import OnProcessStart
+from launch.event_handlers import OnProcessStart, OnShutdown
 import launch.logging
 
 from fogros2.actions import networks, words
@@ -20,6 +22,7 @@ from fogros2.actions.remote import send
 from fogros2.errors import ConfigurationError, Unsupported
 from fogros2.model import NodeSpec
 from fogros2.monitor import credentials, urls
+from fogros2.store import Store
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -37,15 +40,15 @@ class Foxglove(Action):
     """
     Serves the topics that a machine sees to Foxglove, or Lichtblick, in a browser.
 
-    The bridge listens on the machine's loopback and in the VPN: the robot gets there, and whoever
-    may enter the machine, by ``ros2 fog monitor``. A machine that turns out to be the robot itself
-    serves on its loopback alone.
+    The bridge listens on the machine's loopback and in the VPN, and lets in who has its token.
+    That is printed by ``ros2 fog monitor``, for the robot and all who may enter the machine. A
+    machine that turns out to be the robot itself serves on its loopback alone.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param topics: patterns (``*``, ``?``) of the topics to show.
     :param port: TCP port; the two after it are for others than the robot, and the application.
     :param monitor_allow: networks (CIDR) from which others than the robot get in, at the port
-        after that one, over TLS and with a token; through the provider's firewall, where it has
+        after that one, over TLS and with the token; through the provider's firewall, where it has
         one. The machine itself turns all others away.
     :param image: container image of the web application, served at the same port where the machine
         can run it; '' for none.
@@ -77,11 +80,10 @@ class Foxglove(Action):
         topics = [words.resolve(context, topic) for topic in self._topics]
         allow = networks.resolve(context, self._allow)
         if coordinator.on_robot(self.machine):
-            process = Carrier(_bridge('robot', port, topics))
-            return [process, _once_started(process, lambda: _logger().info(
-                f"Foxglove: {urls.app(urls.bridge('localhost', port))}"))]
+            return self._on_robot(coordinator, port, topics)
         session = coordinator.session(self.machine)
-        options = ['--vpn', str(port)]
+        folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)
+        options = ['--secrets', folder, '--vpn', str(port)]
         provider = coordinator.launch.provider(session.spec.provider)
         if session.spec.monitored and provider.application_port:
             options += ['--application', f'127.0.0.1:{provider.application_port}']
@@ -89,12 +91,26 @@ class Foxglove(Action):
             provider.check_containers(session.spec)
             options += ['--image', words.resolve(context, self._image)]
         if allow:
-            folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)
-            options += ['--guarded', str(urls.guarded_port(port)), '--secrets', folder,
-                        *(word for network in allow for word in ('--allow', network))]
+            options += ['--guarded', str(urls.guarded_port(port)), *(
+                word for network in allow for word in ('--allow', network))]
         process = Carrier(_bridge(session.spec.name, port, topics, options))
         send(process, session.spec.name)
         return [process, _once_started(process, lambda: _tell(session, port, allow))]
+
+    def _on_robot(
+        self, coordinator: Coordinator, port: int, topics: Sequence[str],
+    ) -> list[LaunchDescriptionEntity]:
+        """Serve what the robot sees, on its loopback; the token goes with the launch."""
+        machine = coordinator.resolve(self.machine)
+        name = machine if isinstance(machine, str) else machine.name
+        folder = credentials.on_robot(Store(), name)
+        process = Carrier(_bridge('robot', port, topics, [
+            '--secrets', credentials.folder_of(str(folder), port, str(os.getpid()))]))
+        return [process, _once_started(process, lambda: _logger().info(
+            f"{name}: Foxglove at {urls.bridge('localhost', port)}; "
+            f'in a browser: ros2 fog monitor {name}')),
+            RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: shutil.rmtree(
+                folder, ignore_errors=True)))]
 
 
 def _port(value: Union[int, str]) -> int:

@@ -95,7 +95,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--image', required=True)
     parser.add_argument('--port', type=int, required=True, help='of the loopback')
-    parser.add_argument('--at', required=True, help='where people find it')
+    parser.add_argument('--name', required=True, help="the machine's")
     options = parser.parse_args(arguments)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -103,17 +103,17 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     threading.Thread(target=_until_eof, args=(ended,), daemon=True).start()
     application = Application(options.image, options.port, ended)
     try:
-        _start(application, options.at)
+        _start(application, options.name)
         ended.wait()
     finally:
         application.stop()
 
 
-def _start(application: Application, at: str) -> None:
-    """Start it and say where it is, or why there is none: the bridge goes on without."""
+def _start(application: Application, name: str) -> None:
+    """Start it and say how people find it, or why there is none: the bridge goes on without."""
     try:
         application.start()
-        say(f'the web application is at {at}')
+        say(f'the web application is there: ros2 fog monitor {name}')
     except Cancelled:
         pass
     except CommandError as error:

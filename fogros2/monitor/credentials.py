@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The certificate and the token by which others than the robot come in, made on the machine.
+What lets viewers in, made on the machine: the token, and for others than the robot a certificate.
 
 Neither key nor certificate nor token is ever sent there. The robot reads the token and the
-certificate over its Shell when somebody asks for them (``ros2 fog monitor --share``).
+certificate over its Shell when somebody asks for them (``ros2 fog monitor``).
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ import ssl
 
 from fogros2 import process
 from fogros2.model import Command
+from fogros2.store import Store
 
 #: Days for which a certificate is valid; longer than machines live.
 DAYS = 365
 _SECONDS = 60.0
+#: What the name of the folder begins with that the credentials of one port are in.
+_OURS = 'monitor-'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,31 +55,54 @@ def folder_of(agent: str, port: int, launch: str) -> str:
     :param agent: the agent's folder there.
     :param port: the bridge's.
     """
-    return f'{agent}/monitor-{port}/{launch}'
+    return f'{agent}/{_OURS}{port}/{launch}'
+
+
+def on_robot(store: Store, name: str) -> Path:
+    """Return the folder that stands for the agent's where the machine ``name`` is the robot."""
+    return store.root / f'monitor-{name}'
+
+
+def make_token(folder: Path) -> Credentials:
+    """
+    Make the token unless it is there; remove earlier launches' beside one of :func:`folder_of`.
+
+    :param folder: the launch's own; made with what is above it, 0700.
+    :raises OSError: it can't be written.
+    """
+    found = Credentials(folder)
+    if not found.token.exists():
+        if folder.parent.name.startswith(_OURS):
+            shutil.rmtree(folder.parent, ignore_errors=True)
+        for each in (*reversed(folder.parents), folder):
+            each.mkdir(mode=0o700, exist_ok=True)
+        unfinished = folder / 'token.new'
+        unfinished.touch(mode=0o600)
+        unfinished.write_text(secrets.token_urlsafe(24) + '\n')
+        unfinished.rename(found.token)
+    return found
 
 
 def make(folder: Path, name: str) -> Credentials:
     """
-    Make what isn't there yet, and remove what earlier launches had beside it.
+    Make the token, the key and the certificate, each unless it is there.
 
-    :param folder: 0700 with what is above it; the launch's own.
+    :param folder: see :func:`make_token`.
     :param name: the machine's.
     :raises FogError: there is no ``openssl``, or it fails.
     """
-    found = Credentials(folder)
-    if found.token.exists():
+    found = make_token(folder)
+    if found.certificate.exists():
         return found
-    shutil.rmtree(folder.parent, ignore_errors=True)
-    for each in (folder.parent, folder):
-        each.mkdir(mode=0o700)
+    unfinished = folder / 'certificate.new'
     process.run(Command((
         'openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1',
         '-nodes', '-sha256', '-days', str(DAYS), '-keyout', str(found.key),
-        '-out', str(found.certificate), '-subj', f'/CN={name}',
+        '-out', str(unfinished), '-subj', f'/CN={name}',
         '-addext', f'subjectAltName=DNS:{name}'), what='make a certificate'), timeout=_SECONDS)
     found.key.chmod(0o600)
     # last: where it is, all is
-    found.token.write_text(secrets.token_urlsafe(24) + '\n')
+    unfinished.rename(found.certificate)
     return found
 
 

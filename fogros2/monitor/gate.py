@@ -2,11 +2,12 @@
 """
 What stands before the bridge: it listens where the bridge doesn't, and lets in who may.
 
-The bridge itself listens on loopback. The gate takes connections on the VPN's address and hands
-them on; where others than the robot were allowed in, it takes theirs on a port of its own, from
-the networks that were named alone, over TLS, and hands on those alone whose request carries the
-token: ``wss://ADDRESS:PORT/?token=TOKEN``. All else is turned away, and logged once per address
-and cause, so that nobody fills the disk by knocking.
+The bridge itself asks nobody who he is, and a browser connects to it for any page that it shows.
+So each door of the gate hands on requests alone that carry the token
+(``ws://ADDRESS:PORT/?token=TOKEN``) and that no other site's page makes: on the loopback, on the
+VPN's address, and where others than the robot were allowed in, on a port of its own, from the
+networks that were named alone, over TLS. All else is turned away, and logged once per address and
+cause, so that nobody fills the disk by knocking.
 
 A request for a page goes to the web application where the machine has one, else the gate's own
 page leads to those that others host.
@@ -31,7 +32,7 @@ import sys
 from typing import Optional, Union
 
 from fogros2.monitor import page
-from fogros2.monitor.request import check, parse, Refused, Request
+from fogros2.monitor.request import check, check_site, parse, Refused, Request
 
 #: Variable of all nodes on a machine: its address in the VPN.
 VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'
@@ -53,14 +54,12 @@ Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
 @dataclasses.dataclass(frozen=True)
 class Guard:
     """
-    Who may come in by a door that is open to others than the robot.
+    What a door that is open to others than the robot takes beside the token.
 
     :param allowed: the networks that may knock; all if there are none.
-    :param token: what requests have to carry.
     """
 
     tls: ssl.SSLContext
-    token: str
     allowed: tuple[Network, ...] = ()
 
     def lets_knock(self, peer: str) -> bool:
@@ -74,14 +73,17 @@ class Gate:
     Hands connections on.
 
     :param to: address and port of the bridge.
+    :param token: what requests have to carry.
     :param application: those of the web application, None where there is to be none.
     :param name: of the machine.
     """
 
     def __init__(
-        self, to: tuple[str, int], application: Optional[tuple[str, int]] = None, name: str = '',
+        self, to: tuple[str, int], token: str, application: Optional[tuple[str, int]] = None,
+        name: str = '',
     ) -> None:
         self._to = to
+        self._token = token
         self._application = application
         self._name = name
         self._logged: set[tuple[str, str]] = set()
@@ -91,7 +93,7 @@ class Gate:
         Take connections until cancelled.
 
         :param listener: a socket that listens, and doesn't block.
-        :param guard: without one, whoever gets here may come in.
+        :param guard: of the door for others than the robot.
         """
         loop = asyncio.get_running_loop()
         connections: set[asyncio.Task[None]] = set()
@@ -130,12 +132,12 @@ class Gate:
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         try:
             request = parse(await _head(reader))
-            if guard is not None:
-                check(request, guard.token)
-            await self._lead(request, reader, writer, guard.token if guard else '')
+            check_site(request, self._name, encrypted=guard is not None)
+            check(request, self._token)
+            await self._lead(request, reader, writer, encrypted=guard is not None)
         except Refused as refused:
             self._turn_away(peer, str(refused))
-            writer.write(page.answer(refused.status))
+            writer.write(page.refusal(refused.status, self._name))
         except (OSError, asyncio.IncompleteReadError):
             pass  # gone before it said what it wants
         finally:
@@ -143,7 +145,7 @@ class Gate:
 
     async def _lead(
         self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
-        token: str,
+        *, encrypted: bool,
     ) -> None:
         """Hand a request on to whom it is for, or answer it."""
         if request.websocket:
@@ -161,10 +163,11 @@ class Gate:
         except OSError:
             # the one name that browsers ask for by themselves isn't a page
             writer.write(page.answer('404 Not Found') if request.target == '/favicon.ico'
-                         else page.links(request, self._name, token))
+                         else page.links(request, self._name, self._token,
+                                         encrypted=encrypted))
             return
-        if request.given and token:
-            writer.write(page.redirect(request, token))
+        if request.given:
+            writer.write(page.redirect(request, self._token, encrypted=encrypted))
             await _closed(inner[1])
             return
         # one request each: the next may be for the bridge
@@ -273,7 +276,7 @@ async def _run(options: argparse.Namespace) -> None:
         loop.add_signal_handler(number, ended.cancel)
     if options.until_eof:
         loop.add_reader(0, ended.cancel)  # nothing is ever written there
-    gate = Gate(options.to, options.application, options.name)
+    gate = Gate(options.to, _token(options.token_file), options.application, options.name)
     serving = [asyncio.ensure_future(gate.serve(_listen(address))) for address in options.listen]
     if options.guarded:
         serving.append(asyncio.ensure_future(
@@ -284,15 +287,19 @@ async def _run(options: argparse.Namespace) -> None:
             task.result()  # listening ends with an error alone
 
 
-def _guard(options: argparse.Namespace) -> Guard:
-    with open(options.token_file, encoding='ascii') as file:
+def _token(path: str) -> str:
+    with open(path, encoding='ascii') as file:
         token = file.read().strip()
     if not token:
-        raise SystemExit(f'gate: {options.token_file} holds no token')
+        raise SystemExit(f'gate: {path} holds no token')
+    return token
+
+
+def _guard(options: argparse.Namespace) -> Guard:
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     tls.minimum_version = ssl.TLSVersion.TLSv1_2
     tls.load_cert_chain(options.certificate, options.key)
-    return Guard(tls, token, tuple(options.allow))
+    return Guard(tls, tuple(options.allow))
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
@@ -300,17 +307,18 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--to', type=endpoint, required=True, help='where the bridge listens')
     parser.add_argument('--listen', type=endpoint, action='append', default=[],
-                        help='where to listen for whoever gets there')
+                        help='where to listen without TLS')
     parser.add_argument('--vpn', type=int, metavar='PORT', help=f'the same, at ${VPN_ADDRESS}')
     parser.add_argument('--until-eof', action='store_true',
                         help='end with the process that has the other end of the input')
     parser.add_argument('--guarded', type=endpoint,
-                        help='where to listen with TLS and a token; :PORT for every address')
+                        help='where to listen with TLS; :PORT for every address')
     parser.add_argument('--allow', type=network, action='append', default=[],
                         help='network (CIDR) that may knock there; all unless given')
     parser.add_argument('--certificate', help='PEM file')
     parser.add_argument('--key', help='PEM file')
-    parser.add_argument('--token-file', help='file with the token, so that no process list has it')
+    parser.add_argument('--token-file', required=True,
+                        help='file with the token, so that no process list has it')
     parser.add_argument('--application', type=endpoint, help='where the web application listens')
     parser.add_argument('--name', default=socket.gethostname(), help="the machine's, for people")
     options = parser.parse_args(arguments)
@@ -318,8 +326,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         if VPN_ADDRESS not in os.environ:
             parser.error(f'--vpn takes {VPN_ADDRESS}, which nodes on a machine have')
         options.listen.append((os.environ[VPN_ADDRESS], options.vpn))
-    if options.guarded and not (options.certificate and options.key and options.token_file):
-        parser.error('--guarded takes --certificate, --key and --token-file')
+    if options.guarded and not (options.certificate and options.key):
+        parser.error('--guarded takes --certificate and --key')
     asyncio.run(_run(options))
 
 

@@ -9,10 +9,9 @@ asks nobody; who opens this page is asked.
 from __future__ import annotations
 
 import html
-import ipaddress
 
 from fogros2.monitor import urls
-from fogros2.monitor.request import COOKIE, Request
+from fogros2.monitor.request import cookie, is_loopback, Request
 
 #: Says of an answer that it is the gate's own, not the application's.
 MARK = 'X-FogROS2-Gate'
@@ -46,28 +45,41 @@ def answer(status: str, body: str = '', *headers: str) -> bytes:
     return '\r\n'.join(head).encode('latin-1') + data
 
 
-def redirect(request: Request, token: str) -> bytes:
-    """Return the way to the same page without the token, which becomes a cookie."""
+def refusal(status: str, name: str) -> bytes:
+    """
+    Return the answer to a request that isn't let in.
+
+    :param name: of the machine.
+    """
+    return answer(status, _PAGE.format(name=html.escape(name), text=(
+        '<p>The address with its token is printed by</p>'
+        f'<p><code>ros2 fog monitor {html.escape(name)}</code></p>')
+        if status.startswith('401') else f'<p>{html.escape(status)}</p>'))
+
+
+def redirect(request: Request, token: str, *, encrypted: bool) -> bytes:
+    """Return the way to the same page without the token; a cookie gets what the page loads."""
     return answer(
         '303 See Other', '', f'Location: {request.target}',
-        f'Set-Cookie: {COOKIE}={token}; Path=/; Secure; HttpOnly; SameSite=Lax')
+        f'Set-Cookie: {"=".join(cookie(token))}; Path=/; HttpOnly; SameSite=Lax'
+        + ('; Secure' if encrypted else ''))
 
 
-def links(request: Request, name: str, token: str = '') -> bytes:
+def links(request: Request, name: str, token: str, *, encrypted: bool) -> bytes:
     """
     Return the page that leads to the web applications.
 
     :param name: of the machine.
-    :param token: what was asked for with it, over TLS; '' where none is needed.
+    :param encrypted: it was asked for over TLS.
     """
     # what was asked for is the one address that is known to get here from there
     where = request.host
-    address = urls.guarded(where, token) if token else f'ws://{where}'
+    address = urls.with_token(where, token, 'wss' if encrypted else 'ws')
     parts = [f'<p>The topics of this machine are at<br><code>{html.escape(address)}</code></p>']
-    if token:
+    if encrypted:
         parts.append('<p>The certificate is accepted: your browser will open this address in the '
                      'applications below, too.</p>')
-    if token or is_loopback(where):
+    if encrypted or is_loopback(where):
         parts.append('<ul>' + ''.join(
             f'<li><a href="{html.escape(urls.app(address, at))}">{title}</a></li>'
             for title, at in (('Lichtblick', urls.LICHTBLICK), ('Foxglove', urls.FOXGLOVE)))
@@ -78,13 +90,3 @@ def links(request: Request, name: str, token: str = '') -> bytes:
             'not encrypted by the browser. Take the desktop application, or</p>'
             f'<p><code>ros2 fog monitor {html.escape(name)}</code></p>')
     return answer('200 OK', _PAGE.format(name=html.escape(name), text='\n'.join(parts)))
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a Host header's value names the loopback."""
-    alone = host.rpartition(':')[0] if not host.endswith(']') and ':' in host else host
-    alone = alone.strip('[]')
-    try:
-        return ipaddress.ip_address(alone).is_loopback
-    except ValueError:
-        return alone == 'localhost'

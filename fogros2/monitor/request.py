@@ -7,11 +7,14 @@ from collections.abc import Sequence
 import dataclasses
 import hmac
 import http.cookies
+import ipaddress
 from typing import Optional
 import urllib.parse
 
-#: Name of the cookie that has the token, after the query had it.
-COOKIE = 'fogros2'
+from fogros2.monitor import urls
+
+#: What desktop applications say in ``Origin``, where they say anything.
+_DESKTOP = ('null', 'file://')
 
 
 class Refused(Exception):
@@ -29,16 +32,16 @@ class Request:
 
     :param target: path and query, without the token.
     :param given: the tokens in the query.
-    :param cookie: the token in a cookie, '' for none.
     :param host: whom it is for, in the words of who asks.
+    :param origins: the sites whose pages ask, in a browser's words.
     :param websocket: whether it asks for a WebSocket.
     :param lines: the header, line by line.
     """
 
     target: str
     given: tuple[str, ...]
-    cookie: str
     host: str
+    origins: tuple[str, ...]
     websocket: bool
     version: str
     lines: tuple[str, ...]
@@ -47,13 +50,15 @@ class Request:
         """
         Return the request's head without the token.
 
-        :param closing: have the connection end with the answer.
+        :param closing: have the connection end with the answer, and leave the query out: it tells
+            the application's page, in the browser, of the bridge and its token.
         """
+        target = self.target.partition('?')[0] if closing else self.target
         left = [line for line in self.lines if not line.lower().startswith('cookie:')]
         if closing:
             left = [line for line in left if not line.lower().startswith('connection:')]
             left.append('Connection: close')
-        head = [f'GET {self.target} {self.version}', *left, '', '']
+        head = [f'GET {target} {self.version}', *left, '', '']
         return '\r\n'.join(head).encode('latin-1')
 
 
@@ -62,7 +67,7 @@ def parse(head: bytes) -> Request:
     Return what a request asks for.
 
     :param head: up to and with the empty line.
-    :raises Refused: it isn't a GET of HTTP/1.
+    :raises Refused: it isn't a GET of HTTP/1, or is for several hosts.
     """
     line, *lines = head.decode('latin-1').split('\r\n')[:-2]
     words = line.split(' ')
@@ -73,6 +78,9 @@ def parse(head: bytes) -> Request:
         query = urllib.parse.parse_qsl(url.query, keep_blank_values=True)
     except ValueError as error:
         raise Refused('400 Bad Request', 'what came is no request for a page') from error
+    hosts = _values(lines, 'host')
+    if len(hosts) > 1:
+        raise Refused('400 Bad Request', 'what came is for several hosts')
     given = tuple(value for name, value in query if name == 'token')
     path = url.path if url.path.startswith('/') else '/'
     left = urllib.parse.urlencode([item for item in query if item[0] != 'token']) \
@@ -80,8 +88,59 @@ def parse(head: bytes) -> Request:
     # one slash alone: '//x' would lead elsewhere where it is redirected to
     return Request(
         '/' + path.lstrip('/\\') + (f'?{left}' if left else ''), given,
-        _cookie(_values(lines, 'cookie')), next(iter(_values(lines, 'host')), ''),
+        ''.join(hosts), tuple(_values(lines, 'origin')),
         'websocket' in ','.join(_values(lines, 'upgrade')).lower(), words[2], tuple(lines))
+
+
+def check_site(request: Request, name: str, *, encrypted: bool) -> None:
+    """
+    Look at the site whose page asks: a browser that may come in asks for any page it shows.
+
+    ``Host`` has to be an address, or a name that nobody else can lead here (DNS rebinding); over
+    TLS the certificate stands for the name. ``Origin`` is missing, as desktop applications have
+    it, or the gate's own page, one of the applications that we lead to, or of this computer's.
+
+    :param name: the machine's.
+    :raises Refused: it is another site's.
+    """
+    alone = _without_port(request.host)
+    if not encrypted and not _is_address(alone) and alone not in ('localhost', name.lower()):
+        raise Refused('421 Misdirected Request', 'asks for a host of another name')
+    own = f'{"https" if encrypted else "http"}://{request.host}'
+    for origin in request.origins:
+        if origin not in (*_DESKTOP, *urls.APPLICATIONS, own) \
+                and not is_loopback(origin.partition('://')[2]):
+            raise Refused('403 Forbidden', "asks for another site's page")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a Host header's value names the loopback."""
+    alone = _without_port(host)
+    return alone == 'localhost' or _is_address(alone) and ipaddress.ip_address(alone).is_loopback
+
+
+def _without_port(host: str) -> str:
+    alone = host.rpartition(':')[0] if not host.endswith(']') and ':' in host else host
+    return alone.strip('[]').lower()
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def cookie(token: str) -> tuple[str, str]:
+    """
+    Return name and value of the cookie that gets pages, after the query had the token.
+
+    The value isn't the token: a browser shows it to all ports of a host, so on the loopback to
+    whatever listens there. Each gate has a name of its own, for the same reason.
+    """
+    digest = hmac.new(token.encode(), b'pages', 'sha256').hexdigest()
+    return f'fogros2-{digest[:8]}', digest[8:]
 
 
 def check(request: Request, token: str) -> None:
@@ -93,10 +152,12 @@ def check(request: Request, token: str) -> None:
 
     :raises Refused: it lacks, or is another.
     """
+    name, value = cookie(token)
+    given = _cookie(_values(request.lines, 'cookie'), name)
     if request.given:
         right = len(request.given) == 1 and _same(request.given[0], token)
-    elif request.cookie and not request.websocket:
-        right = _same(request.cookie, token)
+    elif given and not request.websocket:
+        right = _same(given, value)
     else:
         raise Refused('401 Unauthorized', 'no token')
     if not right:
@@ -112,11 +173,11 @@ def _values(lines: Sequence[str], name: str) -> list[str]:
             if separator and key.lower() == name]
 
 
-def _cookie(values: Sequence[str]) -> str:
+def _cookie(values: Sequence[str], name: str) -> str:
     found: Optional[http.cookies.Morsel[str]] = None
     for value in values:
         try:
-            found = http.cookies.SimpleCookie(value).get(COOKIE, found)
+            found = http.cookies.SimpleCookie(value).get(name, found)
         except http.cookies.CookieError:
             continue  # another's
     return found.value if found is not None else ''

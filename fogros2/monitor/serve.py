@@ -5,13 +5,14 @@ Starts the bridge on a machine, with the gate before it and the web application 
     ros2 run fogros2 bridge [these options, and the gate's] --ros-args [the bridge's parameters]
 
 ``--topic PATTERN``     topics that are shown, all unless given
-``--guarded PORT``      lets others than the robot in there, over TLS and with a token
-``--secrets FOLDER``    where certificate, key and token for that are, or are made
+``--secrets FOLDER``    where the token and what TLS needs are, or are made
+``--guarded PORT``      lets others than the robot in there, over TLS
 ``--image IMAGE``       the web application's, '' for none
 
 Where ROS 2's own ``foxglove_bridge`` is installed that runs, otherwise
-:mod:`~fogros2.monitor.bridge`. Either listens on a free port of the loopback; the gate has the
-port that viewers know. Gate and application end when this process does, however that ends.
+:mod:`~fogros2.monitor.bridge`. Either listens on the loopback, at a port and an address of its
+net 127.0.0.0/8 that no page in a browser can guess: it takes no token. The gate has the port that
+viewers know. Gate and application end when this process does, however that ends.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
+import secrets
 import socket
 import subprocess
 import sys
@@ -30,10 +32,10 @@ from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from fogros2.errors import FogError
 from fogros2.monitor import credentials, urls
 from fogros2.monitor.application import say
-from fogros2.monitor.gate import VPN_ADDRESS
 
 #: What the parameter ``topics`` is called by ``foxglove_bridge``, which takes regular expressions.
 _WHITELIST = 'topic_whitelist'
+#: The web application has no data, and no token.
 _LOOPBACK = '127.0.0.1'
 
 
@@ -58,26 +60,28 @@ def regular_expression(pattern: str) -> str:
                    for c in pattern)
 
 
-def command(port: int, theirs: str, patterns: Sequence[str], ros_arguments: Sequence[str]) -> (
-        list[str]):
+def command(
+    address: str, port: int, theirs: str, patterns: Sequence[str], ros_arguments: Sequence[str],
+) -> list[str]:
     """
     Return the words that run a bridge.
 
-    :param port: of the loopback.
+    :param address: of the loopback, as for ``port``.
     :param theirs: the path of ``foxglove_bridge``, '' for our own.
     :param patterns: of the topics that are shown.
     """
     program = [theirs] if theirs else [sys.executable, '-m', 'fogros2.monitor.bridge']
     name, values = ('topics', list(patterns)) if not theirs else (
         _WHITELIST, [regular_expression(pattern) for pattern in patterns])
-    return [*program, '--ros-args', *ros_arguments, '-p', f'address:={_LOOPBACK}',
+    return [*program, '--ros-args', *ros_arguments, '-p', f'address:={address}',
             '-p', f'port:={port}', '-p', f'{name}:={json.dumps(values)}']
 
 
-def _free_port() -> int:
-    with socket.create_server((_LOOPBACK, 0)) as probe:
-        port: int = probe.getsockname()[1]
-    return port
+def hidden_place() -> tuple[str, int]:
+    """Return one of 16 million addresses of the loopback's net, and a port that is free there."""
+    address = '.'.join(['127', *(str(1 + secrets.randbelow(254)) for _ in range(3))])
+    with socket.create_server((address, 0)) as probe:
+        return address, int(probe.getsockname()[1])
 
 
 def guard(port: int, folder: str, name: str) -> list[str]:
@@ -95,7 +99,7 @@ def guard(port: int, folder: str, name: str) -> list[str]:
     say('the certificate has the SHA-256 '
         + credentials.fingerprint(made.certificate.read_text()))
     return ['--guarded', f':{port}', '--certificate', str(made.certificate),
-            '--key', str(made.key), '--token-file', str(made.token)]
+            '--key', str(made.key)]
 
 
 def main() -> None:
@@ -106,17 +110,21 @@ def main() -> None:
     parser.add_argument('--topic', action='append', default=[])
     parser.add_argument('--vpn', type=int)
     parser.add_argument('--guarded', type=int)
-    parser.add_argument('--secrets', default='')
+    parser.add_argument('--secrets', required=True)
     parser.add_argument('--image', default='')
     parser.add_argument('--name', default=socket.gethostname())
     ours, gate = parser.parse_known_args(words[:at])
-    gate += ['--name', ours.name]
+    folder = os.path.expandvars(ours.secrets)
+    try:
+        made = credentials.make_token(Path(folder))
+    except OSError as error:
+        raise SystemExit(f'nobody could be let in without a token: {error}') from error
+    gate += ['--name', ours.name, '--token-file', str(made.token)]
     if ours.vpn is not None:
         gate += ['--vpn', str(ours.vpn)]
     if ours.guarded is not None:
-        folder = os.path.expandvars(ours.secrets)
         gate += guard(ours.guarded, folder, ours.name)
-    port = _free_port()
+    address, port = hidden_place()
     end, kept = os.pipe()
     os.set_inheritable(kept, True)  # by the bridge: when it is closed the others end
     if ours.image and ours.vpn is not None:
@@ -125,12 +133,12 @@ def main() -> None:
         subprocess.Popen(
             [sys.executable, '-m', 'fogros2.monitor.application', '--image', ours.image,
              '--port', str(inside),
-             '--at', urls.served(os.environ.get(VPN_ADDRESS, 'localhost'), ours.vpn)], stdin=end)
+             '--name', ours.name], stdin=end)
     subprocess.Popen(
-        [sys.executable, '-m', 'fogros2.monitor.gate', '--to', f'{_LOOPBACK}:{port}',
+        [sys.executable, '-m', 'fogros2.monitor.gate', '--to', f'{address}:{port}',
          '--until-eof', *gate], stdin=end)
     os.close(end)
-    words = command(port, foxglove_bridge(), ours.topic or ['*'], words[at + 1:])
+    words = command(address, port, foxglove_bridge(), ours.topic or ['*'], words[at + 1:])
     os.execv(words[0], words)
 
 

@@ -7,9 +7,11 @@ import urllib.parse
 
 #: Port on which viewers expect a bridge.
 PORT = 8765
-#: Foxglove's application, and Lichtblick's, as their makers host them.
+#: Foxglove's application, and Lichtblick's, as their makers host them, and what a browser says in
+#: ``Origin`` for their pages.
 FOXGLOVE = 'https://app.foxglove.dev/~/view'
 LICHTBLICK = 'https://lichtblick-suite.github.io/lichtblick/'
+APPLICATIONS = ('https://app.foxglove.dev', 'https://lichtblick-suite.github.io')
 #: Lichtblick as a container, which serves HTTP on port 8080. By digest: it is what it was when it
 #: was chosen, or it isn't taken.
 IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
@@ -32,17 +34,18 @@ def place(host: str, port: int) -> str:
 
 
 def bridge(host: str, port: int) -> str:
-    """Return a bridge's own address, for the desktop application."""
+    """Return a bridge's address without its token."""
     return f'ws://{place(host, port)}'
 
 
-def guarded(where: str, token: str) -> str:
+def with_token(where: str, token: str, scheme: str = 'ws') -> str:
     """
-    Return a bridge's address for others than the robot.
+    Return the address that opens a bridge.
 
     :param where: ``host:port``.
+    :param scheme: 'wss' at the port for others than the robot.
     """
-    return f'wss://{where}/?{urllib.parse.urlencode({"token": token})}'
+    return f'{scheme}://{where}/?{urllib.parse.urlencode({"token": token})}'
 
 
 def app(address: str, at: str = FOXGLOVE) -> str:
@@ -58,10 +61,14 @@ def app(address: str, at: str = FOXGLOVE) -> str:
     return f'{at}?{query}'
 
 
-def served(host: str, port: int) -> str:
+def served(where: str, token: str) -> str:
     """
     Return the address at which the gate before a bridge serves the application itself.
 
     Where the machine has none, a page is there that leads to those above.
+
+    :param where: ``host:port``.
     """
-    return app(bridge(host, port), f'http://{place(host, port)}/')
+    page = app(with_token(where, token), f'http://{where}/')
+    return f'{page}&{urllib.parse.urlencode({"token": token})}'
+

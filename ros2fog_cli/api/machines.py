@@ -121,11 +121,11 @@ class Entry:
 
     @property
     def monitor(self) -> str:
-        """Where a browser of this robot's sees its topics, '' while it serves none."""
+        """Where this robot sees its topics, with a token; '' while it serves none."""
         record = self.record
         if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
             return ''
-        return urls.served(record.vpn.address, record.monitor)
+        return urls.bridge(record.vpn.address, record.monitor)
 
     @property
     def launch(self) -> str:

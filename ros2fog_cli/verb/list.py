@@ -41,7 +41,8 @@ class ListVerb(VerbExtension):
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
         for entry in entries:
             if entry.monitor:
-                print(f'{entry.name}: topics at {entry.monitor}')
+                print(f'{entry.name}: topics at {entry.monitor}; '
+                      f'with its token: ros2 fog monitor {entry.name}')
         total = machines.total(entries, now)
         if total is not None:
             print(f'{table.cost(total[0])} an hour, {table.cost(total[1], 2)} so far, '

@@ -4,12 +4,17 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import threading
 from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
 
 if TYPE_CHECKING:
     from ros2fog_cli.api.machines import Entry
+
+#: Seconds in which a browser has to come for the page of this computer's own bridge.
+PATIENCE = 60.0
 
 
 class MonitorVerb(VerbExtension):
@@ -29,7 +34,10 @@ class MonitorVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve until interrupted."""
-        from ros2fog_cli.api import reach
+        from ros2fog_cli.api import monitor, reach
+        here = monitor.on_robot(args.name)
+        if here is not None and not args.share:
+            return show_here(args.name, *here, browser=not args.no_browser)
         entry = reach.find(args.name, warn, regions=args.region)
         return share(entry) if args.share else serve(entry, args.port, not args.no_browser)
 
@@ -42,6 +50,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     from ros2fog_cli.api import monitor, reach
     there = (entry.record.monitor if entry.record is not None else 0) or urls.PORT
     with reach.session(entry) as shell:
+        token = monitor.token_of(entry, shell, there)
         try:
             tunnel = Tunnel(shell, ('127.0.0.1', there), port=port, say=warn)
         except OSError as error:
@@ -49,20 +58,53 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
                 f'port {port} of this computer: {error.strerror}',
                 'another --port, or none for one that is free') from error
         with monitor.carrying(tunnel) as ended:
+            where = urls.place('localhost', tunnel.port)
+            page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:', where, token,
+                       application=monitor.has_application(tunnel.port, token))
             try:
-                address = urls.bridge('localhost', tunnel.port)
-                pages = [urls.served('localhost', tunnel.port)] \
-                    if monitor.has_application(tunnel.port) else \
-                    [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
-                print(f'{entry.name} is at {address} until Ctrl-C; in a browser:', *pages,
-                      sep='\n', flush=True)
-                if browser:
-                    import webbrowser
-                    webbrowser.open(pages[0])
-                ended.wait()
+                with contextlib.ExitStack() as undo:
+                    if browser:
+                        start_browser(page, undo)
+                    ended.wait()
             except KeyboardInterrupt:
                 print()
     return 0
+
+
+def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
+    """Say where the bridge of this computer is, with its token, and lead a browser there."""
+    from fogros2.monitor import urls
+    page = say(f'{name} is at {{}}; in a browser:', urls.place('localhost', port), token)
+    with contextlib.ExitStack() as undo:
+        if browser:
+            start_browser(page, undo).wait(PATIENCE)
+    return 0
+
+
+def say(what: str, where: str, token: str, *, application: bool = False) -> str:
+    """Print a bridge's address, in place of the braces, and its pages; return the first one."""
+    from fogros2.monitor import urls
+    address = urls.with_token(where, token)
+    pages = [urls.served(where, token)] if application else \
+        [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
+    print(what.format(address), *pages, sep='\n', flush=True)
+    return pages[0]
+
+
+def start_browser(page: str, undo: contextlib.ExitStack) -> threading.Event:
+    """
+    Start a browser that shows a page, without the page's address on its command line.
+
+    Returns an event that is set when it came, or there is none.
+    """
+    import webbrowser
+
+    from ros2fog_cli.api.monitor import Ticket
+    ticket = Ticket(page)
+    undo.callback(ticket.close)
+    if not webbrowser.open(ticket.url):
+        ticket.used.set()
+    return ticket.used
 
 
 def share(entry: Entry) -> int:
@@ -71,7 +113,7 @@ def share(entry: Entry) -> int:
     from ros2fog_cli.api import monitor, reach
     with reach.session(entry) as shell:
         where, token, fingerprint = monitor.credentials_of(entry, shell)
-    address = urls.guarded(where, token)
+    address = urls.with_token(where, token, 'wss')
     print(f'{address}\n\n'
           'A browser has to be shown the certificate once, here:\n'
           f'https://{address[len("wss://"):]}\n'

@@ -76,28 +76,36 @@ def program(module: str, *words: str) -> Iterator[queue.Queue[str]]:
         process.stdout.close()
 
 
-def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image):
+def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image, tmp_path):
+    token = tmp_path / 'token'
+    token.write_text('sesame\n')
     inside, outside = free_port(), free_port()
     with program('gate', '--to', '127.0.0.1:1', '--listen', f'127.0.0.1:{outside}',
-                 '--application', f'127.0.0.1:{inside}', '--until-eof') as gate:
+                 '--application', f'127.0.0.1:{inside}', '--token-file', str(token),
+                 '--until-eof') as gate:
         assert gate.get(timeout=20) == f'listening on 127.0.0.1:{outside}'
-        assert not has_application(outside)
+        assert not has_application(outside, 'sesame')
         with program('application', '--image', image, '--port', str(inside),
-                     '--at', urls.served('localhost', outside)) as said:
+                     '--name', 'planner') as said:
             assert said.get(timeout=60) == (
-                f'the web application is at http://localhost:{outside}/?ds=foxglove-websocket&'
-                f'ds.url=ws%3A%2F%2Flocalhost%3A{outside}')
-            assert has_application(outside)
+                'the web application is there: ros2 fog monitor planner')
+            assert has_application(outside, 'sesame')
             link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
             with contextlib.closing(link):
-                link.request('GET', '/index.html?ds=x')
+                place = urls.served('', 'sesame').removeprefix('http://')
+                link.request('GET', place)
+                led = link.getresponse()
+                led.read()
+                assert led.getheader('Location').startswith('/?ds=')
+                link.request('GET', led.getheader('Location'), headers={
+                    'Cookie': led.getheader('Set-Cookie').partition(';')[0]})
                 assert link.getresponse().read() == b'the application'
             assert there(inside)
         assert not there(inside)
-        assert not has_application(outside)
+        assert not has_application(outside, 'sesame')
         link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
         with contextlib.closing(link):
-            link.request('GET', '/')
+            link.request('GET', '/?token=sesame')
             answer = link.getresponse()
             assert answer.getheader(page.MARK) and urls.LICHTBLICK.encode() in answer.read()
 
@@ -105,7 +113,7 @@ def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image):
 def test_what_can_not_be_had_is_said(engine):
     port = free_port()
     with program('application', '--image', 'localhost/fogt-no-such-image:1', '--port', str(port),
-                 '--at', 'x') as said:
+                 '--name', 'x') as said:
         assert said.get(timeout=60) == 'getting localhost/fogt-no-such-image:1'
         assert said.get(timeout=60).startswith('no web application here: ')
     assert not there(port)
@@ -116,6 +124,6 @@ def test_an_image_that_comes_slowly_does_not_keep_the_bridge_from_its_end(tmp_pa
     slow.write_text('#!/bin/sh\n[ "$1" = pull ] && exec sleep 600\nexit 1\n')
     slow.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
-    with program('application', '--image', 'x', '--port', str(free_port()), '--at', 'x') as said:
+    with program('application', '--image', 'x', '--port', str(free_port()), '--name', 'x') as said:
         assert said.get(timeout=60) == 'getting x'
     wait_until(lambda: said.empty() or None, timeout=5, what='silence')

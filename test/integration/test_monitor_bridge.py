@@ -281,14 +281,18 @@ def memory(process: subprocess.Popen[str]) -> float:
 
 
 @pytest.mark.parametrize('seconds', [8.0, pytest.param(30.0, marks=pytest.mark.soak)])
-def test_twenty_viewers_of_which_one_reads_nothing_leave_the_robot_alone(bench, seconds):
+def test_twenty_viewers_of_which_one_reads_nothing_leave_the_robot_alone(
+        bench, seconds, tmp_path):
+    token = tmp_path / 'token'
+    token.write_text('sesame\n')
     gate = bench.run('-m', 'fogros2.monitor.gate', '--to', bench.url.rpartition('/')[2],
-                     '--listen', '127.0.0.1:0')
+                     '--listen', '127.0.0.1:0', '--token-file', str(token))
     port = bench.until(lambda: re.search(
         r'listening on 127.0.0.1:(\d+)', ''.join(bench.lines)), 'a gate')[1]
     publishing = Publishing(bench)
     try:
-        crowd = bench.run_node('crowd.mjs', f'ws://127.0.0.1:{port}', '20', '/small', '/big')
+        crowd = bench.run_node('crowd.mjs', f'ws://127.0.0.1:{port}/?token=sesame', '20',
+                               '/small', '/big')
         assert crowd.stdout.readline() == 'ready\n'
         # what is kept for the one that doesn't read is full by then
         begun = publishing.rate(seconds / 2)

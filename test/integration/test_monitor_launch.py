@@ -38,6 +38,15 @@ def generate_launch_description():
     return FogROSLaunchDescription([CloudNode(
         machine=machine, package='fogros2_examples', executable='talker', name='talker')])
 """
+ON_ROBOT = """
+from fogros2 import CloudNode, ContainerInstance, Foxglove, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    machine = ContainerInstance(name='planner')
+    return FogROSLaunchDescription([Foxglove(machine), CloudNode(
+        machine=machine, package='fogros2_examples', executable='talker', name='talker')])
+"""
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -56,22 +65,24 @@ def sees_the_talker(url: str) -> None:
         viewer.close()
 
 
-def sees_by_a_tunnel(name: str) -> None:
-    tunnel = subprocess.Popen(
+@contextlib.contextmanager
+def tunnel(name: str) -> Iterator[str]:
+    """Yield a bridge's address, with its token, as the command line has it."""
+    process = subprocess.Popen(
         ['ros2', 'fog', 'monitor', name, '--no-browser'], stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, stdin=subprocess.DEVNULL)
     try:
-        near = re.search(r'is at (ws://localhost:\d+) ', tunnel.stdout.readline())[1]
+        url = re.search(r'is at (ws://localhost:\d+/\?token=\S+) ', process.stdout.readline())[1]
         # the machine runs no containers, and so has no application
         for page in ('https://app.foxglove.dev/~/view',
                      'https://lichtblick-suite.github.io/lichtblick/'):
-            assert tunnel.stdout.readline().startswith(
+            assert process.stdout.readline().startswith(
                 f'{page}?ds=foxglove-websocket&ds.url=ws%3A%2F%2F')
-        sees_the_talker(near)
+        yield url
     finally:
-        tunnel.send_signal(signal.SIGINT)
-        assert tunnel.communicate(timeout=30)[0] == '\n'
-    assert tunnel.returncode == 0
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=30)[0] == '\n'
+    assert process.returncode == 0
 
 
 @contextlib.contextmanager
@@ -95,7 +106,7 @@ def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = Tru
     with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError, ssl.SSLZeroReturnError), \
             socket.create_connection(at, timeout=20, source_address=(source, 0)) as plain, \
             context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
-        connection.sendall(f'GET {target} HTTP/1.1\r\nHost: x\r\n\r\n'.encode())
+        connection.sendall(f'GET {target} HTTP/1.1\r\nHost: {at[0]}\r\n\r\n'.encode())
         return connection.recv(4096)
     return b''
 
@@ -107,8 +118,7 @@ def test_an_application_is_watched(nothing_left, engine):
                           'foxglove:=true', 'trials:=0')
         launched.wait_for('in a browser: ros2 fog monitor grasping')
         launched.wait_for('serving ws://')
-        viewer = viewers.Viewer(CACHE, re.search(r'Foxglove at (ws://\S+?);', launched.text)[1])
-        try:
+        with tunnel('grasping') as url, contextlib.closing(viewers.Viewer(CACHE, url)) as viewer:
             viewer.look('/grasp_status')
             viewer.look('/camera_info')
             for topic in ('/depth', '/fogros2/grasping/depth', '/grasps', '/grasp_markers',
@@ -117,12 +127,28 @@ def test_an_application_is_watched(nothing_left, engine):
             assert viewer.message('/camera_info')['width'] == 640
             wait_until(lambda: 'grasps' in viewer.message('/grasp_status')['message'],
                        timeout=30.0, what='grasps')
-        finally:
-            viewer.close()
         launched.interrupt()
         assert launched.ended() == 0, launched.text
         assert launched.errors == [], launched.text
         assert '[WARNING] [fogros2]' not in launched.text
+
+
+def test_machine_that_is_the_robot_is_watched_with_its_token(nothing_left, tmp_path, state_home):
+    file = tmp_path / 'monitor.launch.py'
+    file.write_text(ON_ROBOT)
+    with launching() as launch:
+        launched = launch(str(file), '--machine', 'planner=robot')
+        launched.wait_for('planner: Foxglove at ws://localhost:8765; in a browser: '
+                          'ros2 fog monitor planner')
+        launched.wait_for('serving ws://')
+        told = ros2('fog', 'monitor', 'planner', '--no-browser').stdout
+        url = re.match(r'planner is at (ws://localhost:8765/\?token=(\S+)); in a browser:\n', told)
+        sees_the_talker(url[1])
+        assert knock(('localhost', 8765), '/', tls=False).startswith(b'HTTP/1.1 401 ')
+        launched.interrupt()
+        assert launched.ended() == 0, launched.text
+        assert url[2] not in launched.text
+    assert not list(state_home.rglob('token'))
 
 
 def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
@@ -156,23 +182,30 @@ def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
         sees_the_talker(url)
         assert b'certificate is accepted' in knock(at, target)
         inside = re.search(r'Foxglove at (ws://\S+?); in a browser', launched.text)
-        sees_the_talker(inside[1])
-        assert (f'{name}: topics at http{inside[1][len("ws"):]}/?ds=foxglove-websocket&'
+        vpn = tuple(inside[1].removeprefix('ws://').split(':'))
+        sees_the_talker(f'{inside[1]}/?token={token}')
+        assert knock(vpn, '/', tls=False).startswith(b'HTTP/1.1 401 ')
+        assert (f'{name}: topics at {inside[1]}; with its token: ros2 fog monitor {name}'
                 in ros2('fog', 'list').stdout)
         status = ros2('fog', 'status', name).stdout
         assert f'monitor open  {at[0]}:{at[1]}' in status and inside[1][len('ws'):] in status
-        sees_by_a_tunnel(name)
+        with tunnel(name) as near:
+            assert near.endswith(f'/?token={token}')
+            sees_the_talker(near)
+            port = int(re.search(r':(\d+)/', near)[1])
+            assert knock(('localhost', port), '/', tls=False).startswith(b'HTTP/1.1 401 ')
         with second_address(cloud_network, nobody):
             for _ in range(3):
                 assert knock(at, '/').startswith(b'HTTP/1.1 401 ')
                 assert knock(at, '/?token=wrong').startswith(b'HTTP/1.1 401 ')
                 assert b'200' not in knock(at, target, tls=False)
                 assert knock(at, target, source=nobody) == b''
-        for who, why in ((gateway, 'no token'), (gateway, 'a wrong token'),
-                         (gateway, 'no TLS: HTTP_REQUEST'),
+        robot = re.search(r'VPN interface .*\(\S+ (\S+)\)', launched.text)[1]
+        for who, why in ((robot, 'no token'), ('127.0.0.1', 'no token'), (gateway, 'no token'),
+                         (gateway, 'a wrong token'), (gateway, 'no TLS: HTTP_REQUEST'),
                          (nobody, 'not among the networks that are allowed')):
             launched.wait_for(f'turned away {who}: {why}')
-        assert launched.text.count('turned away') == 4
+        assert launched.text.count('turned away') == 6
         # where the machine is reached without the VPN, nobody listens without asking
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((at[0], 8765), timeout=20)

@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import http.client
 import os
+from pathlib import Path
 import shutil
+import socket
 from types import SimpleNamespace
+import urllib.parse
 
 from launch import LaunchContext
 from launch.substitutions import TextSubstitution
@@ -121,8 +126,7 @@ def entry(**changes):
 
 
 def test_where_topics_are_seen_is_told_while_a_launch_serves_them():
-    assert entry().monitor == ('http://198.18.7.2:8765/?ds=foxglove-websocket&'
-                               'ds.url=ws%3A%2F%2F198.18.7.2%3A8765')
+    assert entry().monitor == 'ws://198.18.7.2:8765'
     assert entry().to_json()['monitor_open'] == '198.51.100.9:8766'
     for changes in ({'monitor': 0}, {'pid': 0}, {'vpn': None}):
         assert entry(**changes).monitor == ''
@@ -145,6 +149,42 @@ def test_the_token_is_the_machine_s_to_tell(tmp_path):
             ({'monitor_open': ''}, ConfigurationError, 'nobody but this robot')):
         with pytest.raises(kind, match=said):
             monitor.credentials_of(entry(**changes), shell)
+
+
+def test_tunnel_reads_the_token_of_the_bridge_s_port():
+    shell = FakeShell(handlers={'sh': lambda command: Result(0, 'sesame\n', '')})
+    assert monitor.token_of(entry(), shell, 9000) == 'sesame'
+    assert [command.argv[2:] for command in shell.commands] == [
+        ('cat "$1"/*/token', 'sh', '/run/fogros2/monitor-9000')]
+    assert shell.commands[0].sudo
+
+
+def test_bridge_of_this_computer_is_found_while_it_listens():
+    folder = credentials.on_robot(Store(), 'planner')
+    with socket.create_server(('127.0.0.1', 0)) as bridge:
+        port = bridge.getsockname()[1]
+        made = credentials.make_token(Path(credentials.folder_of(str(folder), port, '1')))
+        assert monitor.on_robot('planner') == (port, made.token.read_text().strip())
+        assert monitor.on_robot('another') is None
+    assert monitor.on_robot('planner') is None
+
+
+def test_browser_is_led_to_the_page_once():
+    with contextlib.closing(monitor.Ticket('http://localhost:1/?token=sesame')) as ticket:
+        assert 'sesame' not in ticket.url
+        place = urllib.parse.urlsplit(ticket.url)
+
+        def ask(path: str) -> tuple[int, str]:
+            with contextlib.closing(http.client.HTTPConnection(place.netloc)) as link:
+                link.request('GET', path)
+                answer = link.getresponse()
+                return answer.status, answer.getheader('Location', '')
+
+        assert ask('/') == (404, '')
+        assert not ticket.used.is_set()
+        assert ask(place.path) == (303, 'http://localhost:1/?token=sesame')
+        assert ticket.used.is_set()
+        assert ask(place.path) == (404, '')
 
 
 def test_a_pod_s_service_keeps_the_callers_addresses():
@@ -186,7 +226,8 @@ def made(monkeypatch):
 
 def coordinated(monkeypatch, spec, *, on_robot=False):
     monkeypatch.setattr(foxglove, 'Coordinator', SimpleNamespace(of=lambda _: SimpleNamespace(
-        on_robot=lambda _: on_robot, session=lambda _: SimpleNamespace(spec=spec),
+        on_robot=lambda _: on_robot, resolve=lambda machine: machine,
+        session=lambda _: SimpleNamespace(spec=spec),
         launch=SimpleNamespace(id='abc123', provider=lambda _: FakeProvider()))))
 
 
@@ -216,6 +257,10 @@ def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, made, runs, on_
     told = streaming.remapped(made[0], {'/camera': '/fogros2/planner/camera'}).arguments
     assert told[-2:] == ('-r', '/camera:=/fogros2/planner/camera')
     # the robot's own has neither others nor an application
-    assert words[4:-5] == ([] if on_robot else [
-        '--vpn', '9000', *(['--image', 'x:1'] if runs else []), '--guarded', '9001',
-        '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--allow', *SOURCES])
+    if on_robot:
+        folder = credentials.on_robot(Store(), 'planner')
+        assert words[4:-5] == ['--secrets', f'{folder}/monitor-9000/{os.getpid()}']
+    else:
+        assert words[4:-5] == [
+            '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--vpn', '9000',
+            *(['--image', 'x:1'] if runs else []), '--guarded', '9001', '--allow', *SOURCES]

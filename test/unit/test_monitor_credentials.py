@@ -14,15 +14,16 @@ from fogros2 import process
 from fogros2.model import Command
 from fogros2.monitor import credentials
 
-pytestmark = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs openssl')
+with_openssl = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs openssl')
 
 
+@with_openssl
 def test_they_are_private_and_stay_for_a_launch(tmp_path):
     folder = Path(credentials.folder_of(str(tmp_path), 8765, 'a1b2c3'))
     made = credentials.make(folder, 'planner')
     token = made.token.read_text()
     assert len(token.strip()) == 32
-    for path in (folder, folder.parent, made.key):
+    for path in (folder, folder.parent, made.key, made.token):
         assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0
     ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(made.certificate, made.key)
     # a bridge that ended is started again, and who was let in stays in
@@ -33,12 +34,29 @@ def test_they_are_private_and_stay_for_a_launch(tmp_path):
     assert not folder.exists()
 
 
+@with_openssl
 def test_the_fingerprint_is_as_openssl_has_it(tmp_path):
     made = credentials.make(Path(credentials.folder_of(str(tmp_path), 1, 'x')), 'planner')
     said = process.run(Command(('openssl', 'x509', '-in', str(made.certificate), '-noout',
                         '-fingerprint', '-sha256')), timeout=20).stdout
     assert said.strip().partition('=')[2] == credentials.fingerprint(
         made.certificate.read_text())
+
+
+def test_folder_of_somebody_s_own_loses_nothing(tmp_path):
+    (tmp_path / 'mine').touch()
+    assert credentials.make_token(tmp_path / 'secrets').token.exists()
+    assert (tmp_path / 'mine').exists()
+
+
+def test_token_needs_no_openssl_and_gets_a_certificate_later(tmp_path, monkeypatch):
+    folder = Path(credentials.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
+    token = credentials.make_token(folder).token.read_text()
+    assert len(token.strip()) == 32
+    assert stat.S_IMODE((tmp_path / 'new').stat().st_mode) == 0o700
+    if shutil.which('openssl') is not None:
+        made = credentials.make(folder, 'planner')
+        assert made.certificate.exists() and made.token.read_text() == token
 
 
 def test_a_machine_without_openssl_lets_nobody_in(tmp_path, monkeypatch, capsys):

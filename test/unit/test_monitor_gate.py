@@ -21,7 +21,7 @@ import pytest
 
 from fogros2.monitor import credentials, page
 from fogros2.monitor.gate import endpoint, network, plain_address
-from fogros2.monitor.request import check, parse, Refused
+from fogros2.monitor.request import check, check_site, cookie, parse, Refused
 
 TOKEN = 'sesame-0123456789'
 
@@ -34,29 +34,75 @@ def test_the_token_is_taken_out_of_what_is_handed_on():
     for target, left in ((f'/a?x=1&token={TOKEN}&y=%20', '/a?x=1&y=+'),
                          (f'/?token={TOKEN}', '/'), ('/a?x=%20', '/a?x=%20')):
         assert parse(request(target)).handed_on() == request(left)
-    cookie = f'Cookie: a=b; fogros2={TOKEN}\r\nConnection: keep-alive\r\n'
-    assert parse(request('/', more=cookie)).handed_on(closing=True) == request(
-        '/', more='Connection: close\r\n')
+    more = f'Cookie: a=b; fogros2={TOKEN}\r\nConnection: keep-alive\r\n'
+    assert parse(request('/a?ds.url=x', more=more)).handed_on(closing=True) == request(
+        '/a', more='Connection: close\r\n')
 
 
-def test_a_page_may_have_the_token_in_a_cookie_and_a_websocket_may_not():
-    cookie = f'Cookie: a=b; fogros2={TOKEN}\r\n'
-    check(parse(request('/', more=cookie)), TOKEN)
+def test_a_cookie_gets_a_page_and_no_websocket():
+    name, value = cookie(TOKEN)
+    more = f'Cookie: a=b; {name}={value}\r\n'
+    check(parse(request('/', more=more)), TOKEN)
     with pytest.raises(Refused, match='no token'):
-        check(parse(request('/', more=f'{cookie}Upgrade: WebSocket\r\n')), TOKEN)
+        check(parse(request('/', more=f'{more}Upgrade: WebSocket\r\n')), TOKEN)
     with pytest.raises(Refused, match='a wrong token'):
-        check(parse(request('/', more='Cookie: fogros2=x\r\n')), TOKEN)
+        check(parse(request('/', more=f'Cookie: {name}=x\r\n')), TOKEN)
     with pytest.raises(Refused, match='no token'):
         check(parse(request('/', more='Cookie: ;;=\r\n')), TOKEN)
 
 
 @pytest.mark.parametrize('target', ['//evil.example/x', '/\\evil.example/x', 'http://x//evil'])
 def test_nobody_is_led_elsewhere(target):
-    answer = page.redirect(parse(request(f'{target}?token={TOKEN}')), TOKEN)
+    answer = page.redirect(
+        parse(request(f'{target}?token={TOKEN}')), TOKEN, encrypted=True)
     place, = (line for line in answer.split(b'\r\n') if line.startswith(b'Location: '))
     assert place[len('Location: '):][:2] not in (b'//', b'/\\')
-    assert TOKEN.encode() not in place
-    assert f'fogros2={TOKEN}; Path=/; Secure; HttpOnly; SameSite=Lax'.encode() in answer
+    assert TOKEN.encode() not in answer
+    assert f'={cookie(TOKEN)[1]}; Path=/; HttpOnly; SameSite=Lax; Secure'.encode() in answer
+
+
+@pytest.mark.parametrize(('host', 'origin'), [
+    ('localhost:8765', None), ('127.0.0.1:8765', 'null'), ('[::1]:8765', 'file://'),
+    ('198.18.1.2:8765', 'http://198.18.1.2:8765'), ('Planner:8765', 'https://app.foxglove.dev'),
+    ('198.18.1.2', 'https://lichtblick-suite.github.io'),
+    ('198.18.1.2:8765', 'http://localhost:8080'), ('198.18.1.2:8765', 'http://[::1]:8080'),
+])
+def test_sites_that_lead_to_the_bridge_may_ask(host, origin):
+    more = '' if origin is None else f'Origin: {origin}\r\n'
+    head = f'GET / HTTP/1.1\r\nHost: {host}\r\n{more}\r\n'.encode()
+    check_site(parse(head), 'planner', encrypted=False)
+
+
+@pytest.mark.parametrize(('host', 'origins', 'status'), [
+    ('localhost:8765', ['https://evil.example'], '403'),
+    ('localhost:8765', ['http://localhost.evil.example'], '403'),
+    ('localhost:8765', ['http://127.0.0.1.evil.example:8765'], '403'),
+    ('localhost:8765', ['https://app.foxglove.dev.evil.example'], '403'),
+    ('localhost:8765', ['http://evil@localhost'], '403'),
+    ('localhost:8765', ['null', 'https://evil.example'], '403'),
+    ('localhost:8765', ['http://198.18.1.2:8765'], '403'),
+    ('localhost:8765', [''], '403'),
+    ('evil.example:8765', ['http://evil.example:8765'], '421'),
+    ('evil.example:8765', [], '421'), ('', [], '421'),
+    ('localhost.evil.example', [], '421'), ('127.0.0.1.evil.example', [], '421'),
+    ('localhost\r\nHost: evil.example', [], '400'),
+])
+def test_other_sites_may_not_ask(host, origins, status):
+    more = ''.join(f'Origin: {origin}\r\n' for origin in origins)
+    with pytest.raises(Refused) as refused:
+        check_site(parse(f'GET / HTTP/1.1\r\nHost: {host}\r\n{more}\r\n'.encode()), 'planner',
+                   encrypted=False)
+    assert refused.value.status.startswith(status)
+    assert 'evil' not in str(refused.value), 'the log takes no words of a stranger'
+
+
+def test_certificate_stands_for_the_name_over_tls():
+    """A cluster's load balancer has a name that the machine doesn't know."""
+    head = 'GET / HTTP/1.1\r\nHost: lb.example:8766\r\nOrigin: {}\r\n\r\n'
+    check_site(parse(head.format('https://lb.example:8766').encode()), 'm', encrypted=True)
+    for other in ('https://evil.example', 'http://lb.example:8766'):
+        with pytest.raises(Refused, match='another site'):
+            check_site(parse(head.format(other).encode()), 'm', encrypted=True)
 
 
 @pytest.mark.parametrize(('head', 'status'), [
@@ -103,14 +149,14 @@ def test_addresses_are_what_they_are_whichever_socket_they_come_by():
 ])
 def test_a_page_leads_to_applications_that_may_open_the_bridge(host, links, shown):
     asked = parse(f'GET / HTTP/1.1\r\nHost: {host}\r\n\r\n'.encode())
-    text = page.links(asked, 'planner').decode()
-    assert (shown in text, 'https://' in text) == (True, links)
+    text = page.links(asked, 'planner', TOKEN, encrypted=False).decode()
+    assert (f'{shown}/?token={TOKEN}' in text, 'https://' in text) == (True, links)
     assert '<script>' not in text
 
 
 def test_who_came_with_the_token_is_led_on_with_it():
     asked = parse(b'GET /?token=x HTTP/1.1\r\nHost: 198.51.100.2:8766\r\n\r\n')
-    text = page.links(asked, 'planner', TOKEN).decode()
+    text = page.links(asked, 'planner', TOKEN, encrypted=True).decode()
     assert ('https://lichtblick-suite.github.io/lichtblick/?ds=foxglove-websocket&amp;'
             f'ds.url=wss%3A%2F%2F198.51.100.2%3A8766%2F%3Ftoken%3D{TOKEN}"') in text
 
@@ -198,7 +244,8 @@ def test_who_may_comes_in_and_others_are_logged_once(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
         open_port, guarded = gate.ports
         with closing(socket.create_connection(('127.0.0.1', open_port), timeout=20)) as robot:
-            robot.sendall(request('/robot', more=UPGRADE))
+            robot.sendall(b'GET /robot?token=%b HTTP/1.1\r\nHost: localhost\r\n%b\r\n' % (
+                gate.token.encode(), UPGRADE.encode()))
             assert b'200 OK' in robot.recv(4096)
         answer = ask(gate, f'/?token={gate.token}&topic=a')
         assert b' 200 OK' in answer
@@ -231,8 +278,8 @@ def test_pages_go_to_the_application_where_there_is_one(tmp_path, bridge):
         answer = ask(gate, f'/?token={gate.token}&ds=x', more='')
         assert answer.startswith(b'HTTP/1.1 303 ')
         assert b'\r\nLocation: /?ds=x\r\n' in answer
-        cookie = f'Cookie: fogros2={gate.token}\r\nConnection: keep-alive\r\n'
-        answer = ask(gate, '/main.js', more=cookie)  # returns: the connection ends with it
+        more = f'Cookie: {"=".join(cookie(gate.token))}\r\nConnection: keep-alive\r\n'
+        answer = ask(gate, '/main.js?x=1', more=more)  # returns: the connection ends with it
         assert b' 200 OK' in answer
         assert answer.endswith(b'/main.js')
         assert ask(gate, '/main.js', more='').startswith(b'HTTP/1.1 401 ')
@@ -242,7 +289,8 @@ def test_without_an_application_a_page_says_where_there_are_some(tmp_path, bridg
     with running(tmp_path, bridge, '--application', f'127.0.0.1:{free_udp_port}',
                  '--name', 'planner') as gate:
         with closing(socket.create_connection(('127.0.0.1', gate.ports[0]), timeout=20)) as robot:
-            robot.sendall(request('/?ds=x'))
+            robot.sendall(b'GET /?token=%b HTTP/1.1\r\nHost: 198.18.1.2:8765\r\n\r\n'
+                          % gate.token.encode())
             page_there = b''.join(iter(lambda: robot.recv(4096), b''))
         assert page_there.startswith(b'HTTP/1.1 200 OK')
         assert b'ros2 fog monitor planner' in page_there

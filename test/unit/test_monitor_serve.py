@@ -19,10 +19,10 @@ serve = pytest.importorskip(
 def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
     assert serve.regular_expression('/camera/*') == '/camera/.*'
     assert serve.regular_expression('/a.b?[c]') == r'/a\.b.\[c\]'
-    assert serve.command(5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
-        '--ros-args', '-r', 'b:=c', '-p', 'address:=127.0.0.1', '-p', 'port:=5',
+    assert serve.command('127.9.9.9', 5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
+        '--ros-args', '-r', 'b:=c', '-p', 'address:=127.9.9.9', '-p', 'port:=5',
         '-p', 'topic_whitelist:=["/a.*"]']
-    assert serve.command(5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2.monitor.bridge']
+    assert serve.command('127.9.9.9', 5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2.monitor.bridge']
 
 
 def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
@@ -39,13 +39,13 @@ def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '')
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}',
-         '--topic', '/camera/*'], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        cwd=Path(__file__).parents[2],
+         '--secrets', str(tmp_path / 'secrets'), '--topic', '/camera/*'],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=Path(__file__).parents[2],
         env={**os.environ, 'AMENT_PREFIX_PATH': f'{tmp_path}{os.pathsep}{prefixes}'})
     try:
         lines = sorted(process.stdout.readline().strip() for _ in range(2))
         assert lines[0] == f'listening on 127.0.0.1:{port}'
-        assert lines[1].startswith('theirs --ros-args -p address:=127.0.0.1 -p port:=')
+        assert lines[1].startswith('theirs --ros-args -p address:=127.')
         assert lines[1].endswith('-p topic_whitelist:=["/camera/.*"]')
     finally:
         process.send_signal(signal.SIGTERM)
