@@ -80,11 +80,15 @@ def test_bytes_get_through_both_ways(echo):
     assert said == []
 
 
-def test_what_is_not_there_is_told(free_udp_port):
-    with tunnel(free_udp_port) as (port, said):
-        with socket.create_connection(('127.0.0.1', port), timeout=20) as link:
-            assert link.recv(1) == b''
-    assert said == [f'nothing answers at 127.0.0.1:{free_udp_port} there']
+def test_what_is_not_there_is_told():
+    # a port that is taken and refuses connections: no other program can answer there
+    with socket.socket() as taken:
+        taken.bind(('127.0.0.1', 0))
+        closed = taken.getsockname()[1]
+        with tunnel(closed) as (port, said):
+            with socket.create_connection(('127.0.0.1', port), timeout=20) as link:
+                assert link.recv(1) == b''
+    assert said == [f'nothing answers at 127.0.0.1:{closed} there']
 
 
 def test_its_end_ends_the_connections(echo):
