@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning cloud-check test test-fast test-kubernetes test-minimum lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -32,8 +32,13 @@ test:
 ## test-fast   the tests that make no machine, on the embedded default, in less than 90 s
 test-fast:
 	@tools/setup.sh test
+	@rm -f .cache/test-*.xml
 	@tools/run.sh embedded -- pytest -n 2 --dist loadgroup --no-loadscope-reorder \
-		test/unit test/contract test/launch $(ARGS)
+		--junit-xml=.cache/test-fast.xml test/unit test/contract test/launch $(ARGS)
+
+## fresh   the commands above on newly installed systems; results go to benchmarks/results/fresh.md
+fresh:
+	@tools/fresh.py $(ARGS)
 
 ## test-kubernetes   the tests with a real Kubernetes cluster, built first if it isn't there
 test-kubernetes:

@@ -9,13 +9,13 @@ Debian's podman brings it, its addresses do not depend on this computer's, and i
 connection in (pasta would open this computer's ports inside).
 
 The mirror, apt's and pip's connection settings and additional certificates are this computer's.
-Root in the system is root of this computer's kernel: run nothing there that you would not run here.
+Root there is root of this computer's kernel: run nothing that you would not run here as root.
 """
 
 from __future__ import annotations
 
 import codecs
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import configparser
 import contextlib
 import dataclasses
@@ -81,7 +81,8 @@ ln -s /proc/self/fd dev/fd
 ln -s fd/0 dev/stdin
 ln -s fd/1 dev/stdout
 ln -s fd/2 dev/stderr
-for each in null:1:3 zero:1:5 full:1:7 random:1:8 urandom:1:9 tty:5:0 fuse:10:229 net/tun:10:200; do
+for each in null:1:3 zero:1:5 full:1:7 random:1:8 urandom:1:9 tty:5:0 fuse:10:229 net/tun:10:200
+do
     numbers=${each#*:}
     mknod -m 666 "dev/${each%%:*}" c "${numbers%:*}" "${numbers#*:}"
 done
@@ -132,11 +133,13 @@ class System:
 
     :param first: its first process, as this computer numbers it.
     :param groups: control groups that its processes belong to.
+    :param kept: sizes of the package files that it had from the start, in bytes.
     """
 
-    def __init__(self, first: int, groups: Sequence[Path]) -> None:
+    def __init__(self, first: int, groups: Sequence[Path], kept: Mapping[str, int]) -> None:
         self.first = first
         self._groups = groups
+        self._kept = kept
 
     @property
     def files(self) -> Path:
@@ -194,6 +197,10 @@ class System:
         """Return how many bytes came by the network."""
         return int(Path(self.files, 'sys/class/net/tap0/statistics/rx_bytes').read_text())
 
+    def saved(self, packages: Iterable[str]) -> int:
+        """Return how many bytes of these package files an earlier run had downloaded."""
+        return sum(self._kept.get(file, 0) for file in packages)
+
     def packages(self) -> dict[str, str]:
         """Return the file names of all installed packages, as apt caches them, by package."""
         lines = self.run('dpkg-query', '-W', '-f',
@@ -209,15 +216,15 @@ def _package(line: str) -> tuple[str, str]:
 @contextlib.contextmanager
 def clean_system(
     folder: Path, suite: Suite, repository: Path, commit: str, *, password: bool,
-    kubernetes: Optional[Path] = None,
+    kubernetes: str = '',
 ) -> Iterator[System]:
     """
     Run a new system for the time of the block, with a checkout in its user's home.
 
     :param folder: keeps everything, also what the next run uses again: systems, packages.
-    :param commit: of ``repository``, as git names it.
+    :param commit: the id of one of ``repository``.
     :param password: whether sudo asks the user for one.
-    :param kubernetes: a folder with built programs of Kubernetes, for the user's cache.
+    :param kubernetes: a folder with built programs of Kubernetes for the user's cache, or ''.
     :raises CleanSystemError: it can't be made here.
     """
     check_needs(suite)
@@ -237,17 +244,16 @@ def clean_system(
         kept.mkdir(exist_ok=True)
         _link(kept, archives)
         undo.callback(_link, archives, kept)
-        system = undo.enter_context(_running(root, run.name))
+        sizes = {path.name: path.stat().st_size for path in kept.glob('*.deb')}
+        system = undo.enter_context(_running(root, run.name, sizes))
         system.run('useradd', '-m', '-s', '/bin/bash', '-G', 'sudo', USER)
         system.run('sh', '-c', f"echo '{USER}:{PASSWORD}' | chpasswd")
         if _own_certificates():
             system.run('update-ca-certificates')
         _check_out(repository, commit, root / 'home' / USER / PROJECT)
-        if kubernetes is not None:
-            shutil.copytree(kubernetes, root / 'home' / USER / '.cache/fogros2/kubernetes',
-                            ignore=lambda folder, names: [
-                                name for name in names if folder == str(kubernetes)
-                                and not (kubernetes / name / 'built').exists()])
+        for built in Path(kubernetes).glob('*/built') if kubernetes else ():
+            shutil.copytree(built.parent, Path(
+                root, 'home', USER, '.cache/fogros2/kubernetes', built.parent.name))
         system.run('chown', '-R', f'{USER}:{USER}', f'/home/{USER}')
         yield system
 
@@ -297,7 +303,7 @@ def _sources(suite: Suite) -> list[str]:
 
 
 def _base(folder: Path, suite: Suite) -> Path:
-    """Return the archive of a release with our packages, made by debootstrap unless it is there."""
+    """Return the archive of a release with our packages; debootstrap makes it once."""
     packages = [*PACKAGES, *(['ca-certificates'] if _own_certificates() else [])]
     key = hashlib.sha256(f'1 {suite.name} {packages}'.encode()).hexdigest()[:16]
     target = folder / f'base-{suite.name}-{key}.tar'
@@ -344,7 +350,7 @@ def _configure(root: Path, suite: Suite, password: bool) -> None:
 
 def pip_settings() -> dict[str, str]:
     """Return this computer's settings of pip: configuration files, then variables."""
-    files = [os.environ.get('PIP_CONFIG_FILE') or '/etc/pip.conf',
+    files: list[str | Path] = [os.environ.get('PIP_CONFIG_FILE') or '/etc/pip.conf',
              *(Path.home() / name for name in ('.pip/pip.conf', '.config/pip/pip.conf'))]
     parser = configparser.RawConfigParser()
     parser.read(files)
@@ -366,21 +372,26 @@ def package_folders(settings: Mapping[str, str]) -> list[Path]:
                    if path.is_dir()})
 
 
+def commit_of(repository: Path, name: str) -> str:
+    """Return the id of a commit that git knows by a name."""
+    return _git('-C', str(repository), 'rev-parse', '--verify', f'{name}^{{commit}}')
+
+
 def _check_out(repository: Path, commit: str, target: Path) -> None:
+    _git('clone', '-q', '--no-checkout', f'file://{repository.resolve()}', str(target))
+    _git('-C', str(target), 'checkout', '-q', '--detach', commit)
+    _git('-C', str(target), 'remote', 'remove', 'origin')
+
+
+def _git(*words: str) -> str:
+    # root reads a repository of somebody else's
     environment = {**os.environ, 'GIT_CONFIG_COUNT': '1', 'GIT_CONFIG_KEY_0': 'safe.directory',
                    'GIT_CONFIG_VALUE_0': '*'}
-
-    def git(*words: str) -> str:
-        return _run(['git', *words], environment=environment).strip()
-
-    wanted = git('-C', str(repository), 'rev-parse', '--verify', f'{commit}^{{commit}}')
-    git('clone', '-q', '--no-checkout', f'file://{repository}', str(target))
-    git('-C', str(target), 'checkout', '-q', '--detach', wanted)
-    git('-C', str(target), 'remote', 'remove', 'origin')
+    return _run(['git', *words], environment=environment).strip()
 
 
 @contextlib.contextmanager
-def _running(root: Path, name: str) -> Iterator[System]:
+def _running(root: Path, name: str, kept: Mapping[str, int]) -> Iterator[System]:
     """Start a system's first process and its network; end everything after the block."""
     hierarchies = _hierarchies()
     with contextlib.ExitStack() as undo:
@@ -400,14 +411,14 @@ def _running(root: Path, name: str) -> Iterator[System]:
         first.stdin.writelines(f'{path}\n' for path in package_folders(pip_settings()))
         first.stdin.close()
         if first.stdout.readline() != 'ready\n':
-            raise CleanSystemError('its first process failed, see above: are namespaces and mounts '
-                                   'allowed here?')
+            raise CleanSystemError('its first process failed (see above): may root make '
+                                   'namespaces and mounts here?')
         for number, options in enumerate(hierarchies.values()):
             if not options:
                 groups[number] = _leaf(groups[number])
         undo.enter_context(_network(first.pid))
         children = Path(f'/proc/{first.pid}/task/{first.pid}/children').read_text().split()
-        yield System(int(children[0]), groups)
+        yield System(int(children[0]), groups, kept)
 
 
 _CGROUP = Path('/sys/fs/cgroup')

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tool that tries the README's commands on newly installed systems, by value."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+README = """
+```console
+$ make demo       # shows it
+$ make test-fast
+$ make test ARGS='-k a'
+```
+```console
+$ make docs
+```
+"""
+
+
+@pytest.fixture(scope='module')
+def tools():
+    """Return the modules of the tool, which are no part of a package."""
+    names = ('clean_system', 'fresh', 'leftovers', 'closing_line')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / 'tools'))
+        yield {name: importlib.import_module(name) for name in names}
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def test_commands_are_the_first_block_of_the_readme(tools):
+    assert tools['fresh'].readme_commands(README) == [
+        'make demo', 'make test-fast', "make test ARGS='-k a'"]
+
+
+@pytest.mark.parametrize('variant, wanted', [
+    ('debian-12-password', ['make demo', 'make test']),
+    ('debian-12', ['make demo', 'make test-fast']),
+    ('debian-13', ['make demo', 'make test-fast'])])
+def test_variant_runs_all_tests_or_the_fast_ones(tools, variant, wanted):
+    readme = (ROOT / 'README.md').read_text()
+    assert tools['fresh'].VARIANTS[variant].commands(readme) == wanted
+
+
+def test_mirror_and_its_pockets_become_another_release(tools, monkeypatch):
+    clean = tools['clean_system']
+    monkeypatch.setattr(clean.platform, 'freedesktop_os_release', lambda: {
+        'ID': 'debian', 'VERSION_CODENAME': 'bookworm'})
+    monkeypatch.setattr(clean, '_run', lambda words: (
+        'http://mirror.test/security/ bookworm-security main\n'
+        'http://mirror.test/debian/ bookworm main\n'
+        'http://mirror.test/debian/ bookworm contrib\n'
+        'http://other.test/ bookworm-tools main\n'
+        'http://other.test/ stable main\n'))
+    assert clean._sources(clean.Suite('trixie', 'Debian 13')) == [
+        'deb http://mirror.test/debian/ trixie main',
+        'deb http://mirror.test/security/ trixie-security main']
+    with pytest.raises(clean.CleanSystemError, match='no mirror of Ubuntu'):
+        clean._sources(clean.Suite('noble', 'Ubuntu 24.04', 'ubuntu'))
+
+
+def test_pip_keeps_its_indices_and_not_its_cache(tools, monkeypatch, tmp_path):
+    clean = tools['clean_system']
+    for name in [name for name in clean.os.environ if name.startswith('PIP_')]:
+        monkeypatch.delenv(name)
+    (tmp_path / 'simple').mkdir()
+    (tmp_path / 'pip.conf').write_text(
+        f'[global]\nextra-index-url = file://{tmp_path}/simple\n  file:///not/there\n'
+        'cache-dir = /somewhere\n')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('PIP_CONFIG_FILE', str(tmp_path / 'pip.conf'))
+    monkeypatch.setenv('PIP_FIND_LINKS', str(tmp_path))
+    settings = clean.pip_settings()
+    assert settings == {'extra-index-url': f'file://{tmp_path}/simple file:///not/there',
+                        'find-links': str(tmp_path)}
+    assert clean.package_folders(settings) == [tmp_path]
+
+
+def test_cached_package_is_found_by_its_version(tools):
+    assert tools['clean_system']._package('libc6:amd64 libc6_1:2.36-9_amd64.deb') == (
+        'libc6:amd64', 'libc6_1%3a2.36-9_amd64.deb')
+
+
+def test_tests_are_counted_and_named(tools, tmp_path):
+    report = tmp_path / 'test-fast.xml'
+    report.write_text(
+        '<testsuites><testsuite tests="4" failures="1" errors="0" skipped="2">'
+        '<testcase classname="test.unit.test_a" name="test_good"/>'
+        '<testcase classname="test.unit.test_a" name="test_bad[1]"><failure/></testcase>'
+        '<testcase classname="test.unit.test_b" name="test_x"><skipped message="no y"/></testcase>'
+        '<testcase classname="test.unit.test_b" name="test_z@g"><skipped message="no y"/>'
+        '</testcase></testsuite></testsuites>')
+    fresh = tools['fresh']
+    assert fresh.added_up([report]) == (1, 1, 2)
+    assert fresh.added_up([]) is None
+    assert fresh.test_names([report]) == (
+        ['test_a::test_bad[1]'], {'no y': ['test_b::test_x', 'test_b::test_z']})
+
+
+def test_page_shows_failures_and_leftovers(tools, tmp_path):
+    fresh = tools['fresh']
+
+    def outcome(system, **more):
+        return fresh.Outcome(**{
+            'system': system, 'password': True, 'command': 'make test', 'commit': 'a' * 40,
+            'date': '2026-01-01', 'status': 0, 'packages': 5, 'downloaded': 7_000_000,
+            'minutes': 1.5, 'tests': (9, 0, 0), 'failed': [], 'skipped': {}, 'left': [],
+            'notes': [], **more})
+
+    fresh.record([outcome('Debian 12', status=2), outcome('Debian 13')], tmp_path)
+    fresh.record([outcome('Debian 12', status=1, tests=(8, 1, 0), failed=['test_a::test_bad'],
+                          left=['interface fog0'])], tmp_path)
+    page = (tmp_path / 'fresh.md').read_text()
+    assert page.count('| Debian 12 |') == page.count('| Debian 13 |') == 1
+    assert '`make test` (**exit status 1**) | 5 | 7 MB | 1.5 | 8 | 1 | 0 | 1, see below |' in page
+    assert '- failed: `test_a::test_bad`' in page and '- left behind: interface fog0' in page
