@@ -72,6 +72,13 @@ class Program:
         self.killer = threading.Timer(60, self.process.kill)
         self.killer.start()
 
+    def send(self, number):
+        """Send a signal to the launch; SIGINT to its processes too, as a terminal does."""
+        if number == signal.SIGINT:
+            os.killpg(self.process.pid, number)
+        else:
+            self.process.send_signal(number)
+
     def wait_for(self, text):
         for line in self.process.stdout:
             self.lines.append(line.rstrip('\n'))
@@ -115,7 +122,7 @@ def program(package, tmp_path):
 def test_while_it_runs(program, number):
     launch = program()
     launch.wait_for('[robot-')
-    launch.process.send_signal(number)
+    launch.send(number)
     assert launch.end() == 0
     text = '\n'.join(launch.lines)
     assert launch.notes()[-4:] == ['stop', 'down', 'all', 'status'], text
@@ -126,7 +133,7 @@ def test_while_it_runs(program, number):
 def test_while_a_machine_comes_up(program, number):
     launch = program(never_up=True)
     launch.wait_for('note: up')
-    launch.process.send_signal(number)
+    launch.send(number)
     assert launch.end() == 0
     assert launch.notes()[-3:] == ['down', 'all', 'status'], '\n'.join(launch.lines)
 
@@ -136,9 +143,9 @@ def test_while_a_machine_comes_up(program, number):
 def test_a_second_one_does_not_cut_the_rollback_short(program, first, second):
     launch = program(slow_down=True)
     launch.wait_for('[robot-')
-    launch.process.send_signal(first)
+    launch.send(first)
     launch.wait_for('note: down')
-    launch.process.send_signal(second)
+    launch.send(second)
     launch.wait_for('again' if second == signal.SIGINT == first else 'shutting down already'
                     if second != signal.SIGINT else '')
     launch.process.stdin.write('\n')
@@ -150,8 +157,8 @@ def test_a_second_one_does_not_cut_the_rollback_short(program, first, second):
 def test_a_signal_ignored_from_the_start_stays_ignored(program):
     launch = program(ignore=[signal.SIGHUP])
     launch.wait_for('[robot-')
-    launch.process.send_signal(signal.SIGHUP)
-    launch.process.send_signal(signal.SIGTERM)
+    launch.send(signal.SIGHUP)
+    launch.send(signal.SIGTERM)
     assert launch.end() == 0
     text = '\n'.join(launch.lines)
     assert 'SIGTERM: shutting down' in text and 'SIGHUP' not in text
