@@ -92,6 +92,22 @@ class Ticket:
         self._server.server_close()
 
 
+@contextlib.contextmanager
+def browser_at(page: str, *, start: bool) -> Iterator[threading.Event]:
+    """
+    Start a browser that shows a page, without the page's address on its command line.
+
+    Yields an event that is set when it came, or there is none to wait for.
+
+    :param start: False for none.
+    """
+    import webbrowser
+    with contextlib.closing(Ticket(page)) as ticket:
+        if not start or not webbrowser.open(ticket.url):
+            ticket.used.set()
+        yield ticket.used
+
+
 def has_application(port: int, token: str) -> bool:
     """Return whether the gate at a port of the loopback has the web application behind it."""
     connection = http.client.HTTPConnection('localhost', port, timeout=_PATIENCE)

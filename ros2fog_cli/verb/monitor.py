@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import threading
 from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
@@ -58,13 +56,11 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
                 f'port {port} of this computer: {error.strerror}',
                 'another --port, or none for one that is free') from error
         with monitor.carrying(tunnel) as ended:
-            where = urls.place('localhost', tunnel.port)
-            page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:', where, token,
-                       application=monitor.has_application(tunnel.port, token))
             try:
-                with contextlib.ExitStack() as undo:
-                    if browser:
-                        start_browser(page, undo)
+                page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
+                           urls.place('localhost', tunnel.port), token,
+                           application=monitor.has_application(tunnel.port, token))
+                with monitor.browser_at(page, start=browser):
                     ended.wait()
             except KeyboardInterrupt:
                 print()
@@ -74,10 +70,10 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
 def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     """Say where the bridge of this computer is, with its token, and lead a browser there."""
     from fogros2.monitor import urls
+    from ros2fog_cli.api import monitor
     page = say(f'{name} is at {{}}; in a browser:', urls.place('localhost', port), token)
-    with contextlib.ExitStack() as undo:
-        if browser:
-            start_browser(page, undo).wait(PATIENCE)
+    with monitor.browser_at(page, start=browser) as came:
+        came.wait(PATIENCE)
     return 0
 
 
@@ -89,22 +85,6 @@ def say(what: str, where: str, token: str, *, application: bool = False) -> str:
         [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
     print(what.format(address), *pages, sep='\n', flush=True)
     return pages[0]
-
-
-def start_browser(page: str, undo: contextlib.ExitStack) -> threading.Event:
-    """
-    Start a browser that shows a page, without the page's address on its command line.
-
-    Returns an event that is set when it came, or there is none.
-    """
-    import webbrowser
-
-    from ros2fog_cli.api.monitor import Ticket
-    ticket = Ticket(page)
-    undo.callback(ticket.close)
-    if not webbrowser.open(ticket.url):
-        ticket.used.set()
-    return ticket.used
 
 
 def share(entry: Entry) -> int:
