@@ -3,11 +3,13 @@
 The node beside the publisher: takes images, publishes them coded.
 
 Subscribes to ``image`` (remap it) and publishes ``<image>/h264``, or what the parameter ``stream``
-names; see doc/h264.md for all topics and parameters.
+names; see doc/h264.md for all topics and parameters. The parameter ``topic`` is the name that
+messages have for ``image``.
 """
 
 from __future__ import annotations
 
+import difflib
 import signal
 from typing import Optional
 
@@ -20,6 +22,9 @@ from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
 from image_transport_h264.worker import Worker
+
+#: Seconds until a topic without a publisher is reported.
+PATIENCE = 5.0
 
 
 class EncoderNode(LazyNode):
@@ -39,12 +44,26 @@ class EncoderNode(LazyNode):
             self._infos = Relay(self, CameraInfo, camera_info_topic(topic),
                                 f'{stream}/{CAMERA_INFO}', IMAGE_QOS)
         self._listeners_changed()
+        named = str(self.declare_parameter('topic', '').value) or topic
+        self._look = self.create_timer(PATIENCE, lambda: self._look_for_images(topic, named))
         self.get_logger().info(f'{topic} goes out as {stream} ({codec})')
 
     def destroy_node(self) -> None:
         """End the worker, then the node."""
         self._worker.stop()
         super().destroy_node()
+
+    def _look_for_images(self, topic: str, named: str) -> None:
+        """Warn once if nobody publishes images, with the nearest topic that has some."""
+        self._look.cancel()
+        if self.count_publishers(topic):
+            return
+        others = [name for name, kinds in self.get_topic_names_and_types()
+                  if 'sensor_msgs/msg/Image' in kinds and name != topic
+                  and self.count_publishers(name)]
+        near = difflib.get_close_matches(named, others, n=1)
+        guess = f' (did you mean {near[0]}?)' if near else ''
+        self.get_logger().warning(f'no images on {named}{guess}')
 
     def _listeners_changed(self) -> None:
         self._images.want(self._sender.listeners() > 0)

@@ -9,7 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.actions import components, streaming
+from fogros2.actions import components, keywords, streaming
 from fogros2.actions.carriers import RobotCarrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import checked
@@ -39,7 +39,8 @@ class CloudGroup(GroupAction):
         self, machine: SomeMachine, actions: Iterable[Action], *,
         stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
-        super().__init__(list(actions), **kwargs)
+        with keywords.refused(type(self)):
+            super().__init__(list(actions), **kwargs)
         self.machine = checked(machine)
         self.stream_topics = list(stream_topics)
         self._streams: Sequence[Entry] = ()

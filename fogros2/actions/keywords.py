@@ -8,11 +8,13 @@ without a line of its own here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 import difflib
 import inspect
+import re
 from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
 
 from fogros2 import plugin_system
@@ -218,6 +220,24 @@ def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
                 f"a machine of the provider '{provider}' needs {keyword.name}",
                 f'{keyword.name}= says it')
     return cls(**given)
+
+
+@contextlib.contextmanager
+def refused(cls: type[Any]) -> Iterator[None]:
+    """
+    Name the nearest keyword where a constructor that the block calls knows none of that name.
+
+    :param cls: the class; launch's actions hand on keywords from class to class.
+    """
+    try:
+        yield
+    except TypeError as error:
+        match = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
+        if match is None:
+            raise
+        known = {name for each in cls.__mro__ if '__init__' in vars(each)
+                 for name in inspect.signature(vars(each)['__init__']).parameters}
+        raise unknown(f'a {cls.__name__}', match[1], known - {'self', 'args', 'kwargs'}) from None
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> ConfigurationError:

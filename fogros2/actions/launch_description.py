@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 import functools
+import inspect
 from typing import get_args, Optional, TYPE_CHECKING, TypeGuard, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
@@ -22,7 +23,7 @@ from launch.actions import (
     UnsetLaunchConfiguration,
 )
 
-from fogros2.actions import private, streaming
+from fogros2.actions import keywords, private, streaming
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.fog_machine import FogMachine
@@ -59,7 +60,11 @@ class FogROSLaunchDescription(LaunchDescription):
         self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
         deprecated_reason: Optional[str] = None, robot_nodes: RobotNodes = 'after_cloud',
         stream_topics: Sequence[Entry] = (), dds: Optional[str] = None,
+        **unknown: object,
     ) -> None:
+        for name in unknown:
+            known = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
+            raise keywords.unknown('a FogROSLaunchDescription', name, known)
         super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(

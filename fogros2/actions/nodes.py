@@ -10,7 +10,7 @@ from launch import LaunchContext, LaunchDescriptionEntity
 import launch_ros.actions
 
 from fogros2 import containers
-from fogros2.actions import components, streaming, words
+from fogros2.actions import components, keywords, streaming, words
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.machines import checked, CloudInstance
 from fogros2.actions.remote import RemoteProcess, send
@@ -50,7 +50,8 @@ class Node(launch_ros.actions.Node):
         image: Optional[SomeSubstitutionsType] = None,
         image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (), **kwargs: Any,
     ) -> None:
-        super().__init__(**kwargs)
+        with keywords.refused(type(self)):
+            super().__init__(**kwargs)
         if isinstance(image_options, str) or image_options and image is None:
             raise ConfigurationError(
                 f'image_options={image_options!r} is no list of options for an image',

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+from typing import ClassVar, Optional
 
 from fogros2.model import NodeSpec, Stream
 
@@ -15,6 +15,8 @@ class ImageTransport(abc.ABC):
     #: Whether the pair carries camera info too, for streams that ask for it. Where it doesn't,
     #: camera info keeps its name, and crosses the VPN as it is.
     camera_info: ClassVar[bool] = False
+    #: The options that a stream may have, None for any.
+    options: ClassVar[Optional[frozenset[str]]] = None
 
     def check(self) -> None:
         """

@@ -7,7 +7,7 @@ import dataclasses
 
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import check_modules, node
+from fogros2.image_transport.topics import check_modules, node, OPTIONS
 from fogros2.model import NodeSpec, Stream
 
 
@@ -15,6 +15,7 @@ class Compressed(ImageTransport):
     """``/camera`` crosses as ``/camera/compressed``, as ROS's own transport of that name."""
 
     camera_info = True
+    options = OPTIONS | {'format', 'jpeg_quality'}
 
     def check(self) -> None:
         """Look for PyAV, OpenCV and NumPy."""

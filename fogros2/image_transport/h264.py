@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import check_modules, node
+from fogros2.image_transport.topics import check_modules, node, OPTIONS
 from fogros2.model import NodeSpec, Stream
 
 
@@ -12,6 +12,8 @@ class H264(ImageTransport):
     """``/camera`` crosses as ``/camera/h264``."""
 
     camera_info = True
+    options = OPTIONS | {'adapt', 'bitrate', 'encoder', 'gop', 'lossless', 'max_rate', 'preset',
+                         'quality'}
 
     def check(self) -> None:
         """Look for PyAV, OpenCV and NumPy."""

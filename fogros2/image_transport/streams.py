@@ -62,7 +62,7 @@ def stream(entry: Entry, machine: str) -> Stream:
 
     :param entry: its source, if it has one, as a name.
     :raises ConfigurationError: not an entry; an unknown transport (the hint lists those there
-        are) or direction; a topic that can't be carried.
+        are), direction or parameter; a topic that can't be carried.
     :raises PrerequisiteError: the robot lacks what its end of the stream takes.
     """
     if isinstance(entry, tuple) and len(entry) == 2:
@@ -86,6 +86,14 @@ def stream(entry: Entry, machine: str) -> Stream:
     made = Stream(entry.topic, entry.transport, source=entry.source if there else machine,
                   target=machine if there else None, options=dict(entry.parameters))
     check(made)
+    options = _transport(made).options
+    for name in entry.parameters:
+        if options is not None and name not in options:
+            near = difflib.get_close_matches(name, sorted(options), n=1)
+            raise ConfigurationError(
+                f"{entry.topic}: streams by {entry.transport} have no '{name}'",
+                f"did you mean '{near[0]}'?" if near else
+                f"there are: {', '.join(sorted(options))}")
     if None in (made.source, made.target):
         _transport(made).check()
     return made

@@ -27,6 +27,8 @@ _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
 #: What FogROS2 appends to a streamed topic's name on machines.
 _CLOUD = '/cloud'
+#: Options that any stream of this project's nodes may have.
+OPTIONS = frozenset({'camera_info', *_DECODER_PARAMETERS})
 
 
 def check(stream: Stream) -> None:
@@ -165,6 +167,8 @@ def node(
     label, full, between = names_of(stream, role, name)
     parameters: dict[str, Any] = {
         'codec': codec, 'stream': between, 'camera_info': carries_info(stream)}
+    if role == 'encoder' and image != stream.topic:
+        parameters['topic'] = stream.topic
     for key, value in stream.options.items():
         if key != 'camera_info' and (key in _DECODER_PARAMETERS) == (role == 'decoder'):
             parameters[key] = value

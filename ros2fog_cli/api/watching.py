@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -11,11 +12,15 @@ import sys
 import time
 from typing import Any, Optional
 
+from fogros2.errors import DeadlineExceeded
 from fogros2.store import check_name, Store
+from fogros2.waiting import wait_until
 from ros2fog_cli.api import reach, screen
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.live import Live, PRESENT
 
+#: Seconds that the rates of streams may take.
+PATIENCE = 10.0
 _WAITING = 'no such machine yet'
 
 
@@ -49,6 +54,35 @@ def watch(
         if graphs is not None:
             graphs.close()
     return 0
+
+
+def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str, Any]]:
+    """
+    Return the streams to and from a machine, as the dashboard's state has them.
+
+    A node joins the launch for a few seconds, which measures the rates.
+    """
+    graphs = Graphs(Store(), pictures=False)
+    live = Live(name=name, regions=regions, interval=0.5, more=graphs.look)
+    found: list[dict[str, Any]] = []
+    begin = time.monotonic()
+
+    def measured() -> bool:
+        found[:] = [one for one in live.state().get('streams', [])
+                    if name in (one['source'], one['target'])]
+        # what seems to have no subscriber may have one that isn't known yet
+        settled = time.monotonic() - begin > PATIENCE / 2
+        return bool(found) and all(
+            one['rate'] is not None or settled and one['note'] for one in found)
+
+    live.start()
+    try:
+        with contextlib.suppress(DeadlineExceeded):
+            wait_until(measured, timeout=PATIENCE, what='the rates of streams')
+    finally:
+        live.close()
+        graphs.close()
+    return found
 
 
 def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:

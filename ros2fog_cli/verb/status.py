@@ -44,7 +44,8 @@ class StatusVerb(VerbExtension):
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
         entry = reach.find(args.name, warn, regions=args.region)
-        status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None}
+        status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
+                                  'streams': []}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
@@ -72,6 +73,10 @@ class StatusVerb(VerbExtension):
         else:
             problems.append(f"agent: this robot has no record of '{entry.name}'; only the robot "
                             'that launched it can ask its agent')
+        if any('_encoder' in node['name'] or '_decoder' in node['name']
+               for node in (status['agent'] or {}).get('nodes', ())):
+            from ros2fog_cli.api.watching import streams
+            status['streams'] = streams(entry.name, regions=args.region)
         if args.json:
             print(json.dumps({**status, 'problems': problems}, indent=2))
         else:
@@ -136,3 +141,10 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
              str(node['pid']) if node.get('pid') else '-',
              '-' if node.get('returncode') is None else str(node['returncode']),
              str(node.get('restarts', 0))) for node in nodes]))
+    if status['streams']:
+        print()
+        print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC'), [
+            (one['topic'], one['transport'], one['source'] or 'robot', one['target'] or 'robot',
+             one['note'] or ('-' if one['rate'] is None else f"{one['rate']:.1f}/s"),
+             '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s")
+            for one in status['streams']]))

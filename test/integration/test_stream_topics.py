@@ -15,7 +15,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.launched import launching
+from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
@@ -195,3 +195,16 @@ def test_images_cross_encoded(tmp_path: Path, cloud_network: str, description: s
     assert not launched.errors, launched.text
     # one raw image a direction would be 1.8 MB
     assert 0 < found['traffic'] < found['seen'] * 200_000, found
+
+
+def test_status_shows_the_rate_of_each_stream(cloud_network: str) -> None:
+    with launching() as start:
+        run = start('fogros2_examples', 'video.container.launch.xml', f'name:={NAME}-rate')
+        run.wait_for('process started with pid', times=4)
+        status = ros2('fog', 'status', f'{NAME}-rate', timeout=60)
+        assert status.returncode == 0, status.stdout + status.stderr
+        rate = re.search(r'^/camera +h264 +robot +\S+ +([0-9.]+)/s ', status.stdout, re.MULTILINE)
+        assert rate is not None and float(rate[1]) > 1, status.stdout
+        assert re.search(r'^/annotated .* nobody subscribes ', status.stdout, re.MULTILINE)
+        run.interrupt()
+        assert run.ended() == 0, run.text

@@ -208,6 +208,21 @@ def test_the_other_codecs(bench: Bench, codec: str) -> None:
     assert numpy.abs(a - b).max() == 0 if codec != 'jpeg' else numpy.abs(a - b).mean() < 4
 
 
+def test_a_mistyped_topic_gets_the_nearest(bench: Bench) -> None:
+    bench.node.create_publisher(Image, '/camera/image_raw', RELIABLE)
+    lines = bench.start('encoder', '-r', 'image:=/camera/imag_raw')
+    renamed = bench.start('encoder', '-r', 'image:=/fogros2/m/camera/imge_raw',
+                          '-p', 'topic:=/camera/imge_raw')
+    right = bench.start('encoder', '-r', 'image:=/camera/image_raw')
+    bench.until(lambda: any('no images' in line for line in lines)
+                and any('no images' in line for line in renamed), 'two warnings')
+    assert any('no images on /camera/imag_raw (did you mean /camera/image_raw?)' in line
+               for line in lines)
+    assert any('no images on /camera/imge_raw (did you mean /camera/image_raw?)' in line
+               for line in renamed)
+    assert not any('no images' in line for line in right)
+
+
 def test_no_subscriber_no_work(bench: Bench) -> None:
     """The raw topic and the stream are subscribed to while someone sees the images."""
     bench.pair()

@@ -189,6 +189,19 @@ def test_a_machine_of_another_type_is_refused():
         CloudNode(machine=None, package='demo', executable='talker')
 
 
+def test_an_unknown_keyword_gets_the_nearest_name(planner):
+    topics = [('/camera', 'h264')]
+    for make in (lambda: node(machine=planner, stream_topic=topics),
+                 lambda: CloudNode(planner, executable='talker', stream_topic=topics),
+                 lambda: CloudGroup(planner, [], stream_topic=topics),
+                 lambda: FogROSLaunchDescription(stream_topic=topics)):
+        with pytest.raises(ConfigurationError) as error:
+            make()
+        assert "has no 'stream_topic' (did you mean 'stream_topics'?)" in str(error.value)
+    with pytest.raises(ConfigurationError, match="did you mean 'namespace'"):
+        node(machine=planner, namspace='/up')
+
+
 # -- XML and YAML --------------------------------------------------------------------------------
 
 MACHINE = '<fog_machine name="planner" provider="container" ros_workspace=""/>'

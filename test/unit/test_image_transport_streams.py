@@ -137,3 +137,25 @@ def test_what_republish_lacks_is_found_at_once(
             stream(('/camera', 'theora'), 'm')
         (index / package).touch()
     assert stream(('/camera', 'theora'), 'm').transport == 'theora'
+
+
+@pytest.mark.parametrize(('entry', 'said'), [
+    (StreamTopic('/camera', bitrat=3),
+     "/camera: streams by h264 have no 'bitrat' (did you mean 'bitrate'?)"),
+    (StreamTopic('/camera', 'compressed', quality=3),
+     "/camera: streams by compressed have no 'quality' (did you mean 'jpeg_quality'?)"),
+    (StreamTopic('/camera', 'compressed', xyz=3),
+     "/camera: streams by compressed have no 'xyz' "
+     '(there are: camera_info, encoding, format, jpeg_quality, show_damage)')])
+def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
+    with pytest.raises(ConfigurationError) as error:
+        stream(entry, 'm')
+    assert str(error.value) == said
+
+
+def test_parameters_are_those_that_the_nodes_declare():
+    pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+    from fogros2.image_transport.h264 import H264
+    from fogros2.image_transport.topics import OPTIONS
+    from image_transport_h264.senders import PARAMETERS
+    assert H264.options == OPTIONS | {name for name, _, _ in PARAMETERS}
