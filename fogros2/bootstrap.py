@@ -17,6 +17,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import re
 import shlex
 import threading
 from typing import Literal, Optional
@@ -27,8 +28,8 @@ from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python
-from fogros2.model import Bootstrap, Command, MachineSpec
-from fogros2.plan import DEFAULT_RMW, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.model import Bootstrap, Command, MachineSpec, Result
+from fogros2.plan import DEFAULT_RMW, extended, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
 from fogros2.shell import Shell
 
 #: The system that ROS 2 Jazzy has packages for.
@@ -141,6 +142,7 @@ def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None, wheel_folder: Optional[Path] = None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
+    packages: Sequence[str] = (),
 ) -> tuple[RosInstall, str]:
     """
     Make a machine ready for ROS 2 nodes, by what it has and by ``spec.bootstrap``.
@@ -151,6 +153,7 @@ def ensure(
     :param on_plan: is told how things will run there as soon as files can be sent and the VPN set
         up, which needs nothing of what takes longest.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
+    :param packages: those of the nodes that will run there.
     :returns: how things run there, and a few words on what was done.
     :raises ConfigurationError: the machine is to be elsewhere, and isn't.
     :raises PrerequisiteError: the machine can't be made ready.
@@ -165,8 +168,12 @@ def ensure(
     if elsewhere:
         check_elsewhere(spec, facts, robot)
     workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
+    keys = needs.keys(workspace, packages)
     todo = plan_alike(spec, facts, robot, under, workspace)
-    if todo is None:
+    if todo is not None:
+        # it has the same ROS packages
+        keys = needs.outside(keys, under.prefixes)
+    else:
         try:
             wheels = wheel_cache.collect(wheel_folder)
         except OSError as error:
@@ -174,10 +181,10 @@ def ensure(
                 f"what '{spec.name}' lacks can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, workspace)
-    pip = needs.PipFolder.of(spec, facts)
-    if spec.pip:
+    folder = needs.PipFolder.of(spec, facts, keys)
+    if spec.pip or keys:
         todo = dataclasses.replace(todo, install=dataclasses.replace(
-            todo.install, environment=pip.found_by(todo.install.environment)))
+            todo.install, environment=folder.found_by(todo.install.environment)))
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
     on_plan(todo.install)
@@ -186,15 +193,59 @@ def ensure(
                   timeout=timeout, cancel=cancel)
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
-    more = []
-    if spec.apt and todo.mode != 'apt':
-        lacking = shell.run(needs.missing(spec.apt), timeout=timeout, cancel=cancel).stdout.split()
-        more += _apt_wanted(spec, facts, lacking)
-    if spec.pip and pip.done not in facts.installed:
-        more.append(pip.fill(todo.install.environment, spec.environment, todo.install.setup))
-    for command in (*todo.commands, *more):
+    for command in todo.commands:
         shell.run(command, timeout=timeout, cancel=cancel)
-    return todo.install, ', '.join([todo.note, *(command.what for command in more)])
+    notes = [todo.note]
+    if (spec.apt or spec.pip or keys) and folder.done not in facts.installed:
+        notes += _complete(spec, todo, folder, keys, functools.partial(
+            shell.run, timeout=timeout, cancel=cancel))
+    return todo.install, ', '.join(notes)
+
+
+def _complete(
+    spec: MachineSpec, todo: Preparation, folder: needs.PipFolder, keys: Sequence[str],
+    run: Callable[..., Result],
+) -> list[str]:
+    """
+    Install what nodes need beyond ROS 2, and return in a few words what was done.
+
+    :param keys: of rosdep. What it can't resolve is said, and is no error: the nodes may do
+        without, and a machine may be one on which nothing may be installed.
+    :param run: runs a command on the machine.
+    :raises PrerequisiteError: what the launch file names can't be installed.
+    """
+    install, facts = todo.install, todo.install.facts
+    environment = extended(install.environment, spec.environment)
+    apt, pip, notes = spec.apt, spec.pip, []
+    able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
+    left = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
+    if left:
+        asked = run(needs.resolve(left, environment, install.setup), check=False)
+        if asked.returncode == needs.NO_ROSDEP and able:
+            run(_apt_install([needs.rosdep_package(facts)], 'install rosdep'), check=False)
+            asked = run(needs.resolve(left, environment, install.setup), check=False)
+        if asked.returncode == 0:
+            more_apt, more_pip = needs.resolved(asked.stdout)
+            apt, pip = (*apt, *more_apt), (*pip, *more_pip)
+            left = re.findall(r"no rosdep rule for '([^']+)'", asked.stderr)
+        if left:
+            notes.append(f"the machine may lack {', '.join(left)}")
+    if apt:
+        lacking = run(needs.missing(apt)).stdout.split()
+        if lacking and not able:
+            raise PrerequisiteError(
+                f"machine '{spec.name}' lacks the packages {', '.join(lacking)}",
+                f"on the machine: apt-get install {' '.join(lacking)}")
+        if lacking:
+            run(_apt_install(lacking, f"install {', '.join(lacking)}"))
+            notes.append(f"installed {', '.join(lacking)}")
+    if not (apt or pip) and install.kind == 'ros':
+        return notes
+    run(dataclasses.replace(folder, requirements=pip).fill(
+        install.environment, spec.environment, install.setup))
+    if pip:
+        notes.append(f"installed {', '.join(pip)} by pip")
+    return notes
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:
@@ -354,21 +405,6 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
     if not packages:
         return ()
     return (_apt_install(packages, f"install {', '.join(packages)}"),)
-
-
-def _apt_wanted(spec: MachineSpec, facts: HostFacts, lacking: Sequence[str]) -> list[Command]:
-    """
-    Return what installs the Debian packages that a launch file names.
-
-    :raises PrerequisiteError: nothing may be installed there, or not by this user.
-    """
-    if not lacking:
-        return []
-    if spec.bootstrap == 'none' or not facts.root or 'apt-get' not in facts.programs:
-        raise PrerequisiteError(
-            f"machine '{spec.name}' lacks the packages {', '.join(lacking)} of apt=",
-            f"on the machine: apt-get install {' '.join(lacking)}")
-    return [_apt_install(lacking, f"install {', '.join(lacking)}")]
 
 
 def _why_not_embedded(

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What nodes need on a machine beyond ROS 2, as a launch file names it: apt and pip packages.
+What nodes need on a machine beyond ROS 2: packages that launch files name, and rosdep keys.
 
-apt's go where apt puts them. pip's go into a folder of their own that Python looks into last, so
-that they can replace nothing of the system's, of ROS 2's or ours (PEP 668).
+The keys are what the travelling packages declare (``exec_depend``) and the packages of the
+launch's nodes. apt's packages go where apt puts them. pip's go into a folder of their own that
+Python looks into last, so that they can replace nothing of the system's, of ROS 2's or ours
+(PEP 668).
 """
 
 from __future__ import annotations
@@ -12,13 +14,16 @@ from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 import hashlib
 import json
+from pathlib import Path
 import re
 import shlex
+from typing import Optional
 
 from fogros2 import modules, plan
 from fogros2.errors import ConfigurationError
-from fogros2.host import HostFacts
+from fogros2.host import DISTRO, HostFacts
 from fogros2.model import Command, MachineSpec
+from fogros2.workspace import run_dependencies, Workspace
 
 #: Packages that only this project's own wheels may bring, and the modules in them.
 OURS = ('fogros2', 'fogros2-examples', 'fogros2-monitor', 'image-transport-h264', 'ros2-embedded',
@@ -37,11 +42,38 @@ for name; do
     esac
 done
 """
+#: Prints the keys that are neither a ROS package there nor a Debian package of that very name.
+_UNKNOWN = """\
+for key; do
+    IFS=:
+    for prefix in $AMENT_PREFIX_PATH; do
+        [ ! -e "$prefix/share/ament_index/resource_index/packages/$key" ] || continue 2
+    done
+    unset IFS
+    [ "$(dpkg-query -W -f '${db:Status-Status}' "$key" 2>/dev/null)" = installed ] || echo "$key"
+done
+"""
+#: Exit status where rosdep itself is not there.
+NO_ROSDEP = 4
+#: rosdep downloads its lists once; it exits with 1 where one of the keys has no rule.
+_RESOLVE = f"""\
+command -v rosdep >/dev/null || exit {NO_ROSDEP}
+""" + """\
+if [ ! -e "${ROS_HOME:-$HOME/.ros}/rosdep/sources.cache/index" ]; then
+    [ -n "$ROSDEP_SOURCE_PATH" ] || [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] \\
+        || sudo -n rosdep init >&2 || exit 3
+    rosdep update --rosdistro "$distro" >&2 || exit 3
+fi
+rosdep resolve --rosdistro "$distro" "$@" || [ $? = 1 ]
+"""
 #: Python executes it as it starts. The system's module of this name, if any, follows.
 _LAST_IN_PATH = """\
 import importlib.util, os, site, sys
 from importlib.machinery import PathFinder
 _here = os.path.dirname(os.path.abspath(__file__))
+if sys.base_prefix == '/usr' != sys.prefix:
+    # an environment of the system's own Python sees what apt has installed
+    sys.path.append('/usr/lib/python3/dist-packages')
 site.addsitedir(os.path.join(os.path.dirname(_here), 'site'))
 _next = PathFinder.find_spec('sitecustomize', [p for p in sys.path if os.path.abspath(p) != _here])
 if _next is not None:
@@ -77,6 +109,65 @@ def check_pip(requirement: str) -> str:
     return requirement
 
 
+def keys(workspace: Optional[Workspace], packages: Iterable[str]) -> tuple[str, ...]:
+    """
+    Return the rosdep keys of what has to be on a machine beside the workspace, sorted.
+
+    :param packages: those of the launch's nodes.
+    """
+    own = workspace.packages if workspace is not None else {}
+    found = set(packages)
+    for name, prefix in (workspace.installed if workspace is not None else {}).items():
+        found |= run_dependencies(prefix / 'share' / name / 'package.xml')
+    return tuple(sorted(found - set(own) - {''}))
+
+
+def outside(names: Iterable[str], prefixes: Iterable[str]) -> tuple[str, ...]:
+    """Return the keys that are no ROS package below some prefixes of this computer."""
+    folders = [Path(prefix, 'share/ament_index/resource_index/packages') for prefix in prefixes]
+    return tuple(name for name in names
+                 if not any((folder / name).exists() for folder in folders))
+
+
+def rosdep_package(facts: HostFacts) -> str:
+    """Return the Debian package that has rosdep."""
+    return 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
+
+
+def unknown(
+    names: Sequence[str], environment: Mapping[str, str], setup: Sequence[str],
+) -> Command:
+    """Return the command that prints the keys for which a machine may lack something."""
+    return modules.among_nodes(
+        environment, setup, f'set -- {shlex.join(names)}\n{_UNKNOWN}', 'look for dependencies')
+
+
+def resolve(
+    names: Sequence[str], environment: Mapping[str, str], setup: Sequence[str],
+) -> Command:
+    """Return the command whose output ``resolved`` reads."""
+    return modules.among_nodes(
+        environment, setup, f'distro={DISTRO}\nset -- {shlex.join(names)}\n{_RESOLVE}',
+        'resolve rosdep keys')
+
+
+def resolved(output: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    r"""
+    Return the Debian packages and the pip packages that rosdep names.
+
+    >>> resolved('#ROSDEP[a]\n#apt\nliba libb\n#ROSDEP[c]\n#pip\nc')
+    (('liba', 'libb'), ('c',))
+    """
+    found: dict[str, list[str]] = {'apt': [], 'pip': []}
+    installer = ''
+    for line in output.splitlines():
+        if line.startswith('#'):
+            installer = line[1:].strip()
+        elif installer in found:
+            found[installer] += line.split()
+    return tuple(dict.fromkeys(found['apt'])), tuple(dict.fromkeys(found['pip']))
+
+
 def missing(names: Iterable[str]) -> Command:
     """Return the command that prints which Debian packages a machine lacks."""
     return Command(('sh', '-c', _MISSING, 'sh', *names), what='look for apt packages')
@@ -94,9 +185,16 @@ class PipFolder:
     requirements: tuple[str, ...]
 
     @classmethod
-    def of(cls, spec: MachineSpec, facts: HostFacts) -> PipFolder:
-        """Return a machine's folder, below the login user's home."""
-        need = json.dumps([sorted(spec.pip), *(python.version for python in facts.pythons)])
+    def of(
+        cls, spec: MachineSpec, facts: HostFacts, names: Sequence[str] = (),
+    ) -> PipFolder:
+        """
+        Return a machine's folder, below the login user's home.
+
+        :param names: rosdep keys; some may be pip's.
+        """
+        need = json.dumps([sorted(spec.pip), sorted(names), sorted(spec.apt),
+                           *(python.version for python in facts.pythons)])
         digits = hashlib.sha256(need.encode()).hexdigest()[:16]
         return cls(f'{facts.home}/.local/share/fogros2/pip-{digits}', spec.pip)
 
@@ -120,8 +218,10 @@ class PipFolder:
         :param environment: of nodes there, ``given`` the launch file's for the machine.
         """
         names = ' '.join(name.replace('-', '_') for name in OURS)
-        script = modules.PIP.format(folder=shlex.quote(self.path)) + (
-            f'"$@" {shlex.join(self.requirements)}\n'
+        script = modules.PIP.format(folder=shlex.quote(self.path)) if self.requirements else (
+            f'set -e\nmkdir -p {shlex.quote(self.path)}\ncd {shlex.quote(self.path)}\n')
+        script += (
+            (f'"$@" {shlex.join(self.requirements)}\n' if self.requirements else '') +
             'rm -rf pip\n'
             f'for name in {names}; do [ ! -e "site/$name" ] || {{\n'
             "    echo \"one of the packages brings '$name', which is part of FogROS2\" >&2\n"

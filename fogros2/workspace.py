@@ -172,6 +172,19 @@ def dependencies(path: str | os.PathLike[str]) -> list[str]:
     return sorted(needed - {''} - set(manifests))
 
 
+def run_dependencies(manifest: Path) -> set[str]:
+    """
+    Return what a package declares for running: ``depend``, ``exec_depend``; not for ROS 1 alone.
+
+    :raises WorkspaceError: the manifest can't be read.
+    """
+    if not manifest.is_file():
+        return set()
+    return {(element.text or '').strip() for element in _parsed(manifest)
+            if element.tag in ('depend', 'exec_depend', 'run_depend')
+            and '$ROS_VERSION == 1' not in element.get('condition', '')}
+
+
 def plan(
     workspace: Workspace, machine: HostFacts, robot: HostFacts, *, ros_setup: Sequence[str],
     can_build: bool, name: str,

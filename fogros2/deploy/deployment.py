@@ -117,7 +117,8 @@ class Deployment:
             ros, note = bootstrap.ensure(
                 shell, self.launch.underlay(job.spec.workspace), job.spec,
                 timeout=job.timeouts.install, cancel=job.cancel, on_plan=on_plan,
-                elsewhere=True)
+                elsewhere=True,
+                packages=sorted({package for package, _ in self.launch.programs(job.name)}))
             detail.append(note)
             return ros
 

@@ -19,6 +19,7 @@ from fogros2.errors import CommandError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.report import StepDone
+from fogros2.testing.rosdep import rosdep_source
 from fogros2.waiting import wait_until
 
 pytestmark = [
@@ -97,7 +98,46 @@ def test_node_finds_what_its_machine_was_asked_for(spec):
     finally:
         assert launch.down() == []
     (detail,) = [e.detail for e in events if isinstance(e, StepDone) and e.step == 'ROS 2']
-    assert 'install fogt-hello' in detail and 'install Python packages' in detail
+    assert 'installed fogt-hello' in detail and 'installed fogt-one by pip' in detail
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """Return a built workspace whose package runs with what this computer doesn't have."""
+    prefix = tmp_path / 'ws' / 'install' / 'needy'
+    for path, text in (
+            ('share/ament_index/resource_index/packages/needy', ''),
+            ('share/needy/package.xml',
+             '<package><name>needy</name><exec_depend>fogt_apt</exec_depend>'
+             '<exec_depend>fogt_pip</exec_depend><exec_depend>fogt_unknown</exec_depend>'
+             '<exec_depend>std_msgs</exec_depend></package>')):
+        (prefix / path).parent.mkdir(parents=True, exist_ok=True)
+        (prefix / path).write_text(text)
+    (tmp_path / 'ws/install/.colcon_install_layout').write_text('isolated')
+    return tmp_path / 'ws'
+
+
+def test_what_the_workspace_runs_with_is_installed_once(spec, packages, workspace):
+    lists = packages / uuid.uuid4().hex[:6]
+    lists.mkdir()
+    variables = rosdep_source(
+        lists, {'fogt_apt': '[fogt-hello]', 'fogt_pip': '{pip: {packages: [fogt-one]}}'},
+        f'/fogt/{lists.name}')
+    spec = dataclasses.replace(
+        spec, apt=(), pip=(), workspace=str(workspace), on_exit='keep',
+        environment={**spec.environment, **variables})
+    details = []
+    for last in (False, True):
+        launch = Launch(report=lambda event: details.append(event.detail) if (
+            isinstance(event, StepDone) and event.step == 'ROS 2') else None)
+        try:
+            machine = launch.up(dataclasses.replace(spec, on_exit='delete') if last else spec)
+            assert said(machine).split()[:2] == ['from-pip', '/usr/bin/fogt-hello']
+        finally:
+            assert launch.down() == []
+    assert 'installed fogt-hello' in details[0] and 'installed fogt-one by pip' in details[0]
+    assert 'the machine may lack fogt_unknown' in details[0]
+    assert details[1] == 'there already'
 
 
 def test_package_that_does_not_exist_is_named(spec):

@@ -13,11 +13,12 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, dependencies, plan
+from fogros2 import bootstrap, dependencies, plan, workspace
 from fogros2.dependencies import PipFolder
 from fogros2.errors import ConfigurationError
 from fogros2.host import HostFacts
 from fogros2.model import MachineSpec
+from fogros2.testing.rosdep import rosdep_source
 
 RUNS_PIP = pytest.mark.skipif(
     importlib.util.find_spec('pip') is None, reason='needs pip in this environment')
@@ -134,6 +135,64 @@ def test_package_that_brings_a_module_of_ours_is_not_kept(tmp_path: Path) -> Non
     folder, done = installed(tmp_path, 'harmless')
     assert done.returncode == 1 and "brings 'fogros2'" in done.stderr
     assert not Path(folder.path, 'site').exists() and not Path(folder.path, 'complete').exists()
+
+
+def manifest(root: Path, name: str, *lines: str) -> None:
+    """Write an installed package of a workspace."""
+    for folder, text in (
+            (f'share/ament_index/resource_index/packages/{name}', ''),
+            (f'share/{name}/package.xml',
+             f'<package><name>{name}</name>{"".join(lines)}</package>')):
+        path = root / 'install' / name / folder
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
+    manifest(tmp_path, 'mine', '<exec_depend>python3-scipy</exec_depend>',
+             '<depend>tf2_ros</depend>', '<build_depend>eigen</build_depend>',
+             '<exec_depend>other</exec_depend>', '<test_depend>gtest</test_depend>',
+             '<exec_depend condition="$ROS_VERSION == 1">rospy</exec_depend>')
+    manifest(tmp_path, 'other')
+    found = workspace.inspect(tmp_path)
+    assert dependencies.keys(found, ['mine', 'slam_toolbox']) == (
+        'python3-scipy', 'slam_toolbox', 'tf2_ros')
+    assert dependencies.keys(None, ['slam_toolbox']) == ('slam_toolbox',)
+
+
+def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None:
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    (index / 'tf2_ros').touch()
+    assert dependencies.outside(['python3-scipy', 'tf2_ros'], [str(tmp_path), '/none']) == (
+        'python3-scipy',)
+    command = dependencies.unknown(
+        ['tf2_ros', 'fogt-none', 'dpkg'], {'AMENT_PREFIX_PATH': f'/none:{tmp_path}'}, ())
+    said = subprocess.run(command.argv, capture_output=True, text=True, check=True).stdout.split()
+    assert said == ['fogt-none', *([] if shutil.which('dpkg-query') else ['dpkg'])]
+
+
+def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
+    if shutil.which('rosdep', path=str(Path(sys.executable).parent)) is None:
+        pytest.skip('needs rosdep in this environment')
+    environment = {
+        **rosdep_source(tmp_path, {'fogt_key': '[fogt-hello]',
+                                   'fogt_pip': '{pip: {packages: [fogt-one]}}'}),
+        'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}
+    command = dependencies.resolve(
+        ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox'], environment, ())
+    done = subprocess.run(command.argv, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert dependencies.resolved(done.stdout) == (
+        ('fogt-hello', 'ros-jazzy-slam-toolbox'), ('fogt-one',))
+    assert "no rosdep rule for 'fogt_none'" in done.stderr
+
+
+def test_machine_without_rosdep_says_so() -> None:
+    command = dependencies.resolve(['x'], {'PATH': '/usr/bin:/bin'}, ())
+    if shutil.which('rosdep', path='/usr/bin:/bin'):
+        pytest.skip('this computer has rosdep')
+    assert subprocess.run(command.argv, capture_output=True).returncode == dependencies.NO_ROSDEP
 
 
 @pytest.mark.parametrize(('base', 'given', 'expected'), [
