@@ -59,7 +59,7 @@ setup(
     python_requires='>=3.10',
     packages=find_packages(include=[
         'fogros2*', 'fogros2_examples*', 'image_transport_h264*', 'ros2fog_cli*']),
-    package_data={'fogros2': ['py.typed', 'monitor/dashboard/page.html']},
+    package_data={'fogros2': ['locked.txt', 'py.typed', 'monitor/dashboard/page.html']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={

@@ -23,7 +23,7 @@ import threading
 from typing import Literal, Optional
 
 from fogros2 import dependencies as needs
-from fogros2 import host, process
+from fogros2 import host, locked, process
 from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
 from fogros2.errors import ConfigurationError, PrerequisiteError
@@ -464,22 +464,33 @@ def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     target = f'{folder}/wheels'
     # pip runs from its own wheel: the venv needs none, and python3-venv needn't be installed
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
-             '--disable-pip-version-check', '--no-warn-script-location', '--find-links', target]
-    if _fits(facts, wheels) is not None:
-        install = (f'"$venv/bin/python" {shlex.join(words)} --no-index --no-deps '
-                   f'{shlex.quote(target)}/*.whl')
-    else:
-        # compiled for another Python or processor: the machine asks its own package index
-        install = f'"$venv/bin/python" {shlex.join(words)} ros2-embedded fogros2'
+             '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
+    travel = {file: digest for file, digest in wheels.hashes.items()
+              if _fits(facts, wheels) is not None or file.endswith('-none-any.whl')}
+    # compiled for another Python or processor: the machine asks its own package index for these
+    asked = [locked.name_of(file.partition('-')[0]) for file in wheels.hashes
+             if file not in travel]
+    if not asked:
+        words.append('--no-index')
+    lines = [locked.from_file(f'{target}/{file}', digest, locked.name_of(file.partition('-')[0]))
+             for file, digest in travel.items()]
     script = (
-        f'venv={shlex.quote(folder)}/venv\n'
-        f'rm -rf "$venv"\n'
-        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip "$venv"\n'
-        f'{install}\n'
-        f': >{shlex.quote(folder)}/complete\n')
+        f'cd {shlex.quote(folder)}\n'
+        f'{_checked(wheels, wheels.pip)}'
+        'rm -rf venv\n'
+        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip venv\n'
+        f"printf '%s\\n' {shlex.join([*lines, *locked.requirements(asked)])} >requirements.txt\n"
+        f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
+        ': >complete\n')
     return Preparation(
         'embedded', _embedded_install(facts, wheels), send_wheels=True, wheels_target=target,
         commands=(Command.script(script, what='install the embedded default'),))
+
+
+def _checked(wheels: wheel_cache.Wheels, file: str) -> str:
+    """Return what ends a script, in the folder of an installation, if a wheel isn't ours."""
+    line = f'{wheels.hashes[file]}  wheels/{file}'
+    return f'echo {shlex.quote(line)} | sha256sum -c >/dev/null\n'
 
 
 def _travelling(workspace: Optional[workspaces.Workspace]) -> tuple[str, ...]:
@@ -509,6 +520,7 @@ def _ros(
     script = (
         f'cd {shlex.quote(folder)}\n'
         'rm -rf site\n'
+        f'{_checked(wheels, wheels.fogros2)}'
         f'{shlex.quote(facts.python.path)} -m zipfile -e '
         f'wheels/{shlex.quote(wheels.fogros2)} site\n'
         'mkdir -p site/prefix\n'

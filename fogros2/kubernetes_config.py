@@ -41,7 +41,7 @@ def load(context: str) -> tuple[str, str, Any]:
     except ImportError as error:
         raise PrerequisiteError(
             f"Kubernetes' client for Python is missing: {error}",
-            "python3 -m pip install 'fogros2[kubernetes]'") from error
+            'python3 -m pip install kubernetes') from error
     import yaml
     config: Any = kubernetes.config
     if not kubeconfig_files():

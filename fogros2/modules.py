@@ -4,8 +4,8 @@ What some of our programs import beyond ROS 2, and how a machine gets what it la
 
 That goes into a folder which these programs alone look into, so that nothing else on the machine
 finds another NumPy than it was built for. The robot's own modules travel where they run on the
-machine as they are; else the machine asks its package index. Not apt: Ubuntu 24.04 has PyAV 11,
-which can't be told a colour range.
+machine as they are; else the machine asks its package index, for versions that are pinned with
+hashes. Not apt: Ubuntu 24.04 has PyAV 11, which can't be told a colour range.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import shlex
 import sys
 from typing import Optional
 
+from fogros2 import locked
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command, NodeSpec
 from fogros2.wheels import libc_for, runs_on
@@ -251,21 +252,31 @@ def folder(home: str, there: Answer, versions: Sequence[str]) -> str:
     Return where modules lie on a machine; the same for the same need.
 
     :param home: of the login user.
-    :param versions: of what is put there, as far as they are known.
+    :param versions: of what is put there.
     """
     need = json.dumps([there.python, there.missing, list(versions)])
     return (f'{home}/.local/share/fogros2/'
             f'modules-{hashlib.sha256(need.encode()).hexdigest()[:16]}')
 
 
+def pinned(missing: Iterable[str]) -> list[str]:
+    """
+    Return the lines for pip that bring modules from an index.
+
+    :raises PrerequisiteError: one isn't pinned.
+    """
+    return locked.requirements(MODULES[name].distributions[0] for name in missing)
+
+
 def install(
     environment: Mapping[str, str], setup: Sequence[str], target: str, missing: Sequence[str],
 ) -> Command:
-    """Return what installs them from the machine's index, into ``target``/site."""
-    names = [MODULES[name].requirement for name in missing]
-    return among_nodes(environment, setup, PIP.format(folder=shlex.quote(target)) +
-                       f'"$@" --no-deps {shlex.join(names)}\nrm -rf pip\n',
-                       'install Python modules')
+    """Return what installs them from the machine's index, pinned, into ``target``/site."""
+    lines = shlex.join(pinned(missing))
+    return among_nodes(environment, setup, PIP.format(folder=shlex.quote(target)) + (
+        f"printf '%s\\n' {lines} >requirements.txt\n"
+        f'"$@" {shlex.join(locked.OPTIONS)} --requirement requirements.txt\nrm -rf pip\n'),
+        'install Python modules')
 
 
 def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:

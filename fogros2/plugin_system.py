@@ -21,6 +21,8 @@ GROUPS = {
     'fogros2.dds': 'DDS vendor',
     'fogros2.image_transport': 'image transport',
 }
+#: Packages of this project: an index may have another project of such a name.
+_OWN = ('fogros2', 'image_transport_h264', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=None)
@@ -51,6 +53,9 @@ def load(group: str, name: str) -> Any:
     try:
         return points[name].load()
     except ImportError as error:
+        module = error.name or name
+        ours = module.partition('.')[0] in _OWN
         raise PrerequisiteError(
             f"the {GROUPS.get(group, group)} '{name}' can't be loaded: {error}",
-            f'python3 -m pip install {error.name or name}') from error
+            'install FogROS2 again from the folder that it came from' if ours else
+            f'python3 -m pip install {module}') from error

@@ -52,6 +52,7 @@ class Wheels:
     :param fogros2: file name of our own wheel, which any Python takes.
     :param pip: file name of pip's.
     :param embedded: whether the embedded default is among them (a robot with ROS 2 has none).
+    :param hashes: SHA-256 of each wheel by its file name, in hexadecimal digits.
     """
 
     folder: str
@@ -62,6 +63,7 @@ class Wheels:
     fogros2: str
     pip: str = ''
     embedded: bool = True
+    hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def cache_folder() -> Path:
@@ -104,8 +106,10 @@ def _collect(folder: Path) -> Wheels:
         # aside, then moved: two launches may do this at once
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix='.new-') as aside:
-            files = {name: _wheel(d, Path(aside)) for name, d in zip(names, found)}
-            Path(aside, 'wheels.json').write_text(json.dumps(files))
+            packed = {name: _wheel(d, Path(aside)) for name, d in zip(names, found)}
+            Path(aside, 'wheels.json').write_text(json.dumps({
+                name: [file, hashlib.sha256(Path(aside, file).read_bytes()).hexdigest()]
+                for name, file in packed.items()}))
             try:
                 os.rename(aside, target)
             except OSError:
@@ -115,10 +119,12 @@ def _collect(folder: Path) -> Wheels:
                 os.mkdir(aside)
         _forget_old(folder, keep=target)
     os.utime(target)
-    files = json.loads((target / 'wheels.json').read_text())
+    listed = json.loads((target / 'wheels.json').read_text())
+    files = {name: file for name, (file, _) in listed.items()}
     return Wheels(
         str(target), key, (sys.version_info.major, sys.version_info.minor), platform.machine(),
-        libc_for(files.values()), files[OWN], files.get(PIP, ''), EMBEDDED in files)
+        libc_for(files.values()), files[OWN], files.get(PIP, ''), EMBEDDED in files,
+        dict(listed.values()))
 
 
 def runs_on(needed: str, libc: str) -> bool:
@@ -243,7 +249,9 @@ def _wheel(distribution: metadata.Distribution, target: Path) -> str:
     if not distribution.files or distribution.read_text('WHEEL') is None:
         raise PrerequisiteError(
             f'{distribution.name} {distribution.version} was not installed by pip and has no list '
-            'of its files', f'pip install --force-reinstall {distribution.name}')
+            'of its files', 'install it again from the folder that it came from'
+            if _normal(distribution.name) in (OWN, EMBEDDED) else
+            f'pip install --force-reinstall {distribution.name}')
     tags = re.findall(r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)
     pythons, abis, platforms = ('.'.join(dict.fromkeys(t.split('-')[i] for t in tags))
                                 for i in range(3))

@@ -64,7 +64,8 @@ class Equipment:
         target, how = '', 'there already'
         if there.missing:
             copy = modules.copy(there)
-            target = modules.folder(self._home, there, copy.versions if copy else ())
+            target = modules.folder(
+                self._home, there, copy.versions if copy else modules.pinned(there.missing))
             how = 'there from before'
             if not self._has(target):
                 self._fill(target, there, copy)

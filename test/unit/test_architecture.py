@@ -22,7 +22,8 @@ LAYERS = [
     {'store', 'journal', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
      'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',
      'kubernetes_cancel', 'kubernetes_config', 'kubernetes_watch', 'workspace', 'wheels',
-      'modules', 'dependencies', 'bootstrap', 'container_scripts', 'containers', 'ros2_daemon'},
+     'locked', 'modules', 'dependencies', 'bootstrap', 'container_scripts', 'containers',
+     'ros2_daemon'},
     {'deploy', 'monitor', 'testing'},
     {'actions'},
 ]

@@ -33,7 +33,10 @@ DEBIAN = dataclasses.replace(
     NOBLE, system='debian', release='13', libc='glibc 2.41',
     pythons=(Python('/usr/bin/python3', (3, 13), True),))
 WHEELS = Wheels('/cache', 'k1', (3, 12), 'x86_64', 'glibc 2.28',
-                'fogros2-1-py3-none-any.whl', 'pip-25-py3-none-any.whl')
+                'fogros2-1-py3-none-any.whl', 'pip-25-py3-none-any.whl', hashes={
+                    'fogros2-1-py3-none-any.whl': 'f1', 'ros2_embedded-1-py3-none-any.whl': 'e1',
+                    'numpy-1-cp312-cp312-manylinux_2_28_x86_64.whl': 'n1',
+                    'pip-25-py3-none-any.whl': 'b1'})
 UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
     'PATH': '/robot/.venv/bin:/usr/bin', 'AMENT_PREFIX_PATH': '/ws/install/a:/robot/.venv',
     'ROS_DOMAIN_ID': '7', 'ROS_DISTRO': 'jazzy'})
@@ -213,8 +216,20 @@ def test_auto_takes_the_embedded_default_elsewhere() -> None:
 ])
 def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
     script = scripts(plan(facts).commands)
-    assert '--no-index' not in script
-    assert 'ros2-embedded fogros2' in script
+    assert '--no-index' not in script and '--require-hashes' in script
+    folder = 'file:///home/ubuntu/.local/share/fogros2/k1/wheels'
+    assert f'fogros2 @ {folder}/fogros2-1-py3-none-any.whl --hash=sha256:f1' in script
+    assert f'ros2-embedded @ {folder}/ros2_embedded-1-py3-none-any.whl' in script
+    # what is compiled for the robot is taken in the version that is pinned
+    assert 'numpy-1' not in script and 'numpy==' in script
+
+
+def test_a_robots_wheel_of_which_no_other_build_is_pinned_is_named() -> None:
+    odd = dataclasses.replace(WHEELS, hashes={
+        **WHEELS.hashes, 'fast_odd-1-cp312-cp312-linux_x86_64.whl': 'o1'})
+    assert plan(NOBLE, wheel=odd).mode == 'embedded'
+    with pytest.raises(PrerequisiteError, match='fast-odd is compiled for this robot'):
+        plan(DEBIAN, wheel=odd)
 
 
 def test_the_launchs_middleware_is_what_a_machine_gets() -> None:

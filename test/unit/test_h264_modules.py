@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from importlib import metadata
 import os
 from pathlib import Path
@@ -17,7 +18,7 @@ import zipfile
 
 import pytest
 
-from fogros2 import modules
+from fogros2 import locked, modules
 from fogros2.bootstrap import RosInstall
 from fogros2.deploy.equipping import Equipment
 from fogros2.errors import PrerequisiteError
@@ -136,8 +137,14 @@ def test_a_ros_package_may_stand_in_its_place(
 # --- on a machine: this computer, by its own shell ----------------------------------------------
 
 @pytest.fixture
-def machine(tmp_path: Path) -> SimpleNamespace:
-    """Return a machine whose PyAV can't be imported, and whose index is a folder."""
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """
+    Return a machine whose PyAV can't be imported, and whose index is a folder.
+
+    The last wheel that is put there is the one that is pinned.
+    """
+    monkeypatch.setattr(locked, 'FILE', tmp_path / 'locked.txt')
+    locked.FILE.write_text(f"av==98.0 --hash=sha256:{64 * '0'}\n")
     broken, index = tmp_path / 'broken', tmp_path / 'index'
     broken.mkdir()
     (broken / 'av.py').write_text("raise OSError('libavcodec.so.60 is not there')\n")
@@ -153,7 +160,8 @@ def machine(tmp_path: Path) -> SimpleNamespace:
 
 
 def wheel(index: Path, version: str, program: str = '') -> None:
-    with zipfile.ZipFile(index / f'av-{version}-py3-none-any.whl', 'w') as archive:
+    path = index / f'av-{version}-py3-none-any.whl'
+    with zipfile.ZipFile(path, 'w') as archive:
         info = f'av-{version}.dist-info'
         archive.writestr('av/__init__.py', program or f"__version__ = '{version}'\n")
         archive.writestr(f'{info}/METADATA', f'Metadata-Version: 2.1\nName: av\n'
@@ -161,6 +169,8 @@ def wheel(index: Path, version: str, program: str = '') -> None:
         archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
                                           'Tag: py3-none-any\n')
         archive.writestr(f'{info}/RECORD', '')
+    locked.FILE.write_text(
+        f'av=={version} --hash=sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n')
 
 
 def equipped(machine: SimpleNamespace) -> tuple[NodeSpec, str]:
@@ -183,7 +193,7 @@ def test_a_machine_of_another_kind_asks_its_index(
     monkeypatch.setattr(modules, 'copy', lambda there: None)
     if old is not None:
         (machine.broken / 'av.py').write_text(old)
-    for version in ('14.0.0', '99.1.0'):
+    for version in ('14.0.0', '99.2.0', '99.1.0'):
         wheel(machine.index, version)
     node, said = equipped(machine)
     assert said == 'av installed'

@@ -23,7 +23,7 @@ from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_api import ApiError, Unreachable
 from fogros2.testing.shell_contract import raised
 
-pytest.importorskip('kubernetes', reason="needs the client: pip install 'fogros2[kubernetes]'")
+pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
 
 #: What a request is answered: a status and an object, or lines and whether to hold on then.
 Answer = tuple[int, Any]

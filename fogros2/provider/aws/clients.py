@@ -116,7 +116,7 @@ class Account:
                 except ImportError as error:
                     raise PrerequisiteError(
                         'machines at AWS take boto3, which is not installed',
-                        "python3 -m pip install 'fogros2[aws]'") from error
+                        'python3 -m pip install boto3') from error
                 with translated('reading the AWS configuration'):
                     self._session = boto3.session.Session()
             return self._session

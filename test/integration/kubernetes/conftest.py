@@ -43,7 +43,7 @@ def kubernetes(binaries: Path) -> Iterator[Cluster]:
     if folder := os.environ.get('FOGROS2_CLUSTER'):
         yield running_cluster(Path(folder))
         return
-    pytest.importorskip('kubernetes', reason="needs the client: pip install 'fogros2[kubernetes]'")
+    pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
     with cluster(binaries.parent, binaries) as running:
         yield running
 

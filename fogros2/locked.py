@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a machine may take from its package index: versions that are pinned, with hashes.
+
+The robot sends wheels where they fit. Compiled ones don't fit another processor, C library or
+Python; a machine takes those from its own index, and pip refuses any other file than these.
+``tools/lock.py`` writes the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+import re
+
+from fogros2.errors import PrerequisiteError
+
+FILE = Path(__file__).with_name('locked.txt')
+#: What pip is told besides the requirements. Sources would be built by programs without hashes.
+OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
+
+
+def name_of(requirement: str) -> str:
+    """Return the name of a distribution as indexes compare it: ``PyYAML>=6`` is ``pyyaml``."""
+    return re.sub('[-_.]+', '-', re.split(r'[^A-Za-z0-9._-]', requirement.strip())[0]).lower()
+
+
+def parse(text: str) -> dict[str, list[str]]:
+    """
+    Return the entries of a requirements file by the distribution's name.
+
+    One distribution has several entries where the version depends on the Python.
+    """
+    found: dict[str, list[str]] = {}
+    for entry in re.sub(r'\s*\\\n\s*', ' ', text).splitlines():
+        if entry.strip() and not entry.startswith('#'):
+            found.setdefault(name_of(entry), []).append(entry.strip())
+    return found
+
+
+def requirements(names: Iterable[str]) -> list[str]:
+    """
+    Return the lines for pip that bring some distributions.
+
+    :raises PrerequisiteError: one isn't pinned.
+    """
+    entries = parse(FILE.read_text())
+    lines: list[str] = []
+    for name in names:
+        if name_of(name) not in entries:
+            raise PrerequisiteError(
+                f'{name} is compiled for this robot, and no other build of it is pinned',
+                'choose a machine with the same Python, processor and C library as the robot')
+        lines += entries[name_of(name)]
+    return lines
+
+
+def from_file(path: str, sha256: str, name: str) -> str:
+    """Return the line for pip that brings a wheel from a file, by its hash."""
+    from urllib.parse import quote
+    return f'{name} @ file://{quote(path)} --hash=sha256:{sha256}'

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A package index that an attacker writes to runs no code on machines.
+
+The index is a folder that the machine is set up with. It has what the embedded default needs, and
+higher versions of this project's names, whose code would leave a file behind.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+from fogros2 import bootstrap, host, locked, modules, process, wheels
+from fogros2.host import Python
+from fogros2.model import Command, MachineSpec
+from fogros2.plan import Underlay
+from fogros2.wheels import Wheels
+
+OURS = ('fogros2', 'ros2-embedded')
+#: What fogros2 requires on the robot alone.
+ROBOT_ONLY = ('paramiko', 'setuptools')
+UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {})
+#: What the attacker's code leaves where it has run: beside the interpreter that ran it.
+MARK = 'attacked'
+#: pip installs this, and Python runs it at each of its starts.
+CODE = f'import pathlib, sys; pathlib.Path(sys.prefix, {MARK!r}).touch()\n'
+
+
+class Index:
+    """A package index in a folder, as pip takes it by a file URL."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.url = folder.as_uri()
+
+    def add(self, path: Path) -> str:
+        """Put a wheel into it and return its line of a lock file."""
+        name, version = path.name.split('-')[:2]
+        place = self.folder / locked.name_of(name)
+        place.mkdir(parents=True, exist_ok=True)
+        (place / path.name).write_bytes(path.read_bytes())
+        (place / 'index.html').write_text(''.join(
+            f'<a href="{file.name}">{file.name}</a>\n' for file in sorted(place.glob('*.whl'))))
+        return f'{name}=={version} --hash=sha256:{sha256(path)}'
+
+    def attack(self, name: str, version: str, folder: Path, code: str = CODE) -> Path:
+        """Add a distribution of the attacker's."""
+        path = folder / f'{name.replace("-", "_")}-{version}-py3-none-any.whl'
+        with zipfile.ZipFile(path, 'w') as archive:
+            info = f'{name.replace("-", "_")}-{version}.dist-info'
+            files = {
+                f'attack_{name.replace("-", "_")}.pth': code,
+                f'{info}/METADATA': f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n',
+                f'{info}/WHEEL': 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n'}
+            for file, text in files.items():
+                archive.writestr(file, text)
+            archive.writestr(f'{info}/RECORD', ''.join(
+                f'{file},,\n' for file in [*files, f'{info}/RECORD']))
+        self.add(path)
+        return path
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope='module')
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
+    """Return the robot's wheels."""
+    found = wheels.collect(tmp_path_factory.mktemp('wheels'))
+    if not found.embedded:
+        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
+    return found
+
+
+@pytest.fixture
+def index(packed: Wheels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Index:
+    """Return an index that has what the robot has but for its own, and pins it."""
+    made = Index(tmp_path / 'simple')
+    lines = [made.add(path) for path in sorted(Path(packed.folder).glob('*.whl'))
+             if locked.name_of(path.name.partition('-')[0]) not in OURS]
+    for name in ROBOT_ONLY:  # whoever resolves what fogros2 requires finds these as well
+        made.attack(name, '99.0', tmp_path, code='')
+    pins = tmp_path / 'locked.txt'
+    pins.write_text('\n'.join(lines) + '\n')
+    monkeypatch.setattr(locked, 'FILE', pins)
+    return made
+
+
+class Machine:
+    """A home on this computer whose login asks an index of its own."""
+
+    def __init__(self, home: Path, index: Index) -> None:
+        self.home = home
+        self.environment = {
+            'PATH': '/usr/bin:/bin', 'HOME': str(home), 'PIP_INDEX_URL': index.url,
+            'PIP_NO_CACHE_DIR': '1'}
+
+    def run(self, *commands: Command) -> subprocess.CompletedProcess[str]:
+        """Run commands until one fails, and return what the last one left."""
+        for command in commands:
+            done = subprocess.run(
+                command.argv, env=self.environment, capture_output=True, text=True, timeout=120)
+            if done.returncode != 0:
+                break
+        return done
+
+    def was_attacked(self) -> list[Path]:
+        """Return where the attacker's code has run."""
+        return sorted(self.home.rglob(MARK))
+
+
+def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProcess[str], Path]:
+    """Install the embedded default as on a machine with another C library than the wheels'."""
+    facts = dataclasses.replace(
+        host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(machine.home),
+        libc='glibc 2.1', pythons=(Python(sys.executable, sys.version_info[:2], True),),
+        programs=frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'}))
+    todo = bootstrap.plan(
+        MachineSpec('m', 'ssh', bootstrap='embedded'), facts, facts, UNDER, packed, None)
+    target = Path(todo.wheels_target)
+    target.mkdir(parents=True)
+    for path in Path(packed.folder).iterdir():
+        (target / path.name).write_bytes(path.read_bytes())
+    done = machine.run(*todo.commands)
+    python = target.parent / 'venv' / 'bin' / 'python'
+    if done.returncode == 0:
+        # whatever runs at the start of a node has run by then
+        done = machine.run(Command((str(python), '-c', (
+            'from importlib import metadata\nimport fogros2, rclpy\n'
+            'print(*(metadata.version(name) for name in ("fogros2", "ros2-embedded")))'))))
+    return done, python
+
+
+def test_higher_versions_of_our_names_are_not_taken(
+    packed: Wheels, index: Index, tmp_path: Path,
+) -> None:
+    for name in OURS:
+        index.attack(name, '99.0', tmp_path)
+    machine = Machine(tmp_path / 'home', index)
+    done, python = install(packed, machine)
+    assert machine.was_attacked() == [], 'a distribution of the index ran its code'
+    assert done.returncode == 0, done.stderr
+    assert '99.0' not in done.stdout
+
+
+def test_higher_versions_of_what_we_need_are_not_taken(
+    packed: Wheels, index: Index, tmp_path: Path,
+) -> None:
+    for name in ('cyclonedds', 'numpy', 'PyYAML', 'rich-click'):
+        index.attack(name, '11.99', tmp_path)
+    machine = Machine(tmp_path / 'home', index)
+    done, _ = install(packed, machine)
+    assert machine.was_attacked() == [], 'a version that is not pinned ran its code'
+    assert done.returncode == 0, done.stderr
+
+
+def test_another_file_of_a_pinned_version_is_refused(
+    packed: Wheels, index: Index, tmp_path: Path,
+) -> None:
+    (pinned,) = index.folder.glob('cyclonedds/*.whl')
+    replaced = index.attack('cyclonedds', pinned.name.split('-')[1], tmp_path)
+    pinned.write_bytes(replaced.read_bytes())
+    machine = Machine(tmp_path / 'home', index)
+    done, _ = install(packed, machine)
+    assert machine.was_attacked() == [], 'a file with another hash ran its code'
+    assert done.returncode != 0 and 'hash' in done.stderr.lower(), done.stderr
+
+
+def test_sources_are_never_built(packed: Wheels, index: Index, tmp_path: Path) -> None:
+    """A build runs code of the sources, and of tools that nothing pins."""
+    (pinned,) = index.folder.glob('cyclonedds/*.whl')
+    version = pinned.name.split('-')[1]
+    archive = tmp_path / f'cyclonedds-{version}.zip'
+    with zipfile.ZipFile(archive, 'w') as made:
+        made.writestr(f'cyclonedds-{version}/attack.py', (
+            'import os, pathlib\n'
+            f'pathlib.Path(os.environ["HOME"], {MARK!r}).touch()\n'))
+        made.writestr(f'cyclonedds-{version}/pyproject.toml', (
+            '[build-system]\nrequires = []\nbuild-backend = "attack"\nbackend-path = ["."]\n'))
+        made.writestr(f'cyclonedds-{version}/PKG-INFO', (
+            f'Metadata-Version: 2.1\nName: cyclonedds\nVersion: {version}\n'))
+    pinned.unlink()
+    (pinned.parent / archive.name).write_bytes(archive.read_bytes())
+    (pinned.parent / 'index.html').write_text(f'<a href="{archive.name}">{archive.name}</a>')
+    # even where its hash is pinned, as locked.txt has those of sources too
+    locked.FILE.write_text(locked.FILE.read_text().replace(
+        f'cyclonedds=={version}', f'cyclonedds=={version} --hash=sha256:{sha256(archive)}'))
+    machine = Machine(tmp_path / 'home', index)
+    done, _ = install(packed, machine)
+    assert machine.was_attacked() == [], 'the build of sources ran its code'
+    assert done.returncode != 0, done.stdout
+
+
+def test_a_wheel_that_was_changed_on_the_way_is_refused(
+    packed: Wheels, index: Index, tmp_path: Path,
+) -> None:
+    folder = tmp_path / 'changed'
+    folder.mkdir()
+    for path in Path(packed.folder).iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    (folder / packed.fogros2).write_bytes(index.attack('fogros2', '99.0', tmp_path).read_bytes())
+    machine = Machine(tmp_path / 'home', index)
+    done, _ = install(dataclasses.replace(packed, folder=str(folder)), machine)
+    assert machine.was_attacked() == [], 'a wheel with another hash ran its code'
+    assert done.returncode != 0 and 'hash' in done.stderr.lower(), done.stderr
+
+
+def test_modules_of_nodes_are_pinned(index: Index, tmp_path: Path) -> None:
+    index.attack('av', '99.0', tmp_path)
+    with locked.FILE.open('a') as pins:
+        pins.write('av==17.0 --hash=sha256:' + 64 * '0' + '\n')
+    machine = Machine(tmp_path / 'home', index)
+    machine.home.mkdir()
+    done = machine.run(modules.install({}, (), str(machine.home / 'modules'), ['av']))
+    site = machine.home / 'modules' / 'site'
+    machine.run(Command((sys.executable, '-c', f'import site; site.addsitedir({str(site)!r})')))
+    assert not site.exists() and done.returncode != 0, 'a version that is not pinned was taken'
+
+
+def hints() -> list[str]:
+    """Return the texts of this project that tell users what to install."""
+    root = Path(__file__).resolve().parents[2]
+    listed = subprocess.run(['git', 'ls-files', '-z'], cwd=root, capture_output=True, text=True)
+    if listed.returncode != 0:
+        pytest.skip('this tree is under no version control, which says what belongs to it')
+    return [name for name in listed.stdout.split('\0')
+            if name.endswith(('.py', '.md', '.sh', '.rst', '.xml', 'Makefile'))
+            and not name.startswith('test/')]
+
+
+def test_no_hint_names_our_distributions_to_an_index() -> None:
+    import re
+    root = Path(__file__).resolve().parents[2]
+    found = [f'{name}: {match[0]}' for name in hints() for match in re.finditer(
+        r'''pip3? install [^\n`]*?(?<![./\w-])(fogros2|ros2[-_]embedded)(?![/\w])''',
+        (root / name).read_text())]
+    assert found == []
+
+
+def test_what_the_robot_sends_compiled_is_pinned_for_others(packed: Wheels) -> None:
+    """The file that is shipped, for each kind of machine: not the test's."""
+    names = [locked.name_of(file.partition('-')[0]) for file in packed.hashes
+             if not file.endswith('-none-any.whl')]
+    names += [module.distributions[0] for module in modules.MODULES.values()]
+    lines = locked.requirements(names)
+    assert names and all('==' in line and '--hash=sha256:' in line for line in lines)
+    assert os.path.basename(locked.FILE) == 'locked.txt'
