@@ -5,16 +5,19 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 import re
 import shutil
 import sys
 import threading
 import time
 import uuid
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 import pytest
 from ros2cli.cli import main
 
+from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
 from fogros2.errors import FogError, NameTaken, WorkspaceError
 from fogros2.model import Command, MachineSpec, NodeSpec
@@ -29,6 +32,12 @@ pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
 ]
+
+
+class Ros2cliHandler(SimpleXMLRPCRequestHandler):
+    """Answers at the path that the daemon of ros2 has."""
+
+    rpc_paths = ('/ros2cli/',)
 
 
 class Injected(FogError):
@@ -70,6 +79,37 @@ def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
     started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
     done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
     assert sorted(started) == sorted(done)
+
+
+def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
+    launch = Launch()
+    seen = []
+    try:
+        environment = launch.robot_environment()
+        folder = launch.store.launch(launch.id)
+        ros2_daemon.install(folder, sys.executable)
+        server = SimpleXMLRPCServer(
+            ('127.0.0.1', int((folder / ros2_daemon.PORT_FILE).read_text())), Ros2cliHandler,
+            logRequests=False, allow_none=True)
+        interface = Path('/sys/class/net', launch.robot_vpn().interface.name)
+
+        def stop():
+            seen.append(interface.exists())
+            threading.Thread(target=server.shutdown).start()
+
+        def serve():
+            with server:
+                server.serve_forever(0.05)
+
+        server.register_function(stop, 'system.shutdown')
+        thread = threading.Thread(target=serve)
+        thread.start()
+        assert environment and interface.exists()
+    finally:
+        assert launch.down() == []
+    thread.join(10)
+    assert not thread.is_alive()
+    assert seen == [True] and not interface.exists() and not folder.exists()
 
 
 def test_machine_with_a_slow_clock_is_warned_of_and_shown(
