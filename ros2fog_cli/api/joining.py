@@ -89,18 +89,21 @@ def _wait(words: list[str], environment: Mapping[str, str]) -> int:
     def leave(number: int, frame: object) -> None:
         raise SystemExit(128 + number)
 
+    child = None
+    before = {number: signal.signal(number, leave)
+              for number in (signal.SIGHUP, signal.SIGTERM)}
     try:
         child = subprocess.Popen(words, env=dict(environment))
+        # now, as the command would inherit that it is ignored
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        status = child.wait()
     except OSError as error:
         raise ConfigurationError(f"'{words[0]}' can not be run: {error.strerror}",
                                  'name a program of this computer after --') from error
-    before = {number: signal.signal(number, what) for number, what in (
-        (signal.SIGINT, signal.SIG_IGN), (signal.SIGHUP, leave), (signal.SIGTERM, leave))}
-    try:
-        status = child.wait()
     except SystemExit:
-        child.terminate()
-        child.wait()
+        if child is not None:
+            child.terminate()
+            child.wait()
         raise
     finally:
         for number, handler in before.items():

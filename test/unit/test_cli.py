@@ -10,6 +10,7 @@ import functools
 import json
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import time
@@ -459,6 +460,24 @@ def test_shell_runs_a_command_in_the_launch(
     assert ('fogros2-shell-' in where) is daemon and Path(where).exists() is not daemon
     assert "'no-such-program' can not be run" in str(run('shell', 'a', '--', 'no-such-program'))
     assert run('shell', 'a', '--', 'sh', '-c', 'kill -KILL $$') == 128 + 9
+
+
+def test_shell_that_is_terminated_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    monkeypatch.setattr(joining, 'has_daemon', lambda: True)
+    machine('a')
+    record('a', **alive())
+    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
+        (Store().launch('abc123') / name).write_text(text)
+    handler = signal.getsignal(signal.SIGTERM)
+    script = f'echo $$ $(command -v ros2) >{tmp_path}/said; kill -TERM $PPID; exec sleep 60'
+    with pytest.raises(SystemExit, match='143'):
+        joining.run('a', ['sh', '-c', script])
+    pid, program = (tmp_path / 'said').read_text().split()
+    assert not Path('/proc', pid).exists() and not Path(program).exists()
+    assert signal.getsignal(signal.SIGTERM) is handler
 
 
 def test_shell_is_the_users_own(
