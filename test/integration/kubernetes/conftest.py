@@ -33,7 +33,7 @@ def binaries(root: None) -> Path:
     script = ROOT / 'tools' / 'kubernetes.sh'
     found = subprocess.run([script, '--find'], capture_output=True, text=True, check=True)
     if not found.stdout:
-        pytest.skip("needs Kubernetes: 'make test-kubernetes' builds it (ten minutes, once)")
+        pytest.skip("needs Kubernetes: 'make test-kubernetes' builds it (six minutes, once)")
     return Path(found.stdout.strip())
 
 
