@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a machine has, what it needs, and the embedded default installed for real."""
+"""What a machine has, and what it needs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ import dataclasses
 import os
 from pathlib import Path
 import re
-import subprocess
 import sys
 from typing import Any
 
 import pytest
 
-from fogros2 import bootstrap, host, process, wheels
+from fogros2 import bootstrap, host, process
 from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import HostFacts, Python
 from fogros2.model import Bootstrap, Command, MachineSpec
@@ -318,73 +317,6 @@ def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -
     assert todo.install.environment['PATH'].startswith(f'{venv}/bin:')
     assert '/robot' not in ''.join(todo.install.environment.values())
     assert todo.install.workspace is not None and todo.install.workspace.commands == ()
-
-
-@pytest.fixture(scope='module')
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
-    folder = tmp_path_factory.mktemp('wheels')
-    first = wheels.collect(folder)
-    # the second time everything is there
-    assert wheels.collect(folder) == first
-    return first
-
-
-def test_wheels_hold_this_installation(packed: Wheels) -> None:
-    assert packed.python == sys.version_info[:2]
-    names = os.listdir(packed.folder)
-    assert packed.fogros2 in names
-    assert (packed.pip in names) == packed.embedded  # a machine with ROS 2 has its own
-    assert not [name for name in names if name.startswith(('paramiko', 'pytest', 'mypy'))]
-    if packed.embedded:
-        assert [name for name in names if name.startswith('cyclonedds')]
-
-
-def test_the_embedded_default_is_installed_without_a_network(
-    packed: Wheels, tmp_path: Path,
-) -> None:
-    if not packed.embedded:
-        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
-    facts = dataclasses.replace(
-        host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(tmp_path),
-        pythons=(Python(sys.executable, sys.version_info[:2], True),),
-        programs=TOOLS)
-    spec = MachineSpec('m', 'ssh', bootstrap='embedded')
-    todo = bootstrap.plan(spec, facts, facts, UNDER, packed, None)
-    assert todo.mode == 'embedded'
-    target = Path(todo.wheels_target)
-    target.mkdir(parents=True)
-    subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)
-    offline = ['unshare', '-n'] if os.geteuid() == 0 else []
-    environment = {'PATH': '/usr/bin:/bin', 'HOME': str(tmp_path),
-                   'PIP_INDEX_URL': 'http://127.0.0.1:9/'}
-    for command in todo.commands:
-        subprocess.run([*offline, *command.argv], check=True, env=environment)
-    python = f'{tmp_path}/.local/share/fogros2/{packed.key}/venv/bin/python'
-    said = subprocess.run(
-        [python, '-c', 'import fogros2, rclpy, launch, std_msgs.msg; print(fogros2.__file__)'],
-        check=True, capture_output=True, text=True, env=environment, cwd=tmp_path).stdout
-    assert str(tmp_path) in said
-    assert Path(todo.install.command[-1]).is_file()
-    ros2 = Path(todo.install.command[0])
-    assert subprocess.run([ros2, 'fog', '-h'], check=True, capture_output=True, text=True,
-                          env=environment).stdout
-    # the next launch sees it and has nothing to do
-    facts = dataclasses.replace(facts, installed=frozenset({packed.key}))
-    assert bootstrap.plan(spec, facts, facts, UNDER, packed, None).commands == ()
-
-
-def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path: Path) -> None:
-    facts = dataclasses.replace(ROS, home=str(tmp_path))
-    todo = bootstrap.plan(MachineSpec('m', 'ssh'), facts, facts, UNDER, packed, None)
-    target = Path(todo.wheels_target)
-    target.mkdir(parents=True)
-    subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)
-    for command in todo.commands:
-        process.run(command, timeout=60)
-    assert Path(todo.install.command[-1]).is_file()
-    prefix = Path(todo.install.environment['AMENT_PREFIX_PATH'])
-    assert (prefix / 'share/ament_index/resource_index/packages/fogros2_examples').exists()
-    assert os.access(prefix / 'lib/fogros2_examples/talker', os.X_OK)
 
 
 def test_an_unbuilt_workspace_says_so_where_nothing_builds_it(tmp_path: Path) -> None:

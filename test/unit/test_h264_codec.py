@@ -348,7 +348,7 @@ def test_ffmpeg_agrees(
         ours = numpy.stack([p.rows().reshape(size[1], size[0], 3) for p in pictures])
         if encoding == 'bgr8':
             ours = ours[..., ::-1]
-        difference = numpy.abs(frames[:, :size[1], :size[0]].astype(int) - ours)
+        difference = numpy.abs(frames[:, :size[1], :size[0]].astype(numpy.int16) - ours)
         assert difference.max() == 0 if lossless else difference.mean() < 1.5
 
 
