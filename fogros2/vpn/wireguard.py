@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 import ipaddress
+from pathlib import Path
 import re
 import shlex
 
@@ -34,6 +35,9 @@ PORTS_PER_DOMAIN = 250
 #: RTPS 2.5, 9.6.2.4: participants announce themselves to this group.
 DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
+#: Packets that may wait for ``wireguard-go``; the kernel's default is 500. A raw VGA image has 720
+#: at once, and a busy processor lets several images wait.
+QUEUE = 3000
 
 #: Shell text that makes of ``wg show ... endpoints`` questions to ``ip -batch``, one for each host
 #: that is known.
@@ -92,7 +96,8 @@ class WireGuard(Vpn):
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield what makes these the peers, and leaves the sessions of those that stay."""
         yield Command.script(
-            '\n'.join([_configure(interface, peers), *_routes(interface, peers)]), sudo=True,
+            '\n'.join([_configure(interface, peers), *_routes(interface, peers),
+                       _buffer(interface)]), sudo=True,
             what=_what('tell', interface, 'its peers'))
 
     def alive(self, interface: VpnInterface) -> Command:
@@ -175,7 +180,7 @@ class WireGuard(Vpn):
         guard = [_guard(interface, self.ports)] if interface.guarded else []
         return [
             *guard, _link(interface), _Step(_configure(interface, peers, recall=recall)),
-            _address(interface, peers)]
+            _address(interface, peers), _Step(_buffer(interface))]
 
 
 def dds_ports(domain: int) -> tuple[int, int]:
@@ -355,10 +360,23 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     alone = ' noprefixroute' if interface.host_routes else ''
     lines = [
         f'address replace {interface.address}/{prefix} dev {name}{alone}',
-        f'link set dev {name} mtu {interface.mtu} multicast on up']
+        f'link set dev {name} mtu {interface.mtu} multicast on txqueuelen {QUEUE} up']
     do = f'{_print(lines)} | ip -batch -'
     own = [_free(interface, interface.address)] if interface.host_routes else []
     return _Step('\n'.join([*own, do, *_routes(interface, peers)]))
+
+
+def _buffer(interface: VpnInterface) -> str:
+    """
+    Return the text that enlarges the receive buffer of a ``wireguard-go``.
+
+    Each configuration opens its sockets anew. Without the right to do so the VPN works as well,
+    and loses more of large images.
+    """
+    name = _name(interface)
+    source = Path(__file__).with_name('receive_buffer.py').read_text()
+    return (f'[ ! -S /var/run/wireguard/{name}.sock ] || '
+            f'python3 -I -c {shlex.quote(source)} {name} || :')
 
 
 def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:

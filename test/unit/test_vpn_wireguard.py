@@ -70,6 +70,18 @@ def test_the_filter_is_there_before_the_interface_and_goes_after_it() -> None:
     assert down.index('ip link delete') < down.index('nft -f') < down.index('rm -f /state/vpn.key')
 
 
+@pytest.mark.parametrize('interface', [ROBOT, MACHINE])
+def test_large_images_have_room_on_both_hosts(interface: VpnInterface) -> None:
+    wireguard = WireGuard()
+    assert (f'link set dev {interface.name} mtu 1420 multicast on txqueuelen 3000 up'
+            in script(*wireguard.up(interface, [])))
+    # each of these opens the sockets of wireguard-go, whose buffers the last line enlarges
+    for commands in (wireguard.up(interface, []), wireguard.peers(interface, []),
+                     wireguard.repair(interface, [])):
+        assert script(*commands).endswith(f' {interface.name} || :')
+    assert 'pidfd_getfd' in script(*wireguard.up(interface, []))
+
+
 def test_a_machine_is_not_filtered() -> None:
     assert 'nft' not in script(*every_command(MACHINE, TO_ROBOT))
 

@@ -243,11 +243,17 @@ class Lab:
         for command in commands:
             self.run(host, command)
 
-    def connect(self) -> None:
-        """Set the VPN up as a deployment does: the robot, the machine, the robot's peer."""
-        if self.relay is None:
-            self.relayed()
+    def connect(self, endpoint: str = '') -> None:
+        """
+        Set the VPN up as a deployment does: the robot, the machine, the robot's peer.
+
+        :param endpoint: the machine's, where no relay stands before it.
+        """
         peers = self.peers()
+        if endpoint:
+            peers['robot'] = [dataclasses.replace(peers['robot'][0], endpoint=endpoint)]
+        elif self.relay is None:
+            self.relayed()
         self.do('robot', self.vpn.up(self.interfaces['robot'], []))
         self.do('machine', self.vpn.up(self.interfaces['machine'], peers['machine']))
         self.do('robot', self.vpn.peers(self.interfaces['robot'], peers['robot']))

@@ -3,6 +3,8 @@
 """
 The ends of a video stream for tests: ``camera`` publishes images, ``viewer`` takes them.
 
+With ``best_effort`` behind it the viewer takes the camera's own images, at 10 Hz.
+
 The viewer prints a JSON object an image: its number, latency and arrival (s, on the monotonic
 clock that all network namespaces share), and for some how near it is to the original (dB).
 """
@@ -16,6 +18,7 @@ import time
 import numpy
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
 from fogros2_examples.scene import Scene
@@ -33,6 +36,8 @@ def frame(frames: list[numpy.ndarray], number: int) -> numpy.ndarray:
 def main() -> None:
     scene = Scene(WIDTH, HEIGHT, RATE)
     frames = [scene.frame(number) for number in range(FRAMES)]
+    raw = sys.argv[2:] == ['best_effort']
+    qos = qos_profile_sensor_data if raw else 2
     rclpy.init(args=[])
     node = rclpy.create_node(sys.argv[1])
     count = 0
@@ -56,10 +61,10 @@ def main() -> None:
         print(json.dumps(told), flush=True)
 
     if sys.argv[1] == 'camera':
-        publisher = node.create_publisher(Image, '/camera', 2)
-        node.create_timer(1 / RATE, shoot)
+        publisher = node.create_publisher(Image, '/camera', qos)
+        node.create_timer(0.1 if raw else 1 / RATE, shoot)
     else:
-        node.create_subscription(Image, '/seen', view, 2)
+        node.create_subscription(Image, '/camera' if raw else '/seen', view, qos)
     print(json.dumps({'ready': True}), flush=True)
     try:
         rclpy.spin(node)
