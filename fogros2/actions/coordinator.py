@@ -14,6 +14,7 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import difflib
+import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -36,6 +37,7 @@ from fogros2.actions import (
     private,
     signals,
     streaming,
+    uncompressed,
     words,
 )
 from fogros2.actions.console import Console
@@ -114,6 +116,8 @@ class Coordinator:
         self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
         self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
+        #: Ends with the launch.
+        self._watched: Optional[asyncio.Future[None]] = None
         self._restore_signals: Callable[[], None] = _nothing
         self._logger = launch.logging.get_logger('fogros2')
         context.extend_globals({_LOCAL: self})
@@ -402,6 +406,17 @@ class Coordinator:
         await asyncio.gather(*(self._up(session) for session in sessions))
         if self._console is not None and all(session.running for session in sessions):
             self._console.table()
+        if self._watched is None and not self._cancel.is_set():
+            self._watched = self._in_thread(
+                uncompressed.watch, functools.partial(
+                    uncompressed.carried, f'fog{self.launch.id}'),
+                self._crossing_images, self._logger.warning, self._cancel)
+
+    def _crossing_images(self) -> list[str]:
+        machines = {name: session.node_names() for name, session in self._sessions.items()}
+        return uncompressed.crossing_images(
+            machines, {**self._context.environment, **self.launch.robot_environment()},
+            self._cancel)
 
     async def _up(self, session: Session) -> None:
         try:
@@ -475,7 +490,8 @@ class Coordinator:
         # the VPN's interface must not go from under a node that runs
         sessions = self._sessions.values()
         futures = [private.completed(action) for action in census.processes(self._context)]
-        await _all_done({*futures, *(session.deployment for session in sessions)})
+        await _all_done({
+            *futures, *(session.deployment for session in sessions), self._watched})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)

@@ -12,7 +12,7 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 
 import launch.logging
 
-from fogros2.actions import streaming, words
+from fogros2.actions import streaming, uncompressed, words
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec, NodeSpec
 
@@ -177,6 +177,10 @@ class Session:
             self.came_up.set_result(False)
 
     # -- processes ------------------------------------------------------------------------------
+
+    def node_names(self) -> list[str]:
+        """Return the names that the machine's nodes have in the graph."""
+        return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
 
     def submit(self, run: Run) -> None:
         """Start a process as soon as the machine is up."""

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Name the images that cross the VPN as they are, once, so that the user can stream them.
+
+The counters of the VPN's interface say whether there is anything to look for, which costs nothing.
+Only on a busy VPN a program of the dashboard's looks at the graph, for some seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import contextlib
+import json
+from pathlib import Path
+import sys
+import threading
+from typing import Any
+
+from fogros2 import process
+from fogros2.errors import FogError
+from fogros2.model import Command, NodeSpec
+
+#: Prints the topics that cross, in lines of JSON, until its standard input ends.
+PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
+#: Seconds between two looks at the counters; bits per second that are worth a look at the graph.
+INTERVAL, BUSY = 5.0, 20e6
+#: Looks at the counters that are left out after one at the graph.
+PAUSE = 12
+#: Seconds that a look at the graph takes, until all nodes are known, and the longest.
+LOOK, PATIENCE = 8.0, 40.0
+_IMAGE = 'sensor_msgs/msg/Image'
+
+
+def watch(
+    count: Callable[[], int], look: Callable[[], Iterable[str]], warn: Callable[[str], None],
+    ended: threading.Event, interval: float = INTERVAL,
+) -> None:
+    """
+    Warn once of each image topic that crosses the VPN as it is, until the launch ends.
+
+    :param count: returns the bytes that the VPN has carried, both ways; OSError without a VPN.
+    :param look: returns the image topics that cross; FogError ends the watch.
+    """
+    known: set[str] = set()
+    pause = 0
+    with contextlib.suppress(OSError, FogError):
+        before = count()
+        while not ended.wait(interval):
+            now = count()
+            rate, before = 8 * (now - before) / interval, now
+            pause -= 1
+            if rate < BUSY or pause > 0:
+                continue
+            pause = PAUSE
+            new = sorted(set(look()) - known)
+            known.update(new)
+            if new:
+                verb = 'crosses' if len(new) == 1 else 'cross'
+                them = 'it' if len(new) == 1 else 'them'
+                warn(f"{', '.join(new)} {verb} the VPN uncompressed at {rate / 1e6:.0f} Mbit/s: "
+                     f'add {them} to stream_topics')
+
+
+def carried(interface: str) -> int:
+    """Return the bytes that an interface has carried, both ways."""
+    folder = Path('/sys/class/net', interface, 'statistics')
+    return sum(int((folder / f'{way}_bytes').read_text()) for way in ('rx', 'tx'))
+
+
+def crossing_images(
+    machines: Mapping[str, Sequence[str]], environment: Mapping[str, str],
+    ended: threading.Event, program: Sequence[str] = PROGRAM,
+) -> list[str]:
+    """
+    Return the image topics that have ends on both sides of the VPN.
+
+    :param machines: by name, the names of the nodes there.
+    :param environment: the variables of the robot's nodes.
+    :raises FogError: the launch ends, or the program hangs.
+    """
+    line = json.dumps({'machines': machines, 'pictures': False}) + '\n'
+    # it ends with its standard input
+    output = process.run(Command(
+        ('sh', '-c', '{ cat; sleep "$0"; } | "$@"', str(LOOK), *program), input=line.encode(),
+        environment=environment, what='look for images that cross the VPN'),
+        timeout=PATIENCE, check=False, cancel=ended).stdout
+    found: list[str] = []
+    for line in output.splitlines():
+        found = images(line) or found
+    return found
+
+
+def images(line: str) -> list[str]:
+    """Return the image topics in a line that the program prints."""
+    try:
+        told: dict[str, Any] = json.loads(line)
+        return [one['topic'] for one in told['topics'] if one['type'] == _IMAGE]
+    except (ValueError, KeyError, TypeError):
+        return []  # what a library prints
+
+
+def node_name(node: NodeSpec) -> str:
+    """Return the name that a node has in the graph: its remapping, or else its program's."""
+    words = [word for word in node.arguments if isinstance(word, str)]
+    told = [word.partition('__node:=')[2] for word in words if word.startswith('__node:=')]
+    return told[0] if told else node.executable or node.name
