@@ -89,13 +89,17 @@ class Equipment:
                 self._run(modules.install(
                     self._environment, self._setup, target, there.missing))
             except CommandError as error:
+                self._discard(target)
                 raise self._without(there, str(error)) from error
         left = self._ask(there.missing, f'{target}/site')
         if left.missing:
-            self._run(Command(('rm', '-rf', target), what='delete modules that fail'))
+            self._discard(target)
             raise self._without(left, ': '.join(
                 ['they were installed, and cannot be imported', *left.broken]))
         self._run(Command(('touch', f'{target}/complete'), what='note what is there'))
+
+    def _discard(self, target: str) -> None:
+        self._run(Command(('rm', '-rf', target), what='delete modules that fail'))
 
     def _has(self, target: str) -> bool:
         done = self._shell.run(
