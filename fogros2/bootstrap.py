@@ -19,6 +19,7 @@ import os
 from pathlib import Path
 import re
 import shlex
+import sys
 import threading
 from typing import Literal, Optional
 
@@ -181,6 +182,9 @@ def ensure(
                 f"what '{spec.name}' lacks can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, workspace)
+        if todo.install.kind == 'embedded':
+            # it gets this very environment
+            keys = needs.outside(keys, [sys.prefix])
     folder = needs.PipFolder.of(spec, facts, keys)
     if spec.pip or keys:
         todo = dataclasses.replace(todo, install=dataclasses.replace(

@@ -170,6 +170,9 @@ def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None
         ['tf2_ros', 'fogt-none', 'dpkg'], {'AMENT_PREFIX_PATH': f'/none:{tmp_path}'}, ())
     said = subprocess.run(command.argv, capture_output=True, text=True, check=True).stdout.split()
     assert said == ['fogt-none', *([] if shutil.which('dpkg-query') else ['dpkg'])]
+    nothing = subprocess.run(dependencies.unknown(
+        ['tf2_ros'], {'AMENT_PREFIX_PATH': str(tmp_path)}, ()).argv, capture_output=True)
+    assert (nothing.returncode, nothing.stdout) == (0, b'')
 
 
 def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
