@@ -57,3 +57,15 @@ have() { PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin" command -v "$1" >/dev/null
 
 # Whether a program is there and needs no shared library, as an image that holds it alone requires.
 have_static() { have "$1" && ! ldd "$(command -v "$1")" 2>/dev/null | grep -q '=>'; }
+
+# Keeps the ticket that sudo gave alive until this process ends, whatever program it is by then.
+keep_ticket() {
+    if [ "$(id -u)" = 0 ] || ! root_ready; then return 0; fi
+    # at most three hours, and a fraction of a second longer than the process; nobody's child, as
+    # a program would not wait for one that it doesn't know
+    ( ( end=180; me=$$
+        while [ $end -gt 0 ] && sudo -n -v; do
+            timeout 60 tail -s 0.2 --pid="$me" -f /dev/null && exit 0
+            end=$((end - 1))
+        done ) </dev/null >/dev/null 2>&1 & )
+}

@@ -130,6 +130,7 @@ quiet() {
 }
 
 mkdir -p "$cache" .cache
+keep_ticket
 log=$PWD/.cache/kubernetes.log
 target=$(folder)
 if have flock; then

@@ -21,6 +21,27 @@ _FOLDERS = ('dev/shm', 'etc/cni', 'etc/containers', 'etc/netns', 'etc/sudoers.d'
             'etc/wireguard', 'home', 'mnt', 'opt', 'root', 'run', 'srv', 'tmp', 'usr/local',
             'var/lib/cni', 'var/lib/containers', 'var/spool', 'var/tmp')
 _EXPECTED = re.compile(rf'/home/{USER}/({PROJECT}|\.cache)')
+#: What podman keeps when the last container is gone, for the next one.
+_PODMAN = (
+    r'control group \w+/libpod_parent', r'file /dev/shm/libpod_.*',
+    r'file /(etc/cni/net\.d/cni\.lock|etc/containers/networks|var/lib/containers/storage)(/.*)?',
+    r'file /run/(containers|libpod|netns|runc)(/.*)?', r'mount /run/netns',
+    r'iptables rule .*(NETAVARK|netavark).*', r'nftables table table ip (filter|nat)',
+    r'file /var/lib/cni(/.*)?')
+#: What the scripts of packages make without dpkg's knowledge, through systemd for the most part.
+_PACKAGES = (
+    r'file /etc/systemd/.*', r'file /root/\.ssh', r'file /tmp/\.(ICE|X11|font|XIM)-unix',
+    r'file /run/(adduser|dbus|log|runit|sendsigs\.omit\.d|shm|systemd|user|wireguard)(/.*)?',
+    r'file /run/lock/subsys', r'file /usr/local/(lib/python3[.\d]*|share/fonts)(/.*)?')
+#: The records of ROS 2 and sudo, and what pytest keeps of its last three runs.
+_TOOLS = (rf'file /home/{USER}/(\.ros|\.sudo_as_admin_successful)(/.*)?', r'file /run/sudo(/.*)?',
+          rf'file /tmp/pytest-of-({USER}|root)(/.*)?')
+_OTHERS = re.compile('|'.join((*_PODMAN, *_PACKAGES, *_TOOLS)))
+#: For the page with the results.
+NOT_COUNTED = (
+    "Not counted as left behind: the project's folder, the user's cache, podman's own (storage, "
+    'locks, an empty control group, its firewall chains), what scripts of packages make, the logs '
+    'of ROS 2 and the folder in which pytest keeps its last runs.')
 #: Seconds for processes that are ending by themselves.
 _GRACE = 15.0
 _COMMANDS = {
@@ -56,7 +77,7 @@ def after(system: System, before: set[str]) -> list[str]:
     """Return what is there now and was not before."""
     deadline = time.monotonic() + _GRACE
     while True:
-        left = look(system) - before
+        left = {each for each in look(system) - before if not _OTHERS.fullmatch(each)}
         if not left or time.monotonic() > deadline:
             # a new folder says enough of what is in it
             return sorted(each for each in left if each.rpartition('/')[0] not in left)

@@ -34,13 +34,5 @@ case $which in
 esac
 export PATH="$VIRTUAL_ENV/bin:$PATH"
 cd "$back"
-if [ "$(id -u)" != 0 ] && root_ready; then
-    # at most three hours, and a fraction of a second longer than the command; nobody's child, as
-    # the command would not wait for one that it doesn't know
-    ( ( end=180; me=$$
-        while [ $end -gt 0 ] && sudo -n -v; do
-            timeout 60 tail -s 0.2 --pid="$me" -f /dev/null && exit 0
-            end=$((end - 1))
-        done ) </dev/null >/dev/null 2>&1 & )
-fi
+keep_ticket
 exec "$@"

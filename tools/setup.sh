@@ -115,6 +115,8 @@ if [ "$target" != lint ] || [ -n "$packages" ]; then
     fi
 fi
 
+keep_ticket
+
 # --- system packages ----------------------------------------------------------------------------
 # A server that starts just because a test wants its program would open a port on this computer:
 # on systemd it is masked while the package goes in and stays disabled after.

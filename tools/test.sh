@@ -6,6 +6,8 @@ set -u
 cd "$(dirname "$0")/.."
 . tools/common.sh
 mkdir -p .cache
+# building Kubernetes can take longer than sudo remembers the password
+keep_ticket
 rm -f .cache/test-*.xml
 status=0
 # what the user has set for nodes of their own must not decide what a test sees

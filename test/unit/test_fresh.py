@@ -4,10 +4,14 @@
 from __future__ import annotations
 
 import importlib
+import os
 from pathlib import Path
+import subprocess
 import sys
 
 import pytest
+
+from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 README = """
@@ -100,6 +104,30 @@ def test_tests_are_counted_and_named(tools, tmp_path):
     assert fresh.added_up([]) is None
     assert fresh.test_names([report]) == (
         ['test_a::test_bad[1]'], {'no y': ['test_b::test_x', 'test_b::test_z']})
+
+
+def test_sudo_ticket_is_kept_while_a_script_runs(tmp_path):
+    said = tmp_path / 'said'
+    for name, text in (('id', 'echo 1000'), ('sudo', f'echo "$*" >>{said}')):
+        (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+        (tmp_path / name).chmod(0o755)
+    # test.sh waits for Kubernetes's build with it
+    script = subprocess.Popen(
+        ['sh', '-c', '. tools/common.sh; keep_ticket; read -r line'], cwd=ROOT,
+        stdin=subprocess.PIPE, env={**os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    try:
+        wait_until(lambda: said.exists() and '-n -v' in said.read_text().splitlines(),
+                   timeout=20.0, what='sudo to be asked for more time')
+    finally:
+        script.communicate(b'\n')
+
+
+@pytest.mark.parametrize('line, counted', [
+    ('control group memory/libpod_parent', False), ('control group memory/libpod_parent/x', True),
+    ('file /home/robot/.ros/log/x', False), ('file /home/robot/.local/share/fogros2/x', True),
+    ('interface fog12ab', True), ('process wireguard-go fog12ab', True), ('mount /tmp/x', True)])
+def test_only_what_is_ours_counts_as_left_behind(tools, line, counted):
+    assert (tools['leftovers']._OTHERS.fullmatch(line) is None) == counted
 
 
 def test_page_shows_failures_and_leftovers(tools, tmp_path):
