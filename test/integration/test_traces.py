@@ -37,7 +37,7 @@ def elsewhere():
 
 
 @pytest.fixture
-def look(state_home, tmp_path_factory, own_domain):
+def look(root, state_home, tmp_path_factory, own_domain):
     return lambda: Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
 
 
