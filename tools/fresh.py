@@ -168,11 +168,13 @@ def test_names(reports: Iterable[Path]) -> tuple[list[str], dict[str, list[str]]
     skipped: dict[str, list[str]] = {}
     for report in reports:
         for case in ElementTree.parse(report).iter('testcase'):
-            name = f"{case.get('classname', '').rpartition('.')[2]}::{case.get('name')}"
+            # what follows is the group of the test
+            test = case.get('name', '').partition('@')[0]
+            name = f"{case.get('classname', '').rpartition('.')[2]}::{test}"
             if case.find('failure') is not None or case.find('error') is not None:
                 failed.append(name)
             elif (skip := case.find('skipped')) is not None:
-                skipped.setdefault(skip.get('message', ''), []).append(name.partition('@')[0])
+                skipped.setdefault(skip.get('message', ''), []).append(name)
     return failed, skipped
 
 
