@@ -13,6 +13,7 @@ import shutil
 import signal
 import socket
 import subprocess
+from typing import Any
 import urllib.request
 
 import pytest
@@ -129,7 +130,7 @@ def moto_server() -> Iterator[str]:
 @pytest.fixture
 def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
-    from moto.core import DEFAULT_ACCOUNT_ID
+    from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
     from moto.ec2.models import ec2_backends
     from moto.ec2.models.amis import AmiBackend
     from moto.ssm.models import Parameter, ssm_backends
@@ -152,7 +153,9 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
         monkeypatch.delenv(name, raising=False)
     create_image = AmiBackend.create_image
 
-    def create_with_snapshots(self, instance_id, name, description, tag_specifications):
+    def create_with_snapshots(
+        self: Any, instance_id: str, name: str, description: str, tag_specifications: list[Any],
+    ) -> Any:
         """Tag an image's snapshot as well, which Moto doesn't know of."""
         kinds = {kind: [tag for spec in tag_specifications if spec['ResourceType'] == kind
                         for tag in spec['Tags']] for kind in ('image', 'snapshot')}
@@ -172,7 +175,7 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
                 # parameter whose name is AWS's own
                 image = ec2_backends[DEFAULT_ACCOUNT_ID][region].register_image(path, path)
                 image.architecture, image.virtualization_type = arch, 'hvm'
-                ssm_backends[DEFAULT_ACCOUNT_ID][region]._parameters[path] = [Parameter(
+                ssm_backends[DEFAULT_ACCOUNT_ID][region]._parameters[path] = [Parameter(  # type: ignore[abstract]
                     DEFAULT_ACCOUNT_ID, path, image.id, 'String', None, None, None,
                     datetime.datetime.now(), 1, 'text')]
     return moto_server

@@ -62,6 +62,8 @@ mount --bind "$root" "$root"
 cd "$root"
 mount -t proc -o nosuid,nodev,noexec proc proc
 mount -t sysfs -o nosuid,nodev,noexec sysfs sys
+# as systemd sets it at boot: Debian 13's ping has no rights of its own
+echo '0 2147483647' >proc/sys/net/ipv4/ping_group_range
 mount -t tmpfs -o nosuid,nodev,noexec,mode=755 cgroup sys/fs/cgroup
 for each in "$@"; do
     folder=sys/fs/cgroup/${each%%=*} options=${each#*=}
