@@ -25,13 +25,13 @@ _EXPECTED = re.compile(rf'/home/{USER}/({PROJECT}|\.cache)')
 _PODMAN = (
     r'control group \w+/libpod_parent', r'file /dev/shm/libpod_.*',
     r'file /(etc/cni/net\.d/cni\.lock|etc/containers/networks|var/lib/containers/storage)(/.*)?',
-    r'file /run/(containers|libpod|netns|runc)(/.*)?', r'mount /run/netns',
-    r'iptables rule .*(NETAVARK|netavark).*', r'nftables table table ip (filter|nat)',
-    r'file /var/lib/cni(/.*)?')
+    r'file /run/(containers|libpod|lock/netavark\.lock|netns|runc)(/.*)?', r'mount /run/netns',
+    r'iptables rule .*(NETAVARK|netavark).*', r'file /var/lib/cni(/.*)?',
+    r'nftables table table (ip (filter|nat)|inet netavark)')
 #: What the scripts of packages make without dpkg's knowledge, through systemd for the most part.
 _PACKAGES = (
     r'file /etc/systemd/.*', r'file /root/\.ssh', r'file /tmp/\.(ICE|X11|font|XIM)-unix',
-    r'file /run/(adduser|dbus|log|runit|sendsigs\.omit\.d|shm|systemd|user|wireguard)(/.*)?',
+    r'file /run/(adduser|dbus|log|runit|sendsigs\.omit\.d|shm|sshd|systemd|user|wireguard)(/.*)?',
     r'file /run/lock/subsys', r'file /usr/local/(lib/python3[.\d]*|share/fonts)(/.*)?')
 #: The records of ROS 2 and sudo, and what pytest keeps of its last three runs.
 _TOOLS = (rf'file /home/{USER}/(\.ros|\.sudo_as_admin_successful)(/.*)?', r'file /run/sudo(/.*)?',

@@ -278,17 +278,23 @@ def test_a_login_that_nobody_answers_can_be_cancelled(launch, provider, monkeypa
     timer.join()
 
 
+@pytest.fixture
+def closed_port():
+    """Return a port that refuses connections, and that no other program can take."""
+    with socket.socket() as taken:
+        taken.bind(('127.0.0.1', 0))
+        yield taken.getsockname()[1]
+
+
 @pytest.mark.parametrize('ended', [True, False])
 def test_a_machine_that_ends_while_it_boots_is_waited_for_no_longer(
-        launch, provider, monkeypatch, ended):
+        launch, provider, monkeypatch, ended, closed_port):
     monkeypatch.setattr(entering, 'ADDRESS_INTERVAL', 0.1)
     monkeypatch.setattr(FakeProvider, 'firewall', True)
     mine = Job(launch, SPEC)
     Creation(mine).run()
-    with socket.create_server(('127.0.0.1', 0)) as server:
-        port = server.getsockname()[1]
     machine = dataclasses.replace(provider.describe(mine.machine_id), shell=Endpoint(
-        'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
+        'ssh', '127.0.0.1', closed_port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
     launch.timeouts = mine.timeouts = Timeouts(ssh=0.8)
     if ended:
         provider.destroy(mine.machine_id)
