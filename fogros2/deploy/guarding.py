@@ -61,6 +61,8 @@ else
     for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
 fi
 rm -rf -- "$1"
+# the folder of all agents goes with the last one
+rmdir -- "${1%/*}" 2>/dev/null || :
 """
 
 

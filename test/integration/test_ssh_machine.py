@@ -92,7 +92,7 @@ def nothing_runs(computer):
     """Return what is still there of a launch: nothing, and the computer is on."""
     found = [name for name in computer.run('ls /sys/class/net').stdout.split()
              if name.startswith('fog')]
-    found += computer.run('ls /run/fogros2').stdout.split()
+    found += computer.run('ls -d /run/fogros2 2>/dev/null || :').stdout.split()
     found += computer.run(
         'for p in /proc/[0-9]*; do '
         'tr "\\0" " " <$p/cmdline 2>/dev/null | grep -E "agent.py|talker|wireguard-go|ros2 " '
