@@ -46,6 +46,9 @@ class Condition:
     def __init__(self, *, predicate: Callable[[LaunchContext], bool] | None = None) -> None:
         self._predicate = predicate
 
+    def describe(self) -> str:
+        return repr(self)
+
     def evaluate(self, context: LaunchContext) -> bool:
         return False if self._predicate is None else self._predicate(context)
 

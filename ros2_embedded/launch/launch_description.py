@@ -6,7 +6,7 @@ from typing import Any, Iterable, TYPE_CHECKING
 
 import launch.logging
 
-from ._base import Action, Entities, LaunchDescriptionEntity, SomeSubstitutionsType
+from ._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType
 from .launch_context import LaunchContext
 from .utilities import normalize_to_list_of_substitutions, perform_substitutions
 
@@ -45,26 +45,22 @@ class LaunchDescription(LaunchDescriptionEntity):
         self
     ) -> list[tuple[DeclareLaunchArgument, list[Any]]]:
         """Return the arguments, each with the includes on the way to it."""
-        from .actions import (
-            DeclareLaunchArgument,
-            IncludeLaunchDescription,
-            ResetLaunchConfigurations,
-        )
+        from . import actions
         found: list[tuple[DeclareLaunchArgument, list[Any]]] = []
 
         def collect(
             entities: Iterable[LaunchDescriptionEntity], conditional: bool, includes: list[Any]
         ) -> None:
             for entity in entities:
-                if isinstance(entity, DeclareLaunchArgument):
+                if isinstance(entity, actions.DeclareLaunchArgument):
                     if any(entity.name == argument.name for argument, _ in found):
                         continue
                     entity._conditionally_included = conditional or entity.condition is not None
                     found.append((entity, includes))
-                if isinstance(entity, ResetLaunchConfigurations):
+                if isinstance(entity, actions.ResetLaunchConfigurations):
                     # What follows can't see the arguments of this launch.
                     return
-                is_include = isinstance(entity, IncludeLaunchDescription)
+                is_include = isinstance(entity, actions.IncludeLaunchDescription)
                 inner = [*includes, entity] if is_include else includes
                 collect(entity.describe_sub_entities(), False, inner)
                 for _, conditional_entities in entity.describe_conditional_sub_entities():
@@ -76,8 +72,7 @@ class LaunchDescription(LaunchDescriptionEntity):
     def add_entity(self, entity: LaunchDescriptionEntity) -> None:
         self.entities.append(entity)
 
-    def add_action(self, action: Action) -> None:
-        self.add_entity(action)
+    add_action = add_entity
 
 
 class LaunchDescriptionSource:

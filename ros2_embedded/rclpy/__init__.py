@@ -5,10 +5,9 @@ ROS 2's client library for Python, as far as the embedded default has it.
 The names, signatures and behaviour are those of ROS 2 Jazzy's ``rclpy``.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from rclpy.context import Context
-from rclpy.parameter import Parameter
 from rclpy.signals import install_signal_handlers, SignalHandlerOptions, uninstall_signal_handlers
 from rclpy.task import Future
 from rclpy.utilities import (
@@ -79,25 +78,10 @@ def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None 
         uninstall_signal_handlers()
 
 
-def create_node(node_name: str, *, context: Context | None = None,
-                cli_args: list[str] | None = None, namespace: str | None = None,
-                use_global_arguments: bool = True, enable_rosout: bool = True,
-                start_parameter_services: bool = True,
-                parameter_overrides: list[Parameter] | None = None,
-                allow_undeclared_parameters: bool = False,
-                automatically_declare_parameters_from_overrides: bool = False,
-                enable_logger_service: bool = False) -> 'Node':
-    """Create a node; see :class:`rclpy.node.Node`."""
+def create_node(node_name: str, **options: Any) -> 'Node':
+    """Create a node; see :class:`rclpy.node.Node` for the options."""
     from rclpy.node import Node
-    return Node(
-        node_name, context=context, cli_args=cli_args, namespace=namespace,
-        use_global_arguments=use_global_arguments, enable_rosout=enable_rosout,
-        start_parameter_services=start_parameter_services,
-        parameter_overrides=parameter_overrides,
-        allow_undeclared_parameters=allow_undeclared_parameters,
-        automatically_declare_parameters_from_overrides=(
-            automatically_declare_parameters_from_overrides),
-        enable_logger_service=enable_logger_service)
+    return Node(node_name, **options)
 
 
 def spin_once(node: 'Node', *, executor: 'Executor | None' = None,

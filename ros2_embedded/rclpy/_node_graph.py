@@ -2,6 +2,7 @@
 """The part of a node that knows the others."""
 
 from collections.abc import Iterable
+from functools import partialmethod
 from typing import Any
 
 from rclpy import _names
@@ -66,25 +67,17 @@ class NodeGraph:
         ids = {guid for node in found for guid in (node.writers if writers else node.readers)}
         return [one for one in self._graph.endpoints(writers) if one.guid in ids]
 
-    def get_publisher_names_and_types_by_node(
-            self, node_name: str, node_namespace: str,
-            no_demangle: bool = False) -> NamesAndTypes:
+    def _topics_of_node(self, node_name: str, node_namespace: str, no_demangle: bool = False, *,
+                        writers: bool) -> NamesAndTypes:
         """
-        List the topics a node publishes, with their types.
+        List the topics that a node publishes (or subscribes to), with their types.
 
         :raises NodeNameNonExistentError: if there is no such node.
         """
-        return _topics(self._of_node(node_name, node_namespace, True), no_demangle)
+        return _topics(self._of_node(node_name, node_namespace, writers), no_demangle)
 
-    def get_subscriber_names_and_types_by_node(
-            self, node_name: str, node_namespace: str,
-            no_demangle: bool = False) -> NamesAndTypes:
-        """
-        List the topics a node subscribes to, with their types.
-
-        :raises NodeNameNonExistentError: if there is no such node.
-        """
-        return _topics(self._of_node(node_name, node_namespace, False), no_demangle)
+    get_publisher_names_and_types_by_node = partialmethod(_topics_of_node, writers=True)
+    get_subscriber_names_and_types_by_node = partialmethod(_topics_of_node, writers=False)
 
     def get_service_names_and_types_by_node(
             self, node_name: str, node_namespace: str) -> NamesAndTypes:
@@ -141,7 +134,9 @@ class NodeGraph:
         """Count the servers of a service; its name is expanded, not remapped."""
         return self._count(f'rq{self._full(service_name, True)}Request', False)
 
-    def _info(self, topic_name: str, no_mangle: bool, writers: bool) -> list[Any]:
+    def _info(self, topic_name: str, no_mangle: bool = False, *,
+              writers: bool) -> list[TopicEndpointInfo]:
+        """Describe the publishers (or subscriptions) of a topic; names aren't remapped."""
         name = topic_name if no_mangle else 'rt' + self._full(topic_name)
         nodes: dict[bytes, NodeInfo] = {
             guid: node for node in self._graph.nodes()
@@ -159,12 +154,5 @@ class NodeGraph:
                 qos_profile=QoSProfile._from_policies(one.policies))
             for one in self._graph.endpoints(writers) if one.topic == name]
 
-    def get_publishers_info_by_topic(
-            self, topic_name: str, no_mangle: bool = False) -> list[TopicEndpointInfo]:
-        """Describe the publishers of a topic; its name is expanded, not remapped."""
-        return self._info(topic_name, no_mangle, True)
-
-    def get_subscriptions_info_by_topic(
-            self, topic_name: str, no_mangle: bool = False) -> list[TopicEndpointInfo]:
-        """Describe the subscriptions of a topic; its name is expanded, not remapped."""
-        return self._info(topic_name, no_mangle, False)
+    get_publishers_info_by_topic = partialmethod(_info, writers=True)
+    get_subscriptions_info_by_topic = partialmethod(_info, writers=False)

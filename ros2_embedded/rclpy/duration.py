@@ -33,14 +33,12 @@ class Duration:
         return 'Infinite' if self == Infinite else f'{self._nanoseconds} nanoseconds'
 
     def __eq__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self._nanoseconds == other._nanoseconds
-        return NotImplemented
+        return self._nanoseconds == other._nanoseconds if isinstance(other, Duration) \
+            else NotImplemented
 
     def __lt__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self._nanoseconds < other._nanoseconds
-        return NotImplemented
+        return self._nanoseconds < other._nanoseconds if isinstance(other, Duration) \
+            else NotImplemented
 
     def __hash__(self) -> int:
         return hash(self._nanoseconds)

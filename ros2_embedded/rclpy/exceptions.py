@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rclpy raises."""
 
+from functools import partialmethod
 from typing import Any
 
 
@@ -54,29 +55,25 @@ class NameValidationException(Exception):
 class InvalidNamespaceException(NameValidationException):
     """A namespace is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('namespace', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'namespace')
 
 
 class InvalidNodeNameException(NameValidationException):
     """A node's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('node name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'node name')
 
 
 class InvalidTopicNameException(NameValidationException):
     """A topic's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('topic name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'topic name')
 
 
 class InvalidServiceNameException(NameValidationException):
     """A service's name is invalid."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__('service name', name, error_msg, invalid_index)
+    __init__ = partialmethod(NameValidationException.__init__, 'service name')
 
 
 class ParameterException(Exception):
@@ -89,22 +86,19 @@ class ParameterException(Exception):
 class ParameterNotDeclaredException(ParameterException):
     """A parameter was used that nobody declared."""
 
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__('Invalid access to undeclared parameter(s)', parameters)
+    __init__ = partialmethod(ParameterException.__init__, 'Invalid access to undeclared parameter(s)')
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
     """A parameter was declared twice."""
 
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__('Parameter(s) already declared', parameters)
+    __init__ = partialmethod(ParameterException.__init__, 'Parameter(s) already declared')
 
 
 class InvalidParameterException(ParameterException):
     """A parameter's name is invalid."""
 
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__('Invalid parameter name', parameter_name)
+    __init__ = partialmethod(ParameterException.__init__, 'Invalid parameter name')
 
 
 class InvalidParameterTypeException(ParameterException):
@@ -128,8 +122,7 @@ class InvalidParameterValueException(ParameterException):
 class ParameterImmutableException(ParameterException):
     """A read-only parameter was to be changed."""
 
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__('Attempted to modify read-only parameter', parameter_name)
+    __init__ = partialmethod(ParameterException.__init__, 'Attempted to modify read-only parameter')
 
 
 class ParameterUninitializedException(ParameterException):

@@ -47,12 +47,9 @@ def get_logger(name: str) -> RcutilsLogger:
 
 def _configure(arguments: 'Arguments') -> None:
     """Take over what the command line says."""
-    global _default_level, _console
+    global _console
     for name, level in arguments.levels:
-        if name:
-            _levels[name] = level
-        else:
-            _default_level = level
+        set_logger_level(name, level)
     _console = arguments.switches.get('stdout', True)
 
 

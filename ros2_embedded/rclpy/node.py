@@ -163,6 +163,9 @@ class Node(NodeParameters, NodeGraph):
     clients = property(lambda self: iter(self._clients), doc='Its clients.')
     services = property(lambda self: iter(self._services), doc='Its services.')
     timers = property(lambda self: iter(self._timers), doc='Its timers.')
+    context = property(lambda self: self._context, doc='Its context.')
+    default_callback_group = property(
+        lambda self: self._default_callback_group, doc='For what is created without a group.')
     waitables = property(lambda self: iter(self._waitables), doc='Its handlers of events.')
 
     def _entities(self) -> list[Entity]:
@@ -198,16 +201,6 @@ class Node(NodeParameters, NodeGraph):
         executor = self.executor
         if executor is not None:
             executor.wake()
-
-    @property
-    def context(self) -> Context:
-        """Its context."""
-        return self._context
-
-    @property
-    def default_callback_group(self) -> CallbackGroup:
-        """The callback group of what is created without one."""
-        return self._default_callback_group
 
     def get_name(self) -> str:
         """Give its name."""
@@ -468,14 +461,12 @@ class Node(NodeParameters, NodeGraph):
         if logging._rosout.get(self._logger_name) is getattr(self, '_rosout', False):
             del logging._rosout[self._logger_name]
         with self._graph.held():
-            all_things: tuple[tuple[list[Any], Callable[[Any], bool]], ...] = (
-                (self._publishers, self.destroy_publisher),
-                (self._subscriptions, self.destroy_subscription),
-                (self._clients, self.destroy_client), (self._services, self.destroy_service),
-                (self._timers, self.destroy_timer))
-            for things, destroy in all_things:
+            everything: tuple[list[Any], ...] = (
+                self._publishers, self._subscriptions, self._clients, self._services,
+                self._timers)
+            for things in everything:
                 while things:
-                    destroy(things[0])
+                    self._destroy(things, things[0])
             self._graph.remove_node(self._record)
         executor = self.executor
         if executor is not None:

@@ -7,7 +7,13 @@ from typing import Any
 
 _MODULES = {f'rclpy.{name}' for name in (
     'action', 'guard_condition', 'impl.implementation_singleton', 'parameter_event_handler',
-    'qos_overriding_options', 'wait_for_message', 'waitable')}
+    'qos_overriding_options', 'type_description_service', 'wait_for_message', 'waitable')} | {
+        'example_interfaces.action', 'launch.utilities.typing_file_path',
+        'launch_ros.parameters_type', 'launch_ros.remap_rule_type', 'tf2_msgs.action',
+        'rosidl_runtime_py.get_interfaces', 'rosidl_runtime_py.import_message'}
+
+#: The names that modules refuse, by module.
+LACKING: dict[str, list[str]] = {}
 
 
 class NotEmbeddedError(RuntimeError):
@@ -26,8 +32,10 @@ class NotEmbeddedError(RuntimeError):
 def lacking(where: str, names: str,
             error: type[Exception] = ImportError) -> Callable[[str], Any]:
     """Give a ``__getattr__``, by default a module's, for names that only ROS 2 has there."""
+    LACKING[where] = names.split()
+
     def look_up(name: str) -> Any:
-        if name in names.split():
+        if name in LACKING[where]:
             # by default no AttributeError: an import statement wouldn't show its text
             raise error(str(NotEmbeddedError(f'{where}.{name}')))
         raise AttributeError(f"'{where}' has no attribute '{name}'")

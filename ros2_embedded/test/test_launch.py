@@ -4,6 +4,7 @@
 import asyncio
 import importlib.util
 import os
+import subprocess
 import sys
 import textwrap
 
@@ -383,6 +384,7 @@ def test_circular_includes(tmp_path, capsys, name, content):
     ('launch.actions', 'OpaqueCoroutine'), ('launch.conditions', 'LaunchConfigurationEquals'),
     ('launch.substitutions', 'AnonName'), ('launch_ros.actions', 'SetUseSimTime'),
     ('launch_ros.substitutions', 'Parameter'), ('launch.event_handlers', 'OnExecutionComplete'),
+    ('launch.utilities.type_utils', 'SomeValueType'), ('launch.events', 'ExecutionComplete'),
     ('launch_ros.parameter_descriptions', 'Parameter'), ('rclpy.clock', 'JumpThreshold'),
     ('rclpy.logging', 'initialize'), ('rosidl_runtime_py', 'message_to_csv')])
 def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
@@ -401,10 +403,30 @@ def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
 @pytest.mark.parametrize('module', [
-    'rclpy.action', 'rclpy.guard_condition', 'rclpy.wait_for_message', 'rclpy.waitable'])
+    'rclpy.action', 'rclpy.guard_condition', 'rclpy.wait_for_message', 'rclpy.waitable',
+    'example_interfaces.action', 'tf2_msgs.action', 'launch_ros.parameters_type',
+    'rosidl_runtime_py.get_interfaces'])
 def test_modules_that_are_lacking_are_named(module):
     with pytest.raises(ImportError, match=f'{module} is not part of the embedded default'):
         importlib.import_module(module)
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
+@pytest.mark.parametrize('module, name', [
+    ('launch.actions.opaque_coroutine', 'launch.actions.OpaqueCoroutine'),
+    ('launch_ros.actions.ros_timer', 'launch_ros.actions.ROSTimer')])
+def test_modules_of_lacking_classes_name_the_class(module, name):
+    with pytest.raises(ImportError, match=f'{name} is not part of the embedded default'):
+        importlib.import_module(module)
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
+def test_actions_alone_are_refused_by_name():
+    done = subprocess.run(
+        [sys.executable, '-c', 'from example_interfaces.action import Fibonacci'],
+        capture_output=True, text=True, timeout=60)
+    assert done.stderr.splitlines()[-1].startswith(
+        'ImportError: example_interfaces.action is not part of the embedded default; ROS 2 Jazzy')
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
@@ -464,6 +486,24 @@ def test_utilities():
     assert launch.utilities.normalize_to_list_of_entities([log, [log, log]]) == [log] * 3
     with pytest.raises(TypeError, match="'me' expected 'x' to be one of .* but got '1'"):
         launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
+
+
+def test_helpers_of_utilities():
+    from launch.utilities import type_utils
+    from launch_ros.utilities.namespace_utils import is_namespace_absolute, is_root_namespace
+    from launch_ros.utilities.track_node_names import add_node_name, get_node_name_count
+    assert launch.utilities.is_a(Asked(), launch.Event)
+    assert type_utils.coerce_list(['1', '2'], int) == [1, 2]
+    assert type_utils.is_valid_scalar_type(int) and not type_utils.is_valid_scalar_type(list)
+    assert type_utils.is_instance_of_valid_type([1, 'a'], can_be_str=True)
+    assert type_utils.is_normalized_substitution([TextSubstitution(text='a')])
+    assert is_namespace_absolute('/a') and is_root_namespace('/')
+    assert 'Condition' in launch.Condition().describe()
+    context = LaunchContext()
+    assert get_node_name_count(context, '/a') == 0
+    for _ in range(2):
+        add_node_name(context, '/a')
+    assert get_node_name_count(context, '/a') == 2
 
 
 def test_deep_module_paths():

@@ -26,6 +26,8 @@ def add(request, response):
     response.sum = request.a + request.b
     return response
 node.create_service(AddTwoInts, 'add', add)
+actions = [node.create_publisher(String, 'count/_action/feedback', 10),
+           node.create_subscription(String, 'walk/_action/feedback', print, 10)]
 print('ready', flush=True)
 try:
     rclpy.spin(node)
@@ -136,6 +138,9 @@ def test_nodes(worker):
     assert '    /cell/orders: std_msgs/msg/String' in info
     assert info.index('    /cell/add: example_interfaces/srv/AddTwoInts') > \
         info.index('  Service Servers:')
+    servers, clients = info.index('  Action Servers:'), info.index('  Action Clients:')
+    assert info[servers + 1:clients] == ['    /cell/count: std_msgs/msg/String']
+    assert info[clients + 1:] == ['    /cell/walk: std_msgs/msg/String']
     assert "Unable to find node '/none'" in ros2('node', 'info', '/none', status=1)
 
 

@@ -6,6 +6,7 @@ These run on the embedded default and start ROS 2's own programs beside it. ROS2
 set-up script of a ROS 2 Jazzy that isn't in its usual place.
 """
 
+import contextlib
 import importlib.metadata
 import os
 from pathlib import Path
@@ -42,7 +43,9 @@ pytestmark = [
 
 PEER = '''
 import rclpy
+from example_interfaces.action import Fibonacci
 from example_interfaces.srv import AddTwoInts
+from rclpy.action import ActionServer
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
@@ -60,6 +63,7 @@ def add(request, response):
     response.sum = request.a + request.b
     return response
 node.create_service(AddTwoInts, 'add', add)
+action = ActionServer(node, Fibonacci, 'count', lambda goal: Fibonacci.Result())
 node.get_logger().info('ready')
 try:
     rclpy.spin(node)
@@ -87,15 +91,24 @@ def output(*command):
             process.kill()
 
 
+@contextlib.contextmanager
+def running_peer():
+    """Run a node of ROS 2, and end it whatever happens; give what it has written so far."""
+    with ros2('python3', '-c', PEER) as process:
+        try:
+            lines = [process.stdout.readline()]
+            assert 'ready' in lines[0]
+            yield lines
+            process.terminate()
+            lines += process.communicate(timeout=20)[0].splitlines()
+        finally:
+            process.kill()
+
+
 @pytest.fixture(scope='module')
 def peer():
-    """A node of ROS 2; what it has written so far."""
-    with ros2('python3', '-c', PEER) as process:
-        lines = [process.stdout.readline()]
-        assert 'ready' in lines[0]
+    with running_peer() as lines:
         yield lines
-        process.terminate()
-        lines += process.communicate(timeout=20)[0].splitlines()
     assert [line for line in lines if '[WARN]' in line or '[ERROR]' in line] == []
 
 
@@ -221,6 +234,8 @@ def test_it_shows_in_our_commands(peer):
     command = str(Path(sys.executable).with_name('ros2'))
     for words, expected in ((('node', 'list'), '/real/peer'), (('topic', 'list'), '/real/there'),
                             (('service', 'list'), '/real/add'),
+                            (('node', 'info', '/real/peer'),
+                             '    /real/count: example_interfaces/action/Fibonacci'),
                             (('param', 'get', '/real/peer', 'gain'), 'Double value is: ')):
         done = subprocess.run([command, *words], capture_output=True, text=True, timeout=60)
         assert done.returncode == 0 and done.stderr == ''
@@ -239,8 +254,7 @@ def test_both_find_each_other_on_this_computer_alone(monkeypatch, peers):
     context.init(args=[])
     node = rclpy.create_node('first', context=context)
     try:
-        with ros2('python3', '-c', PEER) as process:
-            assert 'ready' in process.stdout.readline()
+        with running_peer():
             assert '/first' in output('ros2', 'node', 'list', '--no-daemon').splitlines()
             end = time.monotonic() + LIMIT
             while ('peer', '/real') not in node.get_node_names_and_namespaces():
@@ -249,8 +263,6 @@ def test_both_find_each_other_on_this_computer_alone(monkeypatch, peers):
             late = subprocess.run([str(Path(sys.executable).with_name('ros2')), 'node', 'list'],
                                   capture_output=True, text=True, timeout=60)
             assert sorted(late.stdout.splitlines()) == ['/first', '/real/peer']
-            process.terminate()
-            process.communicate(timeout=20)
     finally:
         node.destroy_node()
         context.try_shutdown()

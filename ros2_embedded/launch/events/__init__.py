@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Callable
 
+from rosidl_embedded.lacking import lacking
+
 from .._base import Action, Event
 from . import process as process
+
+__getattr__ = lacking(__name__, 'ExecutionComplete')
 
 
 class IncludeLaunchDescription(Event):

@@ -53,7 +53,6 @@ class AsyncSafeSignalManager:
         if self.__outer is None:
             signal.set_wakeup_fd = self.__real_set_wakeup_fd
         AsyncSafeSignalManager.__current = self.__outer
-        self.__next_fd = -1
         self.__reader.close()
         self.__writer.close()
 

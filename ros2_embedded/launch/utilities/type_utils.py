@@ -5,17 +5,29 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, List, TYPE_CHECKING
 
+from rosidl_embedded.lacking import lacking
+
 from .._base import Substitution
-from . import normalize_to_list_of_substitutions, perform_substitutions
+from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
+
+__getattr__ = lacking(
+    __name__, 'AllowedTypesTuple AllowedTypesType AllowedValueType ListTypesTuple ListTypesType '
+    'ListValueType NormalizedScalarType NormalizedSequenceType NormalizedValueType '
+    'ScalarTypesType ScalarValueType SequenceValueType SomeScalarType SomeSequenceType '
+    'SomeValueType StrSomeScalarType StrSomeSequenceType StrSomeValueType')
 
 ScalarTypesTuple = (int, float, bool, str)
 
 
 def is_typing_list(data_type: Any) -> bool:
     return data_type is List or getattr(data_type, '__origin__', None) is list
+
+
+def is_valid_scalar_type(data_type: Any) -> bool:
+    return data_type in ScalarTypesTuple
 
 
 def extract_type(data_type: Any) -> tuple[Any, bool]:
@@ -28,7 +40,7 @@ def extract_type(data_type: Any) -> tuple[Any, bool]:
         return None, True
     arguments = getattr(data_type, '__args__', None) if is_typing_list(data_type) else None
     scalar = arguments[0] if arguments else data_type
-    if scalar not in ScalarTypesTuple:
+    if not is_valid_scalar_type(scalar):
         raise ValueError(f'Unrecognized data type: {data_type}')
     return scalar, bool(arguments)
 
@@ -48,6 +60,9 @@ def is_instance_of(value: Any, data_type: Any = None, *, can_be_str: bool = Fals
         return True
     return is_list == isinstance(value, list) and all(
         isinstance(item, (kind, str) if can_be_str else kind) for item in items)
+
+
+is_instance_of_valid_type = is_instance_of
 
 
 def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = False) -> Any:
@@ -83,6 +98,15 @@ def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = Fals
     return output
 
 
+def coerce_list(value: list[str], data_type: Any = None, *, can_be_str: bool = False) -> Any:
+    """Read each text of a list as the type, as :func:`coerce_to_type` does."""
+    ensure_argument_type(value, list, 'value', 'coerce_list')
+    output = [coerce_to_type(item, data_type, can_be_str=can_be_str) for item in value]
+    if not is_instance_of(output, can_be_str=can_be_str):
+        raise ValueError(f'cannot convert value to {data_type}. Got value=`{value}`')
+    return output
+
+
 def get_typed_value(value: Any, data_type: Any, *, can_be_str: bool = False) -> Any:
     """
     Read a text or a list of texts as the type.
@@ -95,10 +119,7 @@ def get_typed_value(value: Any, data_type: Any, *, can_be_str: bool = False) -> 
     kind, is_list = extract_type(data_type)
     if not is_list:
         raise TypeError(f"Cannot convert input '{value}' of type '{type(value)}' to '{kind}'")
-    output = [coerce_to_type(item, kind, can_be_str=can_be_str) for item in value]
-    if not is_instance_of(output, can_be_str=can_be_str):
-        raise ValueError(f'cannot convert value to {data_type}. Got value=`{value}`')
-    return output
+    return coerce_list(value, kind, can_be_str=can_be_str)
 
 
 def is_substitution(x: Any) -> bool:
@@ -137,6 +158,10 @@ def normalize_typed_substitution(value: Any, data_type: Any) -> Any:
     return items
 
 
+def is_normalized_substitution(x: Any) -> bool:
+    return isinstance(x, list) and bool(x) and all(isinstance(item, Substitution) for item in x)
+
+
 def perform_typed_substitution(context: LaunchContext, value: Any, data_type: Any) -> Any:
     """
     Return what a normalized value becomes in the context.
@@ -145,7 +170,7 @@ def perform_typed_substitution(context: LaunchContext, value: Any, data_type: An
     :raises ValueError: for a result of another type.
     """
     def perform(item: Any, kind: Any) -> Any:
-        if isinstance(item, list) and item and isinstance(item[0], Substitution):
+        if is_normalized_substitution(item):
             return coerce_to_type(perform_substitutions(context, item), kind)
         return item
 

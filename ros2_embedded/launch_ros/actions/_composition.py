@@ -17,7 +17,7 @@ from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import call_service, get_ros_node
 from ..utilities import parameters as ros_parameters
-from ..utilities.names import count_node_name, make_namespace_absolute, prefix_namespace
+from ..utilities.names import add_node_name, make_namespace_absolute, prefix_namespace
 from .node import Node
 
 
@@ -100,7 +100,7 @@ class LoadComposableNodes(launch.Action):
                 f"Failed to load node '{name}' of type '{request.plugin_name}' in container "
                 f"'{container}': {response.error_message}")
             return
-        if warning := count_node_name(context, name):
+        if warning := add_node_name(context, name):
             launch.logging.get_logger(container).warning(warning)
         self.__logger.info(
             f"Loaded node '{response.full_node_name}' in container '{container}'")

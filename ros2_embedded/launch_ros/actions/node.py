@@ -249,7 +249,7 @@ class Node(ExecuteProcess):
             'ns': f'__ns:={self.__expanded_node_namespace}'}})
         entities = super().execute(context)
         if self.is_node_name_fully_specified():
-            if warning := names.count_node_name(context, self.node_name):
+            if warning := names.add_node_name(context, self.node_name):
                 launch.logging.get_logger(self.name).warning(warning)
         return entities
 

@@ -2,12 +2,16 @@
 """Names and namespaces of nodes, and remappings."""
 from __future__ import annotations
 
-from collections import Counter
 import re
 from typing import Any, Iterable, Iterator, TypeVar
 
 from launch.launch_context import LaunchContext
 from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
+
+__all__ = [
+    'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'is_root_namespace',
+    'make_namespace_absolute', 'normalize_remap_rule', 'normalize_remap_rules',
+    'prefix_namespace']
 
 OptionalText = TypeVar('OptionalText', str, None)
 
@@ -26,8 +30,16 @@ def prefix_namespace(base_ns: str | None, ns: str | None) -> str | None:
     return combined if combined in (None, '/') else combined.rstrip('/')
 
 
+def is_root_namespace(ns: str) -> bool:
+    return ns == '/'
+
+
+def is_namespace_absolute(ns: str) -> bool:
+    return ns.startswith('/')
+
+
 def make_namespace_absolute(ns: OptionalText) -> OptionalText:
-    return ns if ns is None or ns.startswith('/') else '/' + ns
+    return ns if ns is None or is_namespace_absolute(ns) else '/' + ns
 
 
 def check_node_name(name: str) -> None:
@@ -45,16 +57,19 @@ def check_namespace(namespace: str) -> None:
         validate_namespace(namespace)
 
 
-def count_node_name(context: LaunchContext, node_name: str) -> str | None:
+def get_node_name_count(context: LaunchContext, node_name: str) -> int:
+    """Return how many nodes of that full name the launch has started."""
+    return context.get_locals_as_dict().get(_COUNTS, {}).get(node_name, 0)
+
+
+def add_node_name(context: LaunchContext, node_name: str) -> str | None:
     """Count one more node of that full name; return a warning from the second on."""
-    if _COUNTS not in context.get_locals_as_dict():
-        context.extend_globals({_COUNTS: Counter()})
-    counts: Counter[str] = context.get_locals_as_dict()[_COUNTS]
-    counts[node_name] += 1
-    if counts[node_name] < 2:
-        return None
-    return (f'there are now at least {counts[node_name]} nodes with the name {node_name} '
-            'created within this launch context')
+    count = get_node_name_count(context, node_name) + 1
+    counts = context.get_locals_as_dict().get(_COUNTS, {})
+    context.extend_globals({_COUNTS: {**counts, node_name: count}})
+    return None if count < 2 else (
+        f'there are now at least {count} nodes with the name {node_name} '
+        'created within this launch context')
 
 
 def normalize_remap_rule(remap_rule: Any) -> tuple[Any, Any]:

@@ -123,9 +123,7 @@ class RcutilsLogger:
         """Log with severity WARN."""
         return self.log(message, LoggingSeverity.WARN, **kwargs)
 
-    def warn(self, message: Any, **kwargs: Any) -> bool:
-        """Log with severity WARN; :meth:`warning` is the newer name."""
-        return self.log(message, LoggingSeverity.WARN, **kwargs)
+    warn = warning  # its older name
 
     def error(self, message: Any, **kwargs: Any) -> bool:
         """Log with severity ERROR."""

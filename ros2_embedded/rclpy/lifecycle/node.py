@@ -119,21 +119,10 @@ class LifecycleNodeMixin(ManagedEntity):
             self._leave(before)
         return result
 
-    def trigger_configure(self) -> TransitionCallbackReturn:
-        """Configure the node."""
-        return self._change(Transition.TRANSITION_CONFIGURE)
-
-    def trigger_cleanup(self) -> TransitionCallbackReturn:
-        """Clean the node up."""
-        return self._change(Transition.TRANSITION_CLEANUP)
-
-    def trigger_activate(self) -> TransitionCallbackReturn:
-        """Activate the node."""
-        return self._change(Transition.TRANSITION_ACTIVATE)
-
-    def trigger_deactivate(self) -> TransitionCallbackReturn:
-        """Deactivate the node."""
-        return self._change(Transition.TRANSITION_DEACTIVATE)
+    trigger_configure = partialmethod(_change, Transition.TRANSITION_CONFIGURE)
+    trigger_cleanup = partialmethod(_change, Transition.TRANSITION_CLEANUP)
+    trigger_activate = partialmethod(_change, Transition.TRANSITION_ACTIVATE)
+    trigger_deactivate = partialmethod(_change, Transition.TRANSITION_DEACTIVATE)
 
     def trigger_shutdown(self) -> TransitionCallbackReturn:
         """

@@ -43,11 +43,10 @@ class CommandExtension(Extension):
 class VerbsCommand(CommandExtension):
     """A command that is nothing but verbs."""
 
-    GROUP: str
-
     def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
         self._parser = parser
-        add_subparsers_on_demand(parser, cli_name, '_verb', self.GROUP, required=False, argv=argv)
+        add_subparsers_on_demand(
+            parser, cli_name, '_verb', f'ros2{self.NAME}.verb', required=False, argv=argv)
 
     def main(self, *, parser: Any, args: Any) -> Any:
         if not hasattr(args, '_verb'):

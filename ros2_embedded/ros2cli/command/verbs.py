@@ -8,28 +8,18 @@ from ros2cli.command import VerbsCommand
 class NodeCommand(VerbsCommand):
     """Various node related sub-commands."""
 
-    GROUP = 'ros2node.verb'
-
 
 class ParamCommand(VerbsCommand):
     """Various param related sub-commands."""
-
-    GROUP = 'ros2param.verb'
 
 
 class PkgCommand(VerbsCommand):
     """Various package related sub-commands."""
 
-    GROUP = 'ros2pkg.verb'
-
 
 class ServiceCommand(VerbsCommand):
     """Various service related sub-commands."""
 
-    GROUP = 'ros2service.verb'
-
 
 class TopicCommand(VerbsCommand):
     """Various topic related sub-commands."""
-
-    GROUP = 'ros2topic.verb'

@@ -7,12 +7,21 @@ from typing import Any
 from ros2cli.node.strategy import add_arguments, NodeStrategy
 from ros2cli.verb import VerbExtension
 
+_FEEDBACK = '/_action/feedback'
+
 
 def get_node_names(node: Any, include_hidden_nodes: bool = False) -> list[str]:
     """List the full names of nodes, sorted; hidden ones if asked for."""
     return sorted(f"{namespace.rstrip('/')}/{name}"
                   for name, namespace in node.get_node_names_and_namespaces()
                   if include_hidden_nodes or name and not name.startswith('_'))
+
+
+def _actions(topics: list[tuple[str, list[str]]]) -> list[tuple[str, list[str]]]:
+    """Return the actions whose feedback is among the topics."""
+    return [(name.removesuffix(_FEEDBACK), [kind.removesuffix('_FeedbackMessage')
+                                            for kind in kinds])
+            for name, kinds in topics if name.endswith(_FEEDBACK)]
 
 
 class ListVerb(VerbExtension):
@@ -53,13 +62,15 @@ class InfoVerb(VerbExtension):
                       f'"{args.node_name}". You are seeing information about only one of them.',
                       file=sys.stderr)
             print(args.node_name)
-            for title, listed in (
-                    ('Subscribers', node.get_subscriber_names_and_types_by_node),
-                    ('Publishers', node.get_publisher_names_and_types_by_node),
-                    ('Service Servers', node.get_service_names_and_types_by_node),
-                    ('Service Clients', node.get_client_names_and_types_by_node),
-                    ('Action Servers', None), ('Action Clients', None)):
-                pairs = [] if listed is None else listed(name, namespace or '/')
+            where = name, namespace or '/'
+            subscribed = node.get_subscriber_names_and_types_by_node(*where)
+            published = node.get_publisher_names_and_types_by_node(*where)
+            for title, pairs in (
+                    ('Subscribers', subscribed), ('Publishers', published),
+                    ('Service Servers', node.get_service_names_and_types_by_node(*where)),
+                    ('Service Clients', node.get_client_names_and_types_by_node(*where)),
+                    ('Action Servers', _actions(published)),
+                    ('Action Clients', _actions(subscribed))):
                 print(f'  {title}:')
                 print(*[f"    {name}: {', '.join(types)}" for name, types in pairs
                         if args.include_hidden or '/_' not in name], sep='\n')

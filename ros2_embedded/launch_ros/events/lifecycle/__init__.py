@@ -6,6 +6,8 @@ from typing import Any, Callable
 
 from launch import Event
 
+from ..matchers import matches_node_name as matches_node_name
+
 _TRANSITIONS = ('CREATE', 'CONFIGURE', 'CLEANUP', 'ACTIVATE', 'DEACTIVATE',
                 'UNCONFIGURED_SHUTDOWN', 'INACTIVE_SHUTDOWN', 'ACTIVE_SHUTDOWN', 'DESTROY')
 
