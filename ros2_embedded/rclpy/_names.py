@@ -109,8 +109,8 @@ def _checked(name: str, fault: Fault | None, error: type[exceptions.NameValidati
 
 def _topic_error(is_service: bool) -> type[exceptions.NameValidationException]:
     if is_service:
-        return exceptions.InvalidServiceNameException
-    return exceptions.InvalidTopicNameException
+        return exceptions.InvalidServiceNameException  # type: ignore[no-any-return]
+    return exceptions.InvalidTopicNameException  # type: ignore[no-any-return]
 
 
 def validate_node_name(node_name: str) -> Literal[True]:

@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable
 from functools import partialmethod
-from typing import Any
 
 from rclpy import _names
 from rclpy._dds import Endpoint

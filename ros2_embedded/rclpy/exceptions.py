@@ -86,7 +86,8 @@ class ParameterException(Exception):
 class ParameterNotDeclaredException(ParameterException):
     """A parameter was used that nobody declared."""
 
-    __init__ = partialmethod(ParameterException.__init__, 'Invalid access to undeclared parameter(s)')
+    __init__ = partialmethod(
+        ParameterException.__init__, 'Invalid access to undeclared parameter(s)')
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
@@ -122,7 +123,8 @@ class InvalidParameterValueException(ParameterException):
 class ParameterImmutableException(ParameterException):
     """A read-only parameter was to be changed."""
 
-    __init__ = partialmethod(ParameterException.__init__, 'Attempted to modify read-only parameter')
+    __init__ = partialmethod(
+        ParameterException.__init__, 'Attempted to modify read-only parameter')
 
 
 class ParameterUninitializedException(ParameterException):

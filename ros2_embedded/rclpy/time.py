@@ -39,10 +39,7 @@ class Time:
         """Nanoseconds since the clock's epoch."""
         return self._nanoseconds
 
-    @property
-    def clock_type(self) -> ClockType:
-        """The kind of clock."""
-        return self._clock_type
+    clock_type = property(lambda self: self._clock_type, doc='The kind of clock.')
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
         """Give seconds and the nanoseconds beyond."""

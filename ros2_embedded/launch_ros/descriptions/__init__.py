@@ -14,6 +14,7 @@ from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
 from ..utilities import normalize_parameters, normalize_remap_rules
 
+
 class ComposableNode:
     """
     A node for a container to load.

@@ -59,7 +59,8 @@ def check_namespace(namespace: str) -> None:
 
 def get_node_name_count(context: LaunchContext, node_name: str) -> int:
     """Return how many nodes of that full name the launch has started."""
-    return context.get_locals_as_dict().get(_COUNTS, {}).get(node_name, 0)
+    counts: dict[str, int] = context.get_locals_as_dict().get(_COUNTS, {})
+    return counts.get(node_name, 0)
 
 
 def add_node_name(context: LaunchContext, node_name: str) -> str | None:
