@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import importlib.util
 import os
 from pathlib import Path
@@ -18,6 +19,9 @@ from fogros2 import ros2_daemon
 from fogros2.errors import ConfigurationError
 from fogros2.store import Record, Store
 from ros2fog_cli.api import reach
+
+#: Seconds that a command may take to end after each signal.
+PATIENCE = 3.0
 
 
 def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
@@ -86,26 +90,41 @@ def _shell(name: str, folder: Path, lines: Sequence[str]) -> list[str]:
 
 def _wait(words: list[str], environment: Mapping[str, str]) -> int:
     """Run a command to its end; Ctrl-C is for the command, a closed terminal for both."""
-    def leave(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
+    child: Optional[subprocess.Popen[bytes]] = None
+    signals: list[int] = []
 
-    child = None
+    def leave(number: int, frame: object) -> None:
+        signals.append(number)
+        # an exception within Popen would lose the command that it started
+        if child is not None and len(signals) == 1:
+            raise SystemExit(128 + number)
+
     before = {number: signal.signal(number, leave)
               for number in (signal.SIGHUP, signal.SIGTERM)}
     try:
         child = subprocess.Popen(words, env=dict(environment))
         # now, as the command would inherit that it is ignored
         before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if signals:
+            raise SystemExit(128 + signals[0])
         status = child.wait()
     except OSError as error:
         raise ConfigurationError(f"'{words[0]}' can not be run: {error.strerror}",
                                  'name a program of this computer after --') from error
     except SystemExit:
         if child is not None:
-            child.terminate()
-            child.wait()
+            _end(child)
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     return status if status >= 0 else 128 - status
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a command; an interactive bash ignores SIGTERM and ends at SIGHUP."""
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL):
+        child.send_signal(number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(PATIENCE)
+            return

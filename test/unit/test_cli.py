@@ -480,6 +480,22 @@ def test_shell_that_is_terminated_leaves_nothing(
     assert signal.getsignal(signal.SIGTERM) is handler
 
 
+@pytest.mark.parametrize('ignored', ['TERM', 'TERM HUP'])
+def test_shell_ends_a_command_that_ignores_signals(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ignored: str,
+) -> None:
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    monkeypatch.setattr(joining, 'PATIENCE', 0.5)
+    machine('a')
+    record('a', **alive())
+    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
+        (Store().launch('abc123') / name).write_text(text)
+    script = f"trap '' {ignored}; echo $$ >{tmp_path}/said; kill -TERM $PPID; exec sleep 60"
+    with pytest.raises(SystemExit, match='143'):
+        joining.run('a', ['sh', '-c', script])
+    assert not Path('/proc', (tmp_path / 'said').read_text().strip()).exists()
+
+
 def test_shell_is_the_users_own(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
 ) -> None:
