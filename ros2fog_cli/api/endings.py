@@ -243,10 +243,12 @@ def let_go(record: Record, store: Store) -> None:
 
     :raises FogError: something could not be taken away.
     """
+    folder = store.root / 'launches' / record.launch
     with store.machine(record.name).lock():
         if record.robot_vpn is not None:
+            ros2_daemon.stop(folder)
             _take_down(record.robot_vpn, record.spec.vpn)
-        shutil.rmtree(store.root / 'launches' / record.launch, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         store.machine(record.name).save(dataclasses.replace(
             record, launch='', pid=0, pid_start=0, robot_vpn=None))
 

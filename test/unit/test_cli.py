@@ -20,7 +20,14 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
-from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result
+from fogros2.model import (
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Result,
+    VpnInterface,
+)
 from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
@@ -392,6 +399,20 @@ def test_a_machine_that_was_reused_lives_from_then_on() -> None:
     assert endings.why_end(entry, NOW, endings.KEEP_STOPPED) == ''
     assert 'lifetime' in endings.why_end(
         dataclasses.replace(entry, record=None), NOW, endings.KEEP_STOPPED)
+
+
+def test_gc_stops_the_daemon_of_a_kept_machines_launch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(endings.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
+    monkeypatch.setattr(endings, '_take_down', lambda vpn, kind: done.append(vpn.name))
+    interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
+    kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
+    endings.let_go(kept, Store())
+    # the daemon is a node with the interface
+    assert done == ['abc123', 'fogabc123']
+    assert Store().machine('a').load().launch == ''
 
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
