@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import http.client
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 import secrets
 import socket
@@ -64,10 +64,13 @@ class Ticket:
         until = time.monotonic() + _VALID
         #: Set when a browser was led there.
         self.used = used = threading.Event()
+        once = threading.Lock()
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                valid = self.path == target and not used.is_set() and time.monotonic() < until
+                # the lock is never given back
+                valid = (self.path == target and time.monotonic() < until
+                         and once.acquire(blocking=False))
                 self.send_response(303 if valid else 404)
                 if valid:
                     used.set()
@@ -79,7 +82,8 @@ class Ticket:
             def log_message(self, format: str, *args: object) -> None:
                 """Say nothing: the terminal shows the pages."""
 
-        self._server = HTTPServer(('127.0.0.1', 0), Handler)
+        # browsers open connections ahead, and send nothing there
+        self._server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
         self.url = f'http://127.0.0.1:{self._server.server_port}{target}'
         self._thread = threading.Thread(
             target=self._server.serve_forever, name='fog-ticket', daemon=True)

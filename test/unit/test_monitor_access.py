@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 import shutil
 import socket
+import threading
 from types import SimpleNamespace
 import urllib.parse
 
@@ -185,6 +186,19 @@ def test_browser_is_led_to_the_page_once():
         assert ask(place.path) == (303, 'http://localhost:1/?token=sesame')
         assert ticket.used.is_set()
         assert ask(place.path) == (404, '')
+
+
+def test_silent_connection_does_not_hold_up_the_browser():
+    ticket = monitor.Ticket('http://localhost:1/')
+    place = urllib.parse.urlsplit(ticket.url)
+    with socket.create_connection((place.hostname, place.port)):
+        with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=5)) as link:
+            link.request('GET', place.path)
+            assert link.getresponse().status == 303
+        closing = threading.Thread(target=ticket.close, daemon=True)
+        closing.start()
+        closing.join(5)
+        assert not closing.is_alive()
 
 
 def test_a_pod_s_service_keeps_the_callers_addresses():
