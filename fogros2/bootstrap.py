@@ -213,8 +213,8 @@ def _complete(
     """
     Install what nodes need beyond ROS 2, and return in a few words what was done.
 
-    :param keys: of rosdep. What it can't resolve is said, and is no error: the nodes may do
-        without, and a machine may be one on which nothing may be installed.
+    :param keys: of rosdep. Keys that cannot be resolved, and packages of keys that may not be
+        installed, are named in the result and are no error: the nodes may do without.
     :param run: runs a command on the machine.
     :raises PrerequisiteError: what the launch file names can't be installed.
     """
@@ -236,11 +236,14 @@ def _complete(
             notes.append(f"the machine may lack {', '.join(left)}")
     if apt:
         lacking = run(needs.missing(apt)).stdout.split()
-        if lacking and not able:
+        named = [name for name in lacking if name in spec.apt]
+        if named and not able:
             raise PrerequisiteError(
-                f"machine '{spec.name}' lacks the packages {', '.join(lacking)}",
-                f"on the machine: apt-get install {' '.join(lacking)}")
-        if lacking:
+                f"machine '{spec.name}' lacks the packages {', '.join(named)}",
+                f"on the machine: apt-get install {' '.join(named)}")
+        if lacking and not able:
+            notes.append(f"the machine lacks {', '.join(lacking)}")
+        elif lacking:
             run(_apt_install(lacking, f"install {', '.join(lacking)}"))
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip) and install.kind == 'ros':

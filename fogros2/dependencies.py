@@ -19,7 +19,7 @@ import re
 import shlex
 from typing import Optional
 
-from fogros2 import modules, plan
+from fogros2 import locked, modules, plan
 from fogros2.errors import ConfigurationError
 from fogros2.host import DISTRO, HostFacts
 from fogros2.model import Command, MachineSpec
@@ -109,7 +109,7 @@ def check_pip(requirement: str) -> str:
     if found is None:
         raise ConfigurationError(f'pip: {requirement!r} names no Python package',
                                  "such as 'pyzbar>=0.1.9' or 'pyzbar @ https://...'")
-    if re.sub('[-_.]+', '-', found[1]).lower() in OURS:
+    if locked.name_of(found[1]) in OURS:
         raise ConfigurationError(f"pip: '{found[1]}' is part of FogROS2, which brings it itself",
                                  'leave it out')
     return requirement

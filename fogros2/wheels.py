@@ -99,7 +99,7 @@ _collected: dict[Path, tuple[float, Wheels]] = {}
 
 def _collect(folder: Path) -> Wheels:
     found = list(_closure())
-    names = [_normal(d.name) for d in found]
+    names = [locked.name_of(d.name) for d in found]
     key = _key(found)
     target = folder / key
     if not (target / 'wheels.json').exists():
@@ -150,10 +150,6 @@ def libc_for(files: Iterable[str]) -> str:
     return f'glibc {newest[0]}.{newest[1]}'
 
 
-def _normal(name: str) -> str:
-    return re.sub('[-_.]+', '-', name).lower()
-
-
 def _closure() -> Iterator[metadata.Distribution]:
     """
     Yield what has to travel: ours, the embedded default, pip, and all they require.
@@ -179,7 +175,7 @@ def _closure() -> Iterator[metadata.Distribution]:
         for requirement in distribution.requires or []:
             words, _, marker = requirement.partition(';')
             if 'extra' not in marker:
-                todo.append(_normal(re.split(r'[^A-Za-z0-9._-]', words.strip())[0]))
+                todo.append(locked.name_of(words))
 
 
 def _own() -> metadata.Distribution:
@@ -192,7 +188,7 @@ def _own() -> metadata.Distribution:
 
 
 def _by_colcon(distribution: metadata.Distribution) -> bool:
-    return _normal(distribution.name) == OWN and distribution.read_text('WHEEL') is None
+    return locked.name_of(distribution.name) == OWN and distribution.read_text('WHEEL') is None
 
 
 def _sources(distribution: metadata.Distribution) -> Optional[Path]:
@@ -250,7 +246,7 @@ def _wheel(distribution: metadata.Distribution, target: Path) -> str:
         raise PrerequisiteError(
             f'{distribution.name} {distribution.version} was not installed by pip and has no list '
             'of its files', 'install it again from the folder that it came from'
-            if _normal(distribution.name) in (OWN, EMBEDDED) else
+            if locked.name_of(distribution.name) in (OWN, EMBEDDED) else
             f'pip install --force-reinstall {distribution.name}')
     tags = re.findall(r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)
     pythons, abis, platforms = ('.'.join(dict.fromkeys(t.split('-')[i] for t in tags))

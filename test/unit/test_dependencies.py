@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import os
 from pathlib import Path
@@ -15,9 +16,9 @@ import pytest
 
 from fogros2 import bootstrap, dependencies, plan, workspace
 from fogros2.dependencies import PipFolder
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import HostFacts
-from fogros2.model import MachineSpec
+from fogros2.model import MachineSpec, Result
 from fogros2.testing.rosdep import rosdep_source
 
 RUNS_PIP = pytest.mark.skipif(
@@ -208,3 +209,23 @@ def test_a_users_paths_extend_the_machines(
     base: dict[str, str], given: dict[str, str], expected: dict[str, str],
 ) -> None:
     assert plan.extended(base, given) == expected
+
+
+def test_missing_packages_of_keys_are_no_error() -> None:
+    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=False)
+    todo = bootstrap.Preparation(
+        'none', bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts))
+    spec = MachineSpec('lab', 'ssh')
+    outputs = {'look for dependencies': 'python3-scipy\n',
+               'resolve rosdep keys': '#apt\npython3-scipy\n',
+               'look for apt packages': 'python3-scipy\n'}
+
+    def complete(spec: MachineSpec) -> list[str]:
+        folder = PipFolder.of(spec, facts, ['python3-scipy'])
+        return bootstrap._complete(
+            spec, todo, folder, ['python3-scipy'],
+            lambda command, **_: Result(0, outputs.get(command.what, ''), ''))
+
+    assert complete(spec) == ['the machine lacks python3-scipy']
+    with pytest.raises(PrerequisiteError, match="'lab' lacks the packages python3-scipy"):
+        complete(dataclasses.replace(spec, apt=('python3-scipy',)))
