@@ -28,7 +28,7 @@ from typing import Optional
 import urllib.parse
 import zipfile
 
-from fogros2 import process
+from fogros2 import locked, process
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import Command
 
