@@ -95,6 +95,8 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'ami_image': {'us-west-2': 'ubuntu'}}, 'it takes ami-'),
     ({'ami_image': {'us-west-2': 1}}, 'it takes names and strings'),
     ({'ec2_instance_type': {'us-west-2': 'cheapest'}}, "can't have 'nearest' or 'cheapest'"),
+    ({'ami_image': {'us-west-2': 'ami-1'}, 'subnet': {'eu-west-1': 'subnet-1'}},
+     'ami_image and subnet have no region in common'),
 ])
 def test_a_wrong_option_is_named_with_what_to_do(options, words):
     with pytest.raises(ConfigurationError, match=re.escape(words)):

@@ -93,7 +93,11 @@ class Options:
                                if name not in by_region}, 'a machine at AWS', _value)
         _check(options)
         _check_by_region(by_region)
-        return dataclasses.replace(options, arch=_ARCHES[options.arch], by_region=by_region)
+        options = dataclasses.replace(options, arch=_ARCHES[options.arch], by_region=by_region)
+        if options.common_regions() == []:
+            raise ConfigurationError(f'{" and ".join(by_region)} have no region in common',
+                                     'give each a value for the same region')
+        return options
 
     def in_region(self, region: str) -> Options:
         """
