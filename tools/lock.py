@@ -2,6 +2,8 @@
 """
 Write fogros2/locked.txt: what a machine may take from its package index, pinned with hashes.
 
+    tools/run.sh embedded -- python tools/lock.py
+
 It takes ``uv`` (``pip install uv``), which asks the index that it is set up with. A version is
 chosen for each Python that we support, and all its wheels are taken, whatever their processor.
 """
@@ -19,6 +21,8 @@ from fogros2.modules import MODULES
 #: What the embedded default needs and a robot can't send to another kind of machine: see
 #: ros2_embedded/setup.py. The pure Python distributions travel.
 EMBEDDED = ('cyclonedds>=11.0,<12', 'numpy', 'PyYAML')
+#: That of the sources: the installed package has a copy.
+TARGET = Path(__file__).resolve().parents[1] / 'fogros2' / locked.FILE.name
 #: The oldest Python of a machine.
 PYTHON = '3.10'
 HEADER = """\
@@ -46,10 +50,10 @@ def main() -> None:
     missing = [name for name in names if name not in entries]
     if missing:
         sys.exit(f'uv has no answer for {", ".join(missing)}')
-    locked.FILE.write_text(HEADER + ''.join(
+    TARGET.write_text(HEADER + ''.join(
         entry.replace(' --hash', ' \\\n    --hash') + '\n'
         for name in names for entry in entries[name]))
-    print(f'{locked.FILE.relative_to(Path.cwd())}: {", ".join(names)}')
+    print(f'{TARGET}: {", ".join(names)}')
 
 
 if __name__ == '__main__':
