@@ -413,7 +413,8 @@ class Coordinator:
                 self._crossing_images, self._logger.warning, self._cancel)
 
     def _crossing_images(self) -> list[str]:
-        machines = {name: session.node_names() for name, session in self._sessions.items()}
+        # the launch may add a machine meanwhile: this runs in a thread
+        machines = {name: session.node_names() for name, session in list(self._sessions.items())}
         return uncompressed.crossing_images(
             machines, {**self._context.environment, **self.launch.robot_environment()},
             self._cancel)
