@@ -47,7 +47,7 @@ CHUNK = 1 << 16
 #: What a user reads who starts the launch file.
 BY_HAND = (
     'cloud.launch.py is for the agent of a cloud machine, which starts it there to run the nodes '
-    "of that machine. To start a machine, launch a file that has a CloudNode: 'ros2 launch "
+    "of that machine. To start a machine, launch a file with machine= on a node: 'ros2 launch "
     "fogros2_examples talker.container.launch.py'")
 
 
