@@ -71,4 +71,3 @@ def served(where: str, token: str) -> str:
     """
     page = app(with_token(where, token), f'http://{where}/')
     return f'{page}&{urllib.parse.urlencode({"token": token})}'
-
