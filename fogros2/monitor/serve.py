@@ -118,7 +118,8 @@ def main() -> None:
     try:
         made = credentials.make_token(Path(folder))
     except OSError as error:
-        raise SystemExit(f'nobody could be let in without a token: {error}') from error
+        raise SystemExit(f'the bridge can not write its token to {folder}: {error.strerror}\n'
+                         '--secrets names another folder') from error
     gate += ['--name', ours.name, '--token-file', str(made.token)]
     if ours.vpn is not None:
         gate += ['--vpn', str(ours.vpn)]

@@ -51,3 +51,10 @@ def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
         process.send_signal(signal.SIGTERM)
         # the gate has our pipe too: its end is what this waits for
         assert process.communicate(timeout=20)[0] == ''
+
+
+def test_folder_that_takes_no_token_is_named(tmp_path, monkeypatch):
+    (tmp_path / 'file').touch()
+    monkeypatch.setattr(sys, 'argv', ['bridge', '--secrets', f'{tmp_path}/file/secrets'])
+    with pytest.raises(SystemExit, match='its token to .*\n--secrets names another folder'):
+        serve.main()
