@@ -303,7 +303,9 @@ def among_nodes(
     environment: Mapping[str, str], setup: Sequence[str], script: str, what: str,
 ) -> Command:
     """Return a command that runs a script as nodes run; a workspace may not be there yet."""
-    lines = [f'[ ! -f {shlex.quote(path)} ] || . {shlex.quote(path)}' for path in setup]
-    return Command(
-        ('env', *(f'{name}={value}' for name, value in environment.items()), 'bash', '-c',
-         '\n'.join([*lines, script])), what=what)
+    # variables of a launch file may be secrets: a command line is for all to read
+    lines = [f'export {name}={shlex.quote(value)}' for name, value in environment.items()]
+    lines += [f'[ ! -f {shlex.quote(path)} ] || . {shlex.quote(path)}' for path in setup]
+    # bash reads all of it before the first program could
+    text = '\n'.join(['{', *lines, script, '} </dev/null', ''])
+    return Command(('bash', '-s'), input=text.encode(), what=what)

@@ -108,7 +108,8 @@ class Machine:
         """Run commands until one fails, and return what the last one left."""
         for command in commands:
             done = subprocess.run(
-                command.argv, env=self.environment, capture_output=True, text=True, timeout=120)
+                command.argv, env=self.environment, input=command.input.decode(),
+                capture_output=True, text=True, timeout=120)
             if done.returncode != 0:
                 break
         return done

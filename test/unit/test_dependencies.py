@@ -14,11 +14,11 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, dependencies, plan, workspace
+from fogros2 import bootstrap, dependencies, modules, plan, workspace
 from fogros2.dependencies import PipFolder
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import HostFacts
-from fogros2.model import MachineSpec, Result
+from fogros2.model import Command, MachineSpec, Result
 from fogros2.testing.rosdep import rosdep_source
 
 RUNS_PIP = pytest.mark.skipif(
@@ -85,6 +85,19 @@ def test_packages_count_for_the_image() -> None:
     assert len(found) == 4
 
 
+def completed(command: Command) -> subprocess.CompletedProcess[str]:
+    """Run a command as a machine does."""
+    return subprocess.run(
+        command.argv, input=command.input.decode(), capture_output=True, text=True)
+
+
+def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
+    command = PipFolder('/none', ('x',)).fill({'A': 'b'}, {'API_KEY': "it's secret"}, ())
+    assert 'secret' not in ' '.join(command.argv)
+    shown = modules.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
+    assert completed(shown).stdout == "it's secret\n"
+
+
 def wheel(folder: Path, name: str, **modules: str) -> None:
     """Write a wheel of some modules."""
     with zipfile.ZipFile(folder / f'{name}-1-py3-none-any.whl', 'w') as archive:
@@ -103,7 +116,7 @@ def installed(tmp_path: Path, *names: str) -> tuple[PipFolder, subprocess.Comple
     command = folder.fill(
         {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
         {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)}, ())
-    return folder, subprocess.run(command.argv, capture_output=True, text=True)
+    return folder, completed(command)
 
 
 @RUNS_PIP
@@ -169,11 +182,11 @@ def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None
         'python3-scipy',)
     command = dependencies.unknown(
         ['tf2_ros', 'fogt-none', 'dpkg'], {'AMENT_PREFIX_PATH': f'/none:{tmp_path}'}, ())
-    said = subprocess.run(command.argv, capture_output=True, text=True, check=True).stdout.split()
+    said = completed(command).stdout.split()
     assert said == ['fogt-none', *([] if shutil.which('dpkg-query') else ['dpkg'])]
-    nothing = subprocess.run(dependencies.unknown(
-        ['tf2_ros'], {'AMENT_PREFIX_PATH': str(tmp_path)}, ()).argv, capture_output=True)
-    assert (nothing.returncode, nothing.stdout) == (0, b'')
+    nothing = completed(dependencies.unknown(
+        ['tf2_ros'], {'AMENT_PREFIX_PATH': str(tmp_path)}, ()))
+    assert (nothing.returncode, nothing.stdout) == (0, '')
 
 
 def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
@@ -185,7 +198,7 @@ def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
         'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}
     command = dependencies.resolve(
         ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox'], environment, ())
-    done = subprocess.run(command.argv, capture_output=True, text=True)
+    done = completed(command)
     assert done.returncode == 0, done.stderr
     assert dependencies.resolved(done.stdout) == (
         ('fogt-hello', 'ros-jazzy-slam-toolbox'), ('fogt-one',))
@@ -196,7 +209,7 @@ def test_machine_without_rosdep_says_so() -> None:
     command = dependencies.resolve(['x'], {'PATH': '/usr/bin:/bin'}, ())
     if shutil.which('rosdep', path='/usr/bin:/bin'):
         pytest.skip('this computer has rosdep')
-    assert subprocess.run(command.argv, capture_output=True).returncode == dependencies.NO_ROSDEP
+    assert completed(command).returncode == dependencies.NO_ROSDEP
 
 
 @pytest.mark.parametrize(('base', 'given', 'expected'), [

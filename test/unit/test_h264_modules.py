@@ -130,7 +130,8 @@ def test_a_ros_package_may_stand_in_its_place(
     variables = {'AMENT_PREFIX_PATH': f'/elsewhere:{tmp_path}', 'PYTHONPATH': str(tmp_path),
                  'PATH': '/usr/bin:/bin'}
     command = modules.ask(['foxglove'], variables, [])
-    said = subprocess.run(command.argv, check=True, text=True, stdout=subprocess.PIPE).stdout
+    said = subprocess.run(command.argv, input=command.input.decode(), check=True, text=True,
+                          stdout=subprocess.PIPE).stdout
     assert modules.answer(said).missing == missing
 
 
