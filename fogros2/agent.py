@@ -1483,6 +1483,11 @@ class Agent:
         remove_tree(self.directory)
         with self.root(), contextlib.suppress(OSError):
             os.rmdir(self.directory)
+        parent = os.path.dirname(self.directory)
+        if os.path.basename(parent) == 'fogros2':
+            # the folder of all agents goes with the last one
+            with self.root(), contextlib.suppress(OSError):
+                os.rmdir(parent)
 
 
 HANDLERS: dict[str, Callable[[Agent, Client, Json], Optional[Json]]] = {
