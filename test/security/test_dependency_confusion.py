@@ -102,7 +102,7 @@ class Machine:
         self.home = home
         self.environment = {
             'PATH': '/usr/bin:/bin', 'HOME': str(home), 'PIP_INDEX_URL': index.url,
-            'PIP_NO_CACHE_DIR': '1'}
+            'PIP_NO_CACHE_DIR': '1', 'PIP_CONFIG_FILE': os.devnull}
 
     def run(self, *commands: Command) -> subprocess.CompletedProcess[str]:
         """Run commands until one fails, and return what the last one left."""
