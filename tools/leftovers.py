@@ -23,8 +23,9 @@ _FOLDERS = ('dev/shm', 'etc/cni', 'etc/containers', 'etc/netns', 'etc/sudoers.d'
 _EXPECTED = re.compile(rf'/home/{USER}/({PROJECT}|\.cache)')
 #: What podman keeps when the last container is gone, for the next one.
 _PODMAN = (
-    r'control group \w+/libpod_parent', r'file /dev/shm/libpod_.*',
-    r'file /(etc/cni/net\.d/cni\.lock|etc/containers/networks|var/lib/containers/storage)(/.*)?',
+    r'control group \w+/libpod_parent(/conmon)?', r'file /dev/shm/libpod_.*',
+    r'file /(etc/cni/net\.d/cni\.lock|etc/containers/networks)(/.*)?',
+    r'file /var/lib/containers/(cache|storage)(/.*)?',
     r'file /run/(containers|libpod|lock/netavark\.lock|netns|runc)(/.*)?', r'mount /run/netns',
     r'iptables rule .*(NETAVARK|netavark).*', r'file /var/lib/cni(/.*)?',
     r'nftables table table (ip (filter|nat)|inet netavark)')
