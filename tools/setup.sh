@@ -72,6 +72,8 @@ LIST
     # Fast DDS's own library judges the profile that ours writes for it
     if [ "$target" = test ]; then
         have g++ || echo g++
+        # instances and robots of the tests fetch pages with it
+        have curl || echo curl
         [ -d /usr/include/fastdds ] || for name in libfastrtps-dev libfastdds-dev; do
             if known "$name"; then echo "$name"; break; fi
         done
