@@ -13,7 +13,6 @@ import contextlib
 import json
 import os
 from pathlib import Path
-import pty
 import re
 import shlex
 import subprocess
@@ -39,6 +38,8 @@ PASSED = [f'PATH={Path(sys.executable).parent}:{os.environ["PATH"]}', *(
         'ROS_PYTHON_VERSION') if name in os.environ)]
 #: Everything is there as on this computer, and nothing that is written reaches it.
 ENTER = """\
+# by the numbers of the outside, whose /proc this still is
+read -r pid rest </proc/self/stat
 mount -t tmpfs tmpfs "$1"
 mkdir "$1/upper" "$1/work" "$1/root"
 mount -t overlay overlay -o "lowerdir=/,upperdir=$1/upper,workdir=$1/work" "$1/root"
@@ -49,7 +50,7 @@ mount --rbind /dev dev
 mount -t tmpfs -o mode=755 tmpfs run
 ip link set lo up
 trap exit TERM
-echo ready
+echo $pid
 sleep 600 &
 wait
 """
@@ -93,8 +94,9 @@ class Copy:
 
     def launch(self, user: str) -> int:
         """Start what stands for a user's launch, and return its id in the copy."""
-        return int(self.run(user, 'sh', '-c', 'sleep 500 >/dev/null 2>&1 </dev/null & echo $!',
-                            check=True).stdout)
+        # the terminal that sudo makes for it by use_pty goes with sudo
+        return int(self.run(user, 'sh', '-c', 'trap "" HUP; '
+                            'sleep 500 >/dev/null 2>&1 </dev/null & echo $!', check=True).stdout)
 
 
 @pytest.fixture(scope='module')
@@ -111,10 +113,10 @@ def copy(tun: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
                              preexec_fn=os.setpgrp)
     assert child.stdout is not None
     try:
-        if child.stdout.readline() != 'ready\n':
+        first = child.stdout.readline()
+        if not first:
             pytest.skip(f'no layer over / is to be had here: {child.communicate()[1]}')
-        pid = child.pid if not words[0] == 'sudo' else _child(child.pid)
-        found = Copy(_child(pid), f'{folder}/root')
+        found = Copy(int(first), f'{folder}/root')
         found.run('root', 'sh', '-c', USERS, check=True)
         for path in (ROOT, Path(sys.executable), Path(sys.executable).resolve()):
             # a home is closed to others, on the copy too unless it is opened there
@@ -128,11 +130,6 @@ def copy(tun: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
     finally:
         process.end(child, sudo=words[0] == 'sudo')
         child.communicate()
-
-
-def _child(pid: int) -> int:
-    """Return the process that another one has started."""
-    return int(Path(f'/proc/{pid}/task/{pid}/children').read_text().split()[0])
 
 
 @contextlib.contextmanager
@@ -235,7 +232,7 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
     tmp_path.chmod(0o755)
     (tmp_path / 'json.py').write_text('raise SystemExit(77)')
     for parent in tmp_path.parents[:3]:
-        if parent.name.startswith('pytest-'):
+        if parent.name.startswith(('pytest-', 'popen-')):
             parent.chmod(0o755)
     script = (f'cd {shlex.quote(str(tmp_path))}; ulimit -S -f 0; umask 0; trap "" CHLD PIPE; '
               f'PYTHONPATH={shlex.quote(str(tmp_path))} PATH=/nowhere SUDO_UID=0 '
@@ -373,6 +370,24 @@ def test_a_whole_launch_of_a_user_without_rights(copy: Copy) -> None:
     assert not {link for link in copy.links() if link.startswith('fog')}
 
 
+#: Runs its words at a terminal, types the password and prints what is seen there. Root runs it, as
+#: the ticket of the user who runs the tests is not valid at another terminal.
+AT_TERMINAL = """\
+import contextlib, os, pty, sys
+pid, terminal = pty.fork()
+if pid == 0:
+    os.execvp(sys.argv[1], sys.argv[1:])
+said = b''
+with contextlib.suppress(OSError):  # the end of a terminal
+    while chunk := os.read(terminal, 1000):
+        said += chunk
+        if b'for the VPN interface: ' in said and b'words' not in said:
+            os.write(terminal, b'words\\n')
+            said += b'(words)'
+sys.stdout.buffer.write(said)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+"""
+
 
 def test_without_it_the_question_comes_first(copy: Copy) -> None:
     """A user who may use sudo with a password, at a terminal, is asked before anything is made."""
@@ -381,21 +396,11 @@ def test_without_it_the_question_comes_first(copy: Copy) -> None:
     copy.run('root', 'sh', '-c', 'echo fogeve:words | chpasswd; '
              'echo "fogeve ALL=(ALL) ALL" >/etc/sudoers.d/eve', check=True)
     twice = 'from fogros2.deploy import check_robot; check_robot(); check_robot(); print("ready")'
-    words = process.argv(Command(
-        tuple(copy.argv('fogeve', sys.executable, '-c', twice)), sudo=True))
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.execvp(words[0], words)
-    said = b''
-    with contextlib.suppress(OSError):  # the end of a terminal
-        while chunk := os.read(terminal, 1000):
-            said += chunk
-            if b'for the VPN interface: ' in said and b'words' not in said:
-                os.write(terminal, b'words\n')
-                said += b'(words)'
-    os.close(terminal)
-    assert os.waitpid(pid, 0)[1] == 0, said
-    assert said.count(b'password for fogeve, for the VPN interface') == 1 and b'ready' in said
+    said = process.run(Command((sys.executable, '-c', AT_TERMINAL, *copy.argv(
+        'fogeve', sys.executable, '-c', twice)), sudo=True), timeout=60.0, check=False)
+    assert said.returncode == 0, said
+    assert said.stdout.count('password for fogeve, for the VPN interface') == 1
+    assert 'ready' in said.stdout
 
 
 def test_it_is_removed_without_a_trace(copy: Copy) -> None:
