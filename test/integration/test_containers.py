@@ -7,6 +7,7 @@ is reached by SSH, and with one of its own on a container machine.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+import dataclasses
 import os
 from pathlib import Path
 import re
@@ -20,11 +21,10 @@ import pytest
 from fogros2 import container_scripts, containers, plan
 from fogros2.containers import Container
 from fogros2.errors import CommandError, DdsError
-from fogros2.model import Command, CreateRequest, Endpoint, MachineSpec, NodeSpec
+from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
 from fogros2.process import run, which
 from fogros2.provider import container_engine
 from fogros2.provider.container import ContainerProvider
-from fogros2.shell.local import LocalShell
 from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
 
@@ -43,13 +43,22 @@ def launch(engine: str) -> Iterator[str]:
     """Return the id of a launch, of which no container is left after."""
     name = secrets.token_hex(3)
     yield name
-    shell = LocalShell(Endpoint('local'), name='here')
-    shell.run(containers.remove(name), timeout=60)
+    at_machine(containers.remove(name))
     assert there(name) == []
 
 
 #: What a launch tells containers of its DDS.
 VARIABLES = 'RMW_IMPLEMENTATION=rmw\nROS_DOMAIN_ID=7\nROS_STATIC_PEERS=a b\n'
+
+
+def at_machine(command: Command) -> str:
+    """
+    Run what a launch runs on a machine, here, and return what it prints.
+
+    As root: the login user of a machine has root without a password, and the user who runs the
+    tests may have it at this terminal alone, where not all of a shell's commands run.
+    """
+    return run(dataclasses.replace(command, sudo=True), timeout=60).stdout
 
 
 def settings(folder: Path) -> Path:
@@ -74,12 +83,11 @@ def begun(words: Sequence[str], folder: Path, **variables: str) -> subprocess.Po
 
 def started(container: Container, launch: str, folder: Path) -> subprocess.Popen[str]:
     """Start a container as a deployment does, and follow it as the agent does."""
-    shell = LocalShell(Endpoint('local'), name='here')
-    assert shell.run(containers.find(), timeout=60).stdout.strip() == 'podman'
-    image = shell.run(containers.fetch(container.image), timeout=60).stdout.strip()
+    assert at_machine(containers.find()).strip() == 'podman'
+    image = at_machine(containers.fetch(container.image)).strip()
     (folder / 'variables').write_text(VARIABLES)
-    shell.run(containers.run(container, 0, launch, image, str(settings(folder)),
-                             str(folder / 'variables')), timeout=60)
+    at_machine(containers.run(container, 0, launch, image, str(settings(folder)),
+                              str(folder / 'variables')))
     (folder / containers.FOLLOWER).write_text(container_scripts.FOLLOW)
     words = containers.follow(container, 0, launch).arguments
     return begun([str(word) for word in words], folder)
@@ -127,16 +135,14 @@ def test_what_nobody_follows_any_more_is_removed(image, launch, tmp_path):
     os.kill(follower.pid, signal.SIGKILL)
     follower.wait(60)
     assert there(launch) != []
-    shell = LocalShell(Endpoint('local'), name='here')
-    shell.run(containers.remove(launch), timeout=60)
+    at_machine(containers.remove(launch))
     wait_until(lambda: not there(launch) or None, timeout=20, what='the container to be gone')
     follower.stdout.close()
 
 
 def test_an_image_that_is_not_there_is_told(engine, launch):
-    shell = LocalShell(Endpoint('local'), name='here')
     with pytest.raises(CommandError, match='no/such'):
-        shell.run(containers.fetch('oci-archive:/no/such'), timeout=60)
+        at_machine(containers.fetch('oci-archive:/no/such'))
 
 
 def test_one_that_fails_is_started_again_as_often_as_it_may(image, launch, tmp_path):
@@ -163,8 +169,7 @@ def test_one_that_somebody_else_removes_is_not_waited_for(image, launch, tmp_pat
     follower = started(limited(
         image, 'sh', '-c', 'echo up; exec busybox sleep 1000', restart='always'), launch, tmp_path)
     assert follower.stdout.readline() == 'up\n'
-    shell = LocalShell(Endpoint('local'), name='here')
-    shell.run(containers.remove(launch), timeout=60)
+    at_machine(containers.remove(launch))
     follower.communicate(timeout=60)
     assert follower.returncode != 0
 
