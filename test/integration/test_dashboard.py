@@ -54,9 +54,10 @@ class Dashboard:
     """``ros2 fog dashboard`` as a process of a test's own."""
 
     def __init__(self) -> None:
+        # in our session: sudo's ticket belongs to the terminal
         self.child = subprocess.Popen(
             ['ros2', 'fog', 'dashboard', '--no-browser'], stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE, text=True, start_new_session=True)
+            stdout=subprocess.PIPE, text=True, preexec_fn=os.setpgrp)
         assert self.child.stdout is not None
         self.url = self.child.stdout.readline().split()[4]
 
