@@ -109,6 +109,14 @@ def root() -> None:
 
 
 @pytest.fixture(scope='session')
+def root_at_login() -> None:
+    """Skip where who logs in by SSH has no root: sudo's ticket belongs to the terminal."""
+    if os.geteuid() != 0 and (shutil.which('sudo') is None or subprocess.run(
+            ['sudo', '-n', 'true'], capture_output=True, start_new_session=True).returncode):
+        pytest.skip('the user of an SSH machine needs sudo without a password')
+
+
+@pytest.fixture(scope='session')
 def tun(root: None) -> None:
     """Skip where no TUN device can be opened."""
     if not os.path.exists('/dev/net/tun'):

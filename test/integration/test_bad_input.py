@@ -312,7 +312,7 @@ def test_a_refused_key(refused, computer, tmp_path):
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_a_computer_that_is_the_robot(refused, tmp_path):
+def test_a_computer_that_is_the_robot(refused, root_at_login, tmp_path):
     """Its two ends of the VPN would be in one network, where nothing goes through a VPN."""
     with private_sshd(tmp_path / 'sshd') as server:
         error, text = refused(

@@ -171,11 +171,10 @@ def test_gc_after_a_launch_that_was_killed_without_a_store(
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_an_ssh_machine_whose_agent_left_is_deleted_at_once(tmp_path: Path) -> None:
+def test_an_ssh_machine_whose_agent_left_is_deleted_at_once(
+    tmp_path: Path, root_at_login: None,
+) -> None:
     """Its agent took its program along; what tried to run that took six seconds to give up."""
-    if os.geteuid() != 0 and subprocess.run(
-            ['setsid', '-w', 'sudo', '-n', 'true'], capture_output=True).returncode:
-        pytest.skip('the user of an SSH machine needs sudo without a password')
     with private_sshd(tmp_path / 'sshd') as server:
         endpoint = server.endpoint
         spec = MachineSpec('lab', 'ssh', {
