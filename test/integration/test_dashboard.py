@@ -265,7 +265,7 @@ def watched(tmp_path: Path, nothing_left: None) -> Iterator[Callable[[str], Path
             watching.append(subprocess.Popen(
                 ['ros2', 'fog', 'status', name, '--watch', '--json', '--topics',
                  '--interval', '0.2'],
-                stdin=subprocess.DEVNULL, stdout=said, start_new_session=True))
+                stdin=subprocess.DEVNULL, stdout=said, preexec_fn=os.setpgrp))
         return tmp_path / 'watched'
 
     yield watch
@@ -278,15 +278,20 @@ def watched(tmp_path: Path, nothing_left: None) -> Iterator[Callable[[str], Path
 
 
 def in_a_terminal(*words: str) -> str:
-    """Return what a command draws until it tells of nodes and the VPN, and gets a Ctrl-C."""
+    """
+    Return what a command draws until it tells of nodes and the VPN, and is interrupted.
+
+    It draws on a terminal of its own, and stays in our session, whose ticket sudo has.
+    """
     import fcntl
     import pty
     import select
     import struct
     import termios
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.execvpe(words[0], words, {**os.environ, 'TERM': 'xterm'})
+    terminal, theirs = pty.openpty()
+    child = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs,
+                             preexec_fn=os.setpgrp, env={**os.environ, 'TERM': 'xterm'})
+    os.close(theirs)
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 40, 100, 0, 0))
     said, pressed = b'', False
     deadline = time.monotonic() + 40.0
@@ -300,9 +305,11 @@ def in_a_terminal(*words: str) -> str:
                 break
             said += more
         if b'talker' in said and b'handshake' in said and not pressed:
-            os.write(terminal, b'\x03')
+            os.killpg(child.pid, signal.SIGINT)
             pressed = True
     os.close(terminal)
-    _, status = os.waitpid(pid, 0)
-    assert os.waitstatus_to_exitcode(status) == 0
+    try:
+        assert child.wait(20) == 0
+    finally:
+        child.kill()
     return said.decode()
