@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 from pathlib import Path
 import socket
 import ssl
@@ -20,6 +21,7 @@ from fogros2.errors import PrerequisiteError
 from fogros2.testing.cluster import images, node, services
 from fogros2.testing.cluster.certificates import Authority, rsa_key
 from fogros2.testing.cluster.images import Image
+from fogros2.testing.cluster.node_process import ClusterError, run_node
 from fogros2.testing.cluster.pod_security import verdict
 
 LAYOUT = services.Layout('198.51.100.254', '198.51.100.253', 30)
@@ -182,3 +184,37 @@ def test_a_folder_is_one_node_s(tmp_path):
         assert (mine, again) == (True, False)
     with node.claimed(tmp_path) as mine:
         assert mine
+
+
+@pytest.fixture
+def sudo(tmp_path, monkeypatch):
+    """Return a function that sets what sudo does for a user who is not root."""
+    def does(script):
+        (tmp_path / 'sudo').write_text(f'#!/bin/sh\n{script}\n')
+        (tmp_path / 'sudo').chmod(0o755)
+
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+    return does
+
+
+def test_node_that_sudo_refuses_is_an_error(sudo, tmp_path):
+    sudo('echo "sudo: a password is required" >&2; exit 1')
+    with pytest.raises(ClusterError, match='exit status 1\nsudo: a password is required'):
+        run_node(tmp_path / 'runs', {}, {}).wait()
+
+
+def test_node_that_was_killed_is_an_error(sudo, tmp_path):
+    sudo('kill -9 $$')
+    with pytest.raises(ClusterError, match='exit status -9'):
+        run_node(tmp_path / 'runs', {}, {}).wait()
+
+
+def test_node_stays_in_the_session_of_the_sudo_ticket(sudo, tmp_path):
+    # the sixth field of its stat; with another terminal or none, sudo asks for the password
+    sudo('read -r line </proc/$$/stat; set -- $line; echo "{\\"session\\": $6}"')
+    started = run_node(tmp_path / 'runs', {}, {})
+    try:
+        assert started.await_line(10.0) == {'session': os.getsid(0)}
+    finally:
+        started.stop()

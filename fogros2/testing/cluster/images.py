@@ -10,7 +10,7 @@ containerd does it, in the user's cache folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import fcntl
@@ -231,24 +231,31 @@ def _make(
         write_archive(archive, [
             Image(name, tuple(layers[:2]), _CONFIG) for name in (READY, DEFAULT)],
             leave_out=layers[:1])
-        _unpack(archive, target, binaries, system)
-        (target / _WHY_NOT).write_text(why_not)
+        _unpack(archive, target, binaries, system, {_WHY_NOT: why_not})
 
 
 def why_not_ready(store: Path) -> str:
     """Return why ``READY`` has no ROS in it, '' if it has."""
-    return (store / _WHY_NOT).read_text()
+    # the folder is root's alone
+    return process.run(Command(('cat', str(store / _WHY_NOT)), sudo=True), timeout=10.0).stdout
 
 
 def _unpack(
     archive: Path, target: Path, binaries: Path, begin: Optional[Path] = None,
+    files: Optional[Mapping[str, str]] = None,
 ) -> None:
-    """Have containerd unpack an archive into a folder that has what ``begin`` has."""
+    """
+    Have containerd unpack an archive into a folder that has what ``begin`` has.
+
+    :param files: more files for the folder, which is root's: name, contents.
+    :raises ClusterError: the folder could not be made.
+    """
     first = {'images': str(begin)} if begin else {}
     run_node(target.parent / 'runs', {
         'commands': {'containerd': services.commands(services.NOWHERE)['containerd']},
         'binaries': str(binaries), 'import': [str(archive)], 'keep': str(target), **first,
-    }, {'containerd.toml': services.containerd(SANDBOX)}).wait()
+    }, {'containerd.toml': services.containerd(SANDBOX),
+        **{f'containerd/{name}': text for name, text in (files or {}).items()}}).wait()
 
 
 def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> str:

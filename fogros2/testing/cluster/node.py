@@ -174,7 +174,8 @@ def copy_images(source: Path, target: Path) -> None:
 
     Files of images are never written again, so they are linked; databases are copied.
     """
-    call('cp', '-al', str(source), str(target))
+    # the target may be there, with files of its own
+    call('cp', '-alT', str(source), str(target))
     for database in target.glob('io.containerd.*/*.db'):
         database.unlink()
         shutil.copy2(source / database.relative_to(target), database)

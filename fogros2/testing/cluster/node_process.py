@@ -12,9 +12,12 @@ import select
 import socket
 import subprocess
 import sys
+import tempfile
 from typing import Any, Optional
 
+from fogros2 import process
 from fogros2.errors import FogError
+from fogros2.model import Command
 from fogros2.testing.cluster import node
 
 
@@ -31,18 +34,16 @@ class NodeProcess:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        words = [sys.executable, '-I', node.__file__, str(folder)]
-        if os.geteuid() != 0:
-            words = ['sudo', '-n', '--', *words]
-        # what a terminal sends to its foreground isn't for the node
-        self._child = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        self._errors = tempfile.TemporaryFile()
+        self._child = process.start(
+            Command((sys.executable, '-I', node.__file__, str(folder)), sudo=True),
+            environment=os.environ, stdin=subprocess.PIPE, stderr=self._errors.fileno())
 
     def await_line(self, timeout: float) -> Optional[dict[str, Any]]:
         """
         Return the next thing the node says, None when it has ended.
 
-        :raises ClusterError: it failed, or said nothing.
+        :raises ClusterError: it failed, was killed, or said nothing.
         """
         assert self._child.stdout is not None
         if not select.select([self._child.stdout], [], [], timeout)[0]:
@@ -51,6 +52,11 @@ class NodeProcess:
         said: Optional[dict[str, Any]] = json.loads(line) if line else None
         if said and 'failed' in said:
             raise ClusterError(f"the tests' cluster: {said['failed']}")
+        if said is None and (status := self._child.wait(60.0)) != 0:
+            self._errors.seek(0)
+            lines = self._errors.read().decode(errors='replace').splitlines()[-15:]
+            raise ClusterError('\n'.join((
+                f"the tests' cluster: its node ended with exit status {status}", *lines)))
         return said
 
     def ask(self, question: Mapping[str, Any], timeout: float = 70.0) -> dict[str, Any]:
@@ -75,6 +81,7 @@ class NodeProcess:
         self._child.stdin.close()
         self._child.wait(60.0)
         self._child.stdout.close()
+        self._errors.close()
 
 
 def run_node(
