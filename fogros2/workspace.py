@@ -491,13 +491,20 @@ def find_workspace(environment: Mapping[str, str]) -> Optional[str]:
     Return the workspace whose install space comes first in the environment, None without one.
 
     An install space is a folder that colcon marked as one, beside a ``src`` folder: an installed
-    distribution has the marker too, or none.
+    distribution has the marker too, or none. ROS 2 that was built from source is no workspace of
+    the user's, though it looks like one.
     """
     for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
         for entry in environment.get(variable, '').split(os.pathsep):
             # an isolated install space has one prefix a package below it
             for folder in (Path(entry), Path(entry).parent) if entry else ():
                 marked = (folder / '.colcon_install_layout').is_file()
-                if marked and (folder.parent / 'src').is_dir():
+                if marked and (folder.parent / 'src').is_dir() and not _is_ros(folder):
                     return str(folder.parent)
     return None
+
+
+def _is_ros(install: Path) -> bool:
+    """Whether an install space, merged or isolated, is a ROS distribution."""
+    name = 'ros_environment'
+    return any((prefix / 'share' / name).is_dir() for prefix in (install, install / name))

@@ -178,6 +178,10 @@ def test_the_workspace_is_found(tmp_path, variable, isolated):
     (tmp_path / 'ws/src').mkdir()
     assert find_workspace(environment) == str(tmp_path / 'ws')
     assert find_workspace({}) is None
+    # ROS 2 that was built from source is the system, not a workspace
+    (first.parent / 'ros_environment' if isolated else install).joinpath(
+        'share/ros_environment').mkdir(parents=True)
+    assert find_workspace(environment) is None
 
 
 def test_info(context):
