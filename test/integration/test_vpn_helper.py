@@ -75,7 +75,8 @@ class Copy:
     def argv(self, user: str, *words: str) -> list[str]:
         inside = ['nsenter', '-t', str(self.pid), '-m', '-n', '-p', '-i', 'chroot', self.root]
         if user == 'root':
-            return [*inside, *words]
+            # as at boot: the helper asks sudo who has called it
+            return [*inside, 'env', '-u', 'SUDO_UID', *words]
         # not su, which takes the terminal away
         return [*inside, 'setpriv', f'--reuid={user}', f'--regid={user}', '--init-groups',
                 'env', '-i', *PASSED, f'HOME=/home/{user}', *words]
