@@ -88,6 +88,8 @@ do
     numbers=${each#*:}
     mknod -m 666 "dev/${each%%:*}" c "${numbers%:*}" "${numbers#*:}"
 done
+# the kubelet reads it; the user may not write there
+mknod -m 644 dev/kmsg c 1 11
 mount -t tmpfs -o nosuid,nodev,mode=755 run run
 mkdir -m 1777 run/lock
 while read -r folder; do

@@ -64,6 +64,8 @@ why_not() {
             mkdir "$tree/fogros2-probe" 2>/dev/null && rmdir "$tree/fogros2-probe" && exit 0
             done; exit 1'; then
         echo "root may make no control groups here, as in a container without privileges"
+    elif ! [ -c /dev/kmsg ]; then
+        echo "there is no /dev/kmsg, which the kubelet reads, as in a container without privileges"
     elif [ -d "$(folder)" ]; then
         :
     elif [ "$(free_gb)" -lt 8 ]; then

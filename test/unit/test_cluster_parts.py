@@ -218,3 +218,11 @@ def test_node_stays_in_the_session_of_the_sudo_ticket(sudo, tmp_path):
         assert started.await_line(10.0) == {'session': os.getsid(0)}
     finally:
         started.stop()
+
+
+def test_error_of_a_service_has_no_stacks_of_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(node, 'HERE', tmp_path)
+    (tmp_path / 'log').mkdir()
+    (tmp_path / 'log/kubelet.log').write_text(
+        'F1 open /dev/kmsg: no such file\ngoroutine 1 [running]:\n' + 'main.main()\n' * 20)
+    assert node.Node(tmp_path, {}).last_words('kubelet') == 'F1 open /dev/kmsg: no such file'

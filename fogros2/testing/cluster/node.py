@@ -284,9 +284,10 @@ class Node:
                 os.waitpid(ended.si_pid, 0)
 
     def last_words(self, name: str) -> str:
-        """Return the end of what a service said."""
+        """Return the end of what a service said, without the stacks that Go adds to an error."""
         log = HERE / 'log' / f'{name}.log'
-        return '\n'.join(log.read_text(errors='replace').splitlines()[-15:])
+        said = log.read_text(errors='replace').partition('\ngoroutine ')[0]
+        return '\n'.join(said.splitlines()[-15:])
 
     def await_answer(self, name: str) -> None:
         """Wait until a service answers, if it is one that others need."""
