@@ -78,23 +78,17 @@ class NodeGraph:
     get_publisher_names_and_types_by_node = partialmethod(_topics_of_node, writers=True)
     get_subscriber_names_and_types_by_node = partialmethod(_topics_of_node, writers=False)
 
-    def get_service_names_and_types_by_node(
-            self, node_name: str, node_namespace: str) -> NamesAndTypes:
+    def _services_of_node(
+            self, node_name: str, node_namespace: str, *, serves: bool) -> NamesAndTypes:
         """
-        List the services of a node, with their types.
+        List the services that a node serves (or has clients of), with their types.
 
         :raises NodeNameNonExistentError: if there is no such node.
         """
-        return _services(self._of_node(node_name, node_namespace, False), True)
+        return _services(self._of_node(node_name, node_namespace, False), serves)
 
-    def get_client_names_and_types_by_node(
-            self, node_name: str, node_namespace: str) -> NamesAndTypes:
-        """
-        List the services a node has clients of, with their types.
-
-        :raises NodeNameNonExistentError: if there is no such node.
-        """
-        return _services(self._of_node(node_name, node_namespace, False), False)
+    get_service_names_and_types_by_node = partialmethod(_services_of_node, serves=True)
+    get_client_names_and_types_by_node = partialmethod(_services_of_node, serves=False)
 
     # --- topics and services ---
 

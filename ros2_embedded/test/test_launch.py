@@ -494,6 +494,9 @@ def test_helpers_of_utilities():
     from launch_ros.utilities.track_node_names import add_node_name, get_node_name_count
     assert launch.utilities.is_a(Asked(), launch.Event)
     assert type_utils.coerce_list(['1', '2'], int) == [1, 2]
+    for wrong in ('1', [1, 2]):
+        with pytest.raises(TypeError):
+            type_utils.coerce_list(wrong)
     assert type_utils.is_valid_scalar_type(int) and not type_utils.is_valid_scalar_type(list)
     assert type_utils.is_instance_of_valid_type([1, 'a'], can_be_str=True)
     assert type_utils.is_normalized_substitution([TextSubstitution(text='a')])

@@ -72,6 +72,7 @@ def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = Fals
     :param can_be_str: whether the text itself will do where it isn't of the type.
     :raises ValueError: if it can't be read so.
     """
+    ensure_argument_type(value, str, 'value', 'coerce_to_type')
     kind, is_list = extract_type(data_type)
     is_list = is_list and kind is not None
     if kind is str and not is_list or kind is None and not value:
