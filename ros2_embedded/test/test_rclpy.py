@@ -667,6 +667,7 @@ def test_shutdown_ends_spinning(context):
 # --- a process of its own -----------------------------------------------------------------------
 
 PROGRAM = '''
+import time
 import rclpy
 from rclpy.executors import ExternalShutdownException
 rclpy.init()
@@ -684,7 +685,11 @@ try:
     rclpy.spin(node)
 except (KeyboardInterrupt, ExternalShutdownException):
     pass
-assert not rclpy.ok()
+except RuntimeError as error:
+    # ROS 2 may begin to wait just as the signal shuts it down
+    assert 'context is not valid' in str(error)
+while rclpy.ok():  # ROS 2 raises KeyboardInterrupt while another thread shuts down
+    time.sleep(0.01)
 log.fatal('over')
 node.destroy_node()
 rclpy.try_shutdown()
@@ -719,7 +724,7 @@ def test_signals_and_the_console(number):
 
 def test_log_level_from_the_command_line():
     program = PROGRAM.replace('rclpy.spin(node)', 'raise KeyboardInterrupt').replace(
-        'assert not rclpy.ok()', '')
+        'while rclpy.ok()', 'while False')
     done = subprocess.run(
         [sys.executable, '-c', program, '--ros-args', '--log-level', 'sleeper:=debug',
          '--log-level', 'error'], capture_output=True, text=True, timeout=30, check=True,
