@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import contextlib
 import re
 import shutil
+import signal
+import subprocess
 import time
 import urllib.request
 import uuid
@@ -188,16 +191,26 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
 def test_pod_serves_the_web_application(launch, namespace):
     run = launch("talker(pod('watched', launch_foxglove=True))", 'listener()',
                  before=f"from fogros2.monitor import urls\nurls.IMAGE = '{APPLICATION}'\n")
-    run.wait_for('Foxglove at ws://', timeout=PATIENCE)
-    address = re.search(r'Foxglove at ws://(\S+);', run.text)
-    assert address is not None
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    run.wait_for('I heard', timeout=PATIENCE)
+    opener = urllib.request.build_opener(
+        urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor())
+    pages = []
 
-    def page():
-        with opener.open(f'http://{address[1]}/', timeout=5) as answer:
-            return answer.read().decode()
+    def shown():
+        with contextlib.suppress(OSError), opener.open(f'http://{address}', timeout=5) as answer:
+            pages.append(answer.read().decode().strip())
+        return pages[-1:] == ['the application']
 
-    wait_until(lambda: page().strip() == 'the application', timeout=60.0, what='the application')
+    tunnel = subprocess.Popen(['ros2', 'fog', 'monitor', 'watched', '--no-browser'], text=True,
+                              stdout=subprocess.PIPE)
+    try:
+        line = tunnel.stdout.readline()
+        address = re.search(r'is at ws://(localhost:\d+/\?token=\S+) ', line)[1]
+        wait_until(shown, timeout=60.0, what='the application')
+    finally:
+        tunnel.send_signal(signal.SIGINT)
+        tunnel.wait(20)
+        tunnel.stdout.close()
     (found,) = namespace.all('pods')
     assert [each['name'] for each in found['spec']['containers']] == ['machine', 'application']
     run.interrupt()
