@@ -16,7 +16,7 @@ import re
 from fogros2.errors import PrerequisiteError
 
 FILE = Path(__file__).with_name('locked.txt')
-#: What pip is told besides the requirements. Sources would be built by programs without hashes.
+#: Options of pip besides the requirements. Sources would be built by programs without hashes.
 OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
 
 

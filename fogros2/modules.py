@@ -5,7 +5,7 @@ What some of our programs import beyond ROS 2, and how a machine gets what it la
 That goes into a folder which these programs alone look into, so that nothing else on the machine
 finds another NumPy than it was built for. The robot's own modules travel where they run on the
 machine as they are; else the machine asks its package index, for versions that are pinned with
-hashes. Not apt: Ubuntu 24.04 has PyAV 11, which can't be told a colour range.
+hashes. Not apt: Ubuntu 24.04 has PyAV 11, which takes no colour range.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def index(packed: Wheels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> In
     made = Index(tmp_path / 'simple')
     lines = [made.add(path) for path in sorted(Path(packed.folder).glob('*.whl'))
              if locked.name_of(path.name.partition('-')[0]) not in OURS]
-    for name in ROBOT_ONLY:  # whoever resolves what fogros2 requires finds these as well
+    for name in ROBOT_ONLY:  # a pip that resolves the requirements of fogros2 finds these too
         made.attack(name, '99.0', tmp_path, code='')
     pins = tmp_path / 'locked.txt'
     pins.write_text('\n'.join(lines) + '\n')
