@@ -203,6 +203,7 @@ class Guard:
             raise
         heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, job.launch.id)
         job.undo.callback(heartbeat.close)
+        job.heartbeat_age = lambda: heartbeat.age
         try:
             wait_until(
                 lambda: heartbeat.round_trip is not None, timeout=job.timeouts.vpn,

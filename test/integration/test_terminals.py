@@ -11,6 +11,7 @@ import uuid
 import pytest
 
 from fogros2.testing.launched import launching, ros2
+from fogros2.waiting import wait_until
 
 pytest.importorskip('ros2cli.daemon', reason='the embedded default has no daemon')
 pytestmark = pytest.mark.usefixtures('nothing_left', 'engine')
@@ -67,13 +68,14 @@ def test_terminals_see_the_machine_and_leave_no_daemon(
             run.wait_for('Publishing')
             seen = terminal('ros2', 'fog', 'shell', NAME, '--', 'sh', '-ec', LOOK)
             assert '/far' in seen.splitlines() and 'Publisher count: 1' in seen, seen
-            assert daemons() == before
+            # a daemon closes its port before its process ends
+            wait_until(lambda: daemons() == before, timeout=30, what='the daemon to end')
             seen = terminal('sh', '-ec', f'eval "$(ros2 fog env {NAME})"; {LOOK}')
             assert '/far' in seen.splitlines() and 'Publisher count: 1' in seen, seen
             assert len(daemons()) == 2
             run.interrupt()
             assert run.ended() == 0, run.text
-        assert daemons() == before
+        wait_until(lambda: daemons() == before, timeout=30, what='the daemon to end')
         # other terminals have not noticed anything
         assert '/rosout' in terminal('ros2', 'topic', 'list')
     finally:
