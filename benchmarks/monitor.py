@@ -306,7 +306,7 @@ def median(crowd: list[Seen], share: float = 0.5) -> float:
 
 def dashboard(seconds: float) -> list[Row]:
     """Return what the dashboard takes where no launch runs: its first paint, and its idling."""
-    from fogros2.testing.browser import Browser, program
+    from rigs.browser import Browser, program
     if program() is None:
         raise SystemExit('needs Chromium: sudo apt-get install chromium')
     with tempfile.TemporaryDirectory() as folder:

@@ -2,7 +2,7 @@
 """
 How long a launch on a rented machine takes from ``ros2 launch`` to the first message.
 
-Against EC2 in a box (``fogros2.testing.ec2``), whose instances boot as slowly as they are told.
+Against EC2 in a box (``rigs.ec2``), whose instances boot as slowly as they are told.
 *Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
 without the installation of ROS 2 on an image that has none. The instances are this computer's own
 containers: where many boot at once they share its cores, as EC2's wouldn't. The robot's CPU is
@@ -29,8 +29,8 @@ import time
 from figures import Row, write
 import startup_kubernetes
 
-from fogros2.testing.ec2 import Ec2Box
-from fogros2.testing.launched import launching, ros2
+from rigs.ec2 import Ec2Box
+from rigs.launched import launching, ros2
 
 REGION = 'us-east-1'
 DELAYS = (0.0, 20.0)

@@ -2,9 +2,9 @@
 """
 How long a launch with pods takes from ``ros2 launch`` to the first message, on a real cluster.
 
-The cluster is one node on this computer (``fogros2.testing.cluster``), whose image is there
-already and has the embedded default. Requests are counted from the API server's audit log, for a
-user who has the sample role and no other right.
+The cluster is one node on this computer (``rigs.cluster``), whose image is there already and has
+the embedded default. Requests are counted from the API server's audit log, for a user who has the
+sample role and no other right.
 
     python benchmarks/startup.py --provider kubernetes [--runs 3]
 """
@@ -26,10 +26,10 @@ import uuid
 
 from figures import Row, write
 
-from fogros2.testing.cluster import Client, Cluster, cluster, READY, running_cluster
-from fogros2.testing.cluster.namespaces import making_namespaces, Namespace
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.cluster import Client, Cluster, cluster, READY, running_cluster
+from rigs.cluster.namespaces import making_namespaces, Namespace
+from rigs.launched import launching, ros2
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / 'tools' / 'kubernetes.sh'

@@ -23,9 +23,9 @@ from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
 from fogros2.provider import container_root
-from fogros2.testing.cluster import images as cluster_images
-from fogros2.testing.traces import nothing_left as nothing_left_of
-from fogros2.testing.traces import RUN, Traces
+from rigs.cluster import images as cluster_images
+from rigs.traces import nothing_left as nothing_left_of
+from rigs.traces import RUN, Traces
 
 #: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
 #: the tests may meet on one computer.

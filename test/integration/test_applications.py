@@ -19,7 +19,7 @@ import time
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 import pytest
 
-from fogros2.testing.launched import launching
+from rigs.launched import launching
 
 ROOT = Path(__file__).parents[2]
 

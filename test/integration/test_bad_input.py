@@ -22,9 +22,9 @@ import pytest
 from fogros2 import process
 from fogros2.provider import container_root
 from fogros2.store import Store
-from fogros2.testing.bare_computer import bare_computer
-from fogros2.testing.launched import launching
-from fogros2.testing.sshd import private_sshd
+from rigs.bare_computer import bare_computer
+from rigs.launched import launching
+from rigs.sshd import private_sshd
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

@@ -19,8 +19,8 @@ from fogros2 import process
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.ssh import SSHProvider
 from fogros2.store import Record, Store
-from fogros2.testing.sshd import private_sshd
 from fogros2.waiting import wait_until
+from rigs.sshd import private_sshd
 
 pytestmark = pytest.mark.timeout(240)
 

@@ -25,8 +25,8 @@ from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
 from fogros2.process import run, which
 from fogros2.provider import container_engine
 from fogros2.provider.container import ContainerProvider
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.launched import launching, ros2
 
 
 @pytest.fixture(scope='module')

@@ -15,7 +15,7 @@ import pytest
 
 from fogros2 import process, workspace
 from fogros2.host import HostFacts
-from fogros2.testing.launched import launching
+from rigs.launched import launching
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left', 'engine'),

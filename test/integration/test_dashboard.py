@@ -19,9 +19,9 @@ pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed
 pytest.importorskip('cv2', reason='the extra "video" is not installed')
 
 from fogros2.store import Store
-from fogros2.testing.browser import Browser, program
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.browser import Browser, program
+from rigs.launched import launching, ros2
 
 pytestmark = [
     pytest.mark.timeout(180),

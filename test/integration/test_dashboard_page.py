@@ -16,8 +16,8 @@ pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed
 
 from fogros2.errors import NameTaken
 from fogros2.monitor.dashboard.server import Dashboard
-from fogros2.testing.browser import Browser, program
 from fogros2.waiting import wait_until
+from rigs.browser import Browser, program
 
 pytestmark = [
     pytest.mark.timeout(90),

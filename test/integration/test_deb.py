@@ -25,7 +25,7 @@ import pytest
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, Result
 from fogros2.process import run, which
-from fogros2.testing.cluster import images
+from rigs.cluster import images
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'

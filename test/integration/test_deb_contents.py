@@ -96,6 +96,17 @@ def test_provides_the_other_packages_of_the_tree(built: Path) -> None:
         f'ros-jazzy-image-transport-h264 (= {version})']
 
 
+def test_brings_our_packages_without_the_rigs(
+    files: dict[str, tuple[tarfile.TarInfo, bytes]],
+) -> None:
+    modules = {Path(name).relative_to(SITE) for name in files
+               if name.startswith(f'{SITE}/') and name.endswith('.py')}
+    assert {path.parts[0] for path in modules} == {
+        'fogros2', 'fogros2_examples', 'image_transport_h264', 'ros2fog_cli'}
+    assert {path.name for path in modules if path.parts[:2] == ('fogros2', 'testing')} == {
+        '__init__.py', 'fakes.py', 'plugins.py', 'provider_contract.py', 'shell_contract.py'}
+
+
 def test_refuses_a_key_it_has_no_version_for(deb: ModuleType, tmp_path: Path) -> None:
     manifest = tmp_path / 'package.xml'
     manifest.write_text('<package><exec_depend>python3-attr</exec_depend></package>')

@@ -19,8 +19,8 @@ from fogros2.errors import CommandError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.report import StepDone
-from fogros2.testing.rosdep import rosdep_source
 from fogros2.waiting import wait_until
+from rigs.rosdep import rosdep_source
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

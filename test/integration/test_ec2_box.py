@@ -17,8 +17,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.ec2 import Ec2Box
 from fogros2.waiting import wait_until
+from rigs.ec2 import Ec2Box
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 pytest.importorskip('moto', reason='needs moto[server]')
@@ -404,7 +404,7 @@ def test_groups_name_groups_and_a_reboot_is_no_new_boot(box, key):
 
 STARTER = """
 import sys, time, boto3
-from fogros2.testing.ec2 import Ec2Box
+from rigs.ec2 import Ec2Box
 with Ec2Box() as box:
     ec2 = boto3.client('ec2', region_name='us-east-1', **box.client_arguments)
     image = boto3.client('ssm', region_name='us-east-1', **box.client_arguments).get_parameter(

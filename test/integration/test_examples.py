@@ -13,8 +13,8 @@ import uuid
 from ament_index_python.packages import get_package_share_directory
 import pytest
 
-from fogros2.testing.colcon_workspace import colcon_workspace
-from fogros2.testing.launched import launching, ros2
+from rigs.colcon_workspace import colcon_workspace
+from rigs.launched import launching, ros2
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

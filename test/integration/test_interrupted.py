@@ -12,9 +12,9 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import argv
-from fogros2.testing.launched import launching
 from fogros2.testing.plugins import install
 from fogros2.waiting import wait_until
+from rigs.launched import launching
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

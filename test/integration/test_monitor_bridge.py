@@ -33,8 +33,8 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.model import DdsInterface
-from fogros2.testing import viewer as viewers
 from fogros2.waiting import wait_until
+from rigs import viewer as viewers
 
 ROOT = Path(__file__).parents[2]
 CACHE = ROOT / '.cache/node'

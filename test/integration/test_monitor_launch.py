@@ -22,9 +22,9 @@ pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 from fogros2.model import Command
 from fogros2.process import run
 from fogros2.store import Store
-from fogros2.testing import viewer as viewers
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs import viewer as viewers
+from rigs.launched import launching, ros2
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]

@@ -13,8 +13,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.colcon_workspace import colcon_workspace
-from fogros2.testing.launched import launching
+from rigs.colcon_workspace import colcon_workspace
+from rigs.launched import launching
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left', 'engine'),

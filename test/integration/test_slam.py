@@ -29,11 +29,11 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_msgs.msg import Header, String  # noqa: E402
 
-from fogros2.testing.launched import launching  # noqa: E402
 from fogros2.waiting import wait_until  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
 from fogros2_examples.slam.camera import SlamCamera  # noqa: E402
 from fogros2_examples.slam.node import KEPT, TFMessage  # noqa: E402
+from rigs.launched import launching  # noqa: E402
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

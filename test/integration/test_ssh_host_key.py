@@ -12,8 +12,8 @@ from fogros2.errors import CommandError, ConnectError, HostKeyError
 from fogros2.model import Command
 from fogros2.shell import host_key
 from fogros2.shell.ssh import SSHShell
-from fogros2.testing.sshd import private_sshd
 from fogros2.waiting import wait_until
+from rigs.sshd import private_sshd
 
 
 def shown(server, key):

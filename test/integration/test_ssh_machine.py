@@ -15,10 +15,10 @@ import uuid
 import pytest
 
 from fogros2.provider import container_root
-from fogros2.testing.bare_computer import bare_computer
-from fogros2.testing.colcon_workspace import colcon_workspace
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.bare_computer import bare_computer
+from rigs.colcon_workspace import colcon_workspace
+from rigs.launched import launching, ros2
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

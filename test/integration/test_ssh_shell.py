@@ -31,8 +31,8 @@ from fogros2.model import Command, Endpoint
 from fogros2.shell import connect
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ShellContract
-from fogros2.testing.sshd import free_port, private_sshd, PrivateSshd
 from fogros2.waiting import wait_until
+from rigs.sshd import free_port, private_sshd, PrivateSshd
 
 pytestmark = pytest.mark.skipif(
     process.which('sshd') is None, reason='needs sshd (openssh-server)')

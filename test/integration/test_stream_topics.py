@@ -15,8 +15,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.launched import launching, ros2
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 

@@ -24,8 +24,8 @@ from fogros2.errors import (
 from fogros2.model import Command
 from fogros2.shell import relay, sync
 from fogros2.shell.ssh import SSHShell
-from fogros2.testing.sshd import private_sshd, PrivateSshd
 from fogros2.waiting import wait_until
+from rigs.sshd import private_sshd, PrivateSshd
 
 pytestmark = [
     pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)'),

@@ -10,8 +10,8 @@ import uuid
 
 import pytest
 
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.launched import launching, ros2
 
 pytest.importorskip('ros2cli.daemon', reason='the embedded default has no daemon')
 pytestmark = pytest.mark.usefixtures('nothing_left', 'engine')

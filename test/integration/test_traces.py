@@ -16,8 +16,8 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
-from fogros2.testing.traces import nothing_left, RUN, Traces
 from fogros2.waiting import wait_until
+from rigs.traces import nothing_left, RUN, Traces
 
 #: A program that waits to be killed, whatever its file is called.
 WAITS = 'import sys; sys.stdin.read()'

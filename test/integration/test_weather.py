@@ -24,9 +24,9 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.launched import Launched, launching
 from fogros2.testing.plugins import install
 from fogros2.waiting import wait_until
+from rigs.launched import Launched, launching
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

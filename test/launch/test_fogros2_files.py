@@ -16,7 +16,7 @@ import subprocess
 
 import pytest
 
-from fogros2.testing.launched import launching, ros2
+from rigs.launched import launching, ros2
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 

@@ -18,11 +18,11 @@ import pytest
 
 from fogros2 import process
 from fogros2.errors import PrerequisiteError
-from fogros2.testing.cluster import images, node, services
-from fogros2.testing.cluster.certificates import Authority, rsa_key
-from fogros2.testing.cluster.images import Image
-from fogros2.testing.cluster.node_process import ClusterError, run_node
-from fogros2.testing.cluster.pod_security import verdict
+from rigs.cluster import images, node, services
+from rigs.cluster.certificates import Authority, rsa_key
+from rigs.cluster.images import Image
+from rigs.cluster.node_process import ClusterError, run_node
+from rigs.cluster.pod_security import verdict
 
 LAYOUT = services.Layout('198.51.100.254', '198.51.100.253', 30)
 

@@ -19,7 +19,7 @@ from fogros2.dependencies import PipFolder
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import HostFacts
 from fogros2.model import Command, MachineSpec, Result
-from fogros2.testing.rosdep import rosdep_source
+from rigs.rosdep import rosdep_source
 
 RUNS_PIP = pytest.mark.skipif(
     importlib.util.find_spec('pip') is None, reason='needs pip in this environment')

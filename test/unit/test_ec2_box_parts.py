@@ -15,8 +15,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.ec2 import cloud_config, market, network
-from fogros2.testing.ec2.cloud_config import parse, Plan, UserDataError
+from rigs.ec2 import cloud_config, market, network
+from rigs.ec2.cloud_config import parse, Plan, UserDataError
 
 
 def test_a_cloud_config_is_understood():

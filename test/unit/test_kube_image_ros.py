@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 
-from fogros2.testing.cluster import ros
+from rigs.cluster import ros
 
 
 def test_the_ros_2_of_an_environment_is_the_prefix_with_the_middleware(tmp_path):

@@ -14,9 +14,9 @@ import uuid
 
 import pytest
 
-from fogros2.testing.ec2 import Ec2Box
-from fogros2.testing.launched import Launched, launching, ros2
 from fogros2.waiting import wait_until
+from rigs.ec2 import Ec2Box
+from rigs.launched import Launched, launching, ros2
 
 HERE = Path(__file__).parent
 BOX = 'test_ec2_box.py'

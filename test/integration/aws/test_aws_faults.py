@@ -11,8 +11,8 @@ import uuid
 
 import pytest
 
-from fogros2.testing.colcon_workspace import colcon_workspace
 from fogros2.waiting import wait_until
+from rigs.colcon_workspace import colcon_workspace
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -16,7 +16,7 @@ import sys
 
 import pytest
 
-from fogros2.testing.launched import launching, ros2
+from rigs.launched import launching, ros2
 
 PAGE = Path(__file__).resolve().parents[3] / 'doc' / 'tutorial.md'
 FILE = 'first.launch.py'

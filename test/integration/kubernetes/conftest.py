@@ -10,8 +10,8 @@ import subprocess
 
 import pytest
 
-from fogros2.testing.cluster import Client, Cluster, cluster, running_cluster
-from fogros2.testing.cluster.namespaces import making_namespaces, Namespace
+from rigs.cluster import Client, Cluster, cluster, running_cluster
+from rigs.cluster.namespaces import making_namespaces, Namespace
 
 ROOT = Path(__file__).resolve().parents[3]
 ROLE = ROOT / 'deploy' / 'kubernetes' / 'role.yaml'

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from fogros2.testing.cluster import READY
+from rigs.cluster import READY
 
 PROGRAM = Path(__file__).resolve().parents[3] / 'tools' / 'cloud_check.py'
 

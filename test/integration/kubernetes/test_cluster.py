@@ -16,15 +16,15 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
-from fogros2.testing.cluster import BARE, node, services
-from fogros2.testing.cluster.cluster import free_network
-from fogros2.testing.cluster.node_process import run_node
 from fogros2.waiting import wait_until
+from rigs.cluster import BARE, node, services
+from rigs.cluster.cluster import free_network
+from rigs.cluster.node_process import run_node
 
 RUN = """
 import signal, sys
 from pathlib import Path
-from fogros2.testing.cluster import cluster
+from rigs.cluster import cluster
 binaries, store = map(Path, sys.argv[1:])
 with cluster(binaries.parent, binaries, store=store) as running:
     print(running.folder, flush=True)

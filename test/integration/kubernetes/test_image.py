@@ -20,10 +20,10 @@ from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.testing import request_for
-from fogros2.testing.cluster import services
-from fogros2.testing.cluster.images import static_busybox
-from fogros2.testing.launched import ros2
 from fogros2.waiting import wait_until
+from rigs.cluster import services
+from rigs.cluster.images import static_busybox
+from rigs.launched import ros2
 
 pytestmark = [
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),

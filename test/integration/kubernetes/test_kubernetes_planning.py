@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from fogros2.testing.launched import launching
+from rigs.launched import launching
 
 pytest.importorskip('ompl', reason='ompl is in the extra applications')
 pytest.importorskip('fcl', reason='python-fcl is in the extra applications')

@@ -15,9 +15,9 @@ import uuid
 
 import pytest
 
-from fogros2.testing.cluster import APPLICATION, DEFAULT, READY
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.cluster import APPLICATION, DEFAULT, READY
+from rigs.launched import launching, ros2
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 

@@ -13,8 +13,8 @@ import pytest
 from fogros2.deploy import Launch
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
-from fogros2.testing.cluster import BARE
-from fogros2.testing.cluster.pod_security import LABEL, NO_CAPABILITIES, pod_security
+from rigs.cluster import BARE
+from rigs.cluster.pod_security import LABEL, NO_CAPABILITIES, pod_security
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),

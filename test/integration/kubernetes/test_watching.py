@@ -13,9 +13,9 @@ import pytest
 
 from fogros2 import kubernetes_api
 from fogros2.provider.kubernetes import exposure
-from fogros2.testing.cluster import READY
-from fogros2.testing.launched import launching, ros2
 from fogros2.waiting import wait_until
+from rigs.cluster import READY
+from rigs.launched import launching, ros2
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 pytestmark = [

@@ -14,8 +14,8 @@ from typing import Any
 
 from moto.ec2 import models
 
-from fogros2.testing.ec2.cloud import Cloud, MOTO
-from fogros2.testing.ec2.market import ENABLED, PublicImage
+from rigs.ec2.cloud import Cloud, MOTO
+from rigs.ec2.market import ENABLED, PublicImage
 
 #: Moto's account.
 ACCOUNT = '123456789012'

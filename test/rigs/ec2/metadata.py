@@ -17,8 +17,8 @@ import threading
 import time
 from typing import Optional
 
-from fogros2.testing.ec2 import netns
-from fogros2.testing.ec2.network import METADATA
+from rigs.ec2 import netns
+from rigs.ec2.network import METADATA
 
 _TOKENS_PATH = '/latest/api/token'
 _LONGEST = 21600

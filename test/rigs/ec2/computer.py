@@ -24,7 +24,7 @@ from fogros2.errors import CommandError, FogError
 from fogros2.model import Command
 from fogros2.provider import container_engine, container_root
 from fogros2.provider.container_engine import Engine
-from fogros2.testing.ec2 import guest
+from rigs.ec2 import guest
 
 #: Roots of all boxes; the file systems of /tmp and /run may not take an overlay's layer.
 DISKS = Path('/var/lib/fogros2-ec2')

@@ -21,8 +21,8 @@ import time
 from typing import Any
 
 from fogros2.errors import FogError
-from fogros2.testing.ec2 import computer, netns, network
-from fogros2.testing.ec2.network import Network, ROUTER
+from rigs.ec2 import computer, netns, network
+from rigs.ec2.network import Network, ROUTER
 
 PORT = 5000
 #: Where the robot's network namespace finds names.
@@ -101,9 +101,9 @@ class Box:
         from moto.moto_server.werkzeug_app import create_backend_app, DomainDispatcherApplication
         from werkzeug.serving import make_server, WSGIRequestHandler
 
-        from fogros2.testing.ec2 import hooks
-        from fogros2.testing.ec2.api import Api
-        from fogros2.testing.ec2.cloud import Cloud
+        from rigs.ec2 import hooks
+        from rigs.ec2.api import Api
+        from rigs.ec2.cloud import Cloud
 
         class Quiet(WSGIRequestHandler):
             protocol_version = 'HTTP/1.1'
@@ -135,9 +135,9 @@ class Box:
             server.shutdown()
 
     def _do(self, order: Mapping[str, Any]) -> Any:
-        from fogros2.testing.ec2 import hooks
-        from fogros2.testing.ec2.api import Fault
-        from fogros2.testing.ec2.market import PublicImage
+        from rigs.ec2 import hooks
+        from rigs.ec2.api import Fault
+        from rigs.ec2.market import PublicImage
         what = order['do']
         if what == 'fault':
             self.api.faults.append(Fault(**order['fault']))

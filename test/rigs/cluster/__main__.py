@@ -2,7 +2,7 @@
 """
 Run a cluster until Ctrl-C, to try things by hand, or so that runs of the tests share it.
 
-    python -m fogros2.testing.cluster "$(tools/kubernetes.sh)"
+    .venv/bin/python -m rigs.cluster "$(tools/kubernetes.sh)"
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import signal
 import sys
 
-from fogros2.testing.cluster import cluster
+from rigs.cluster import cluster
 
 
 def main() -> None:

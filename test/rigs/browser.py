@@ -5,7 +5,7 @@ A headless Chromium, driven by a test over the DevTools protocol.
 https://chromedevtools.github.io/devtools-protocol/; needs ``websocket-client``. By hand it takes a
 picture of a page::
 
-    python -m fogros2.testing.browser URL FILE.png --until EXPRESSION
+    .venv/bin/python -m rigs.browser URL FILE.png --until EXPRESSION
 """
 
 from __future__ import annotations

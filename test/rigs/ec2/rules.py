@@ -15,9 +15,9 @@ import hashlib
 import threading
 from typing import Any, Optional
 
-from fogros2.testing.ec2 import cloud_config, hooks, market
-from fogros2.testing.ec2.answers import Answer, Refusal
-from fogros2.testing.ec2.cloud import Cloud
+from rigs.ec2 import cloud_config, hooks, market
+from rigs.ec2.answers import Answer, Refusal
+from rigs.ec2.cloud import Cloud
 
 #: Parameters of a request that a client token doesn't cover.
 _ASIDE = ('Version', 'Action', 'DryRun')

@@ -7,10 +7,10 @@ pods run; ``cluster`` runs it. All its processes, mounts, bridges and firewall r
 namespaces of their own and end with them, see ``node``; ``services`` says what it consists of.
 """
 
-from fogros2.testing.cluster.client import Client, Refused
-from fogros2.testing.cluster.cluster import Cluster, cluster, running_cluster
-from fogros2.testing.cluster.images import APPLICATION, BARE, DEFAULT, READY
-from fogros2.testing.cluster.node_process import ClusterError
+from rigs.cluster.client import Client, Refused
+from rigs.cluster.cluster import Cluster, cluster, running_cluster
+from rigs.cluster.images import APPLICATION, BARE, DEFAULT, READY
+from rigs.cluster.node_process import ClusterError
 
 __all__ = ['APPLICATION', 'BARE', 'Client', 'Cluster', 'ClusterError', 'DEFAULT', 'READY',
            'Refused', 'cluster', 'running_cluster']

@@ -18,7 +18,7 @@ from typing import Any, Optional
 from fogros2 import process
 from fogros2.errors import FogError
 from fogros2.model import Command
-from fogros2.testing.cluster import node
+from rigs.cluster import node
 
 
 class ClusterError(FogError):

@@ -21,8 +21,8 @@ import tempfile
 import threading
 from typing import Any
 
-from fogros2.testing.cluster.certificates import Authority
-from fogros2.testing.cluster.client import Client
+from rigs.cluster.certificates import Authority
+from rigs.cluster.client import Client
 
 #: What baseline lets a container add (Kubernetes: Pod Security Standards).
 ALLOWED = {'AUDIT_WRITE', 'CHOWN', 'DAC_OVERRIDE', 'FOWNER', 'FSETID', 'KILL', 'MKNOD',

@@ -22,7 +22,7 @@ from typing import Optional
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.ec2 import netns
+from rigs.ec2 import netns
 
 #: Of TEST-NET-2 (RFC 5737): nobody's.
 ROUTER = '198.51.100.1'

@@ -16,10 +16,10 @@ from typing import Any, Optional
 
 from fogros2 import process
 from fogros2.model import Command, Result
-from fogros2.testing.cluster import certificates, images, node, services
-from fogros2.testing.cluster.client import Client
-from fogros2.testing.cluster.node_process import ask, ClusterError, run_node
-from fogros2.testing.cluster.pod_security import make_policies
+from rigs.cluster import certificates, images, node, services
+from rigs.cluster.client import Client
+from rigs.cluster.node_process import ask, ClusterError, run_node
+from rigs.cluster.pod_security import make_policies
 
 #: Users besides the administrator; none has a right until somebody gives it one.
 USERS = ('robot', 'limited')
@@ -154,7 +154,7 @@ def cluster(
 
 
 def running_cluster(folder: Path) -> Cluster:
-    """Return the cluster that another process runs, see ``python -m fogros2.testing.cluster``."""
+    """Return the cluster that another process runs, see ``python -m rigs.cluster``."""
     own = json.loads((folder / _OWN).read_text())
     return Cluster(folder, services.Layout(**own['layout']), Path(own['images']))
 

@@ -18,8 +18,8 @@ from typing import Any, Optional
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.provider import container_root
-from fogros2.testing.ec2.network import ROBOT, ROBOT_ELSEWHERE, ROUTER
 from fogros2.waiting import wait_until
+from rigs.ec2.network import ROBOT, ROBOT_ELSEWHERE, ROUTER
 
 #: Regions whose API hosts the robot can connect to unless said otherwise.
 REGIONS = ('us-east-1', 'eu-central-1', 'us-west-1')
@@ -110,7 +110,7 @@ class Ec2Box:
         """Open the box; a second or two."""
         self._folder = tempfile.TemporaryDirectory(prefix='fogt-ec2-')
         words = process.argv(Command(
-            (sys.executable, '-m', 'fogros2.testing.ec2.server'), sudo=True))
+            (sys.executable, '-m', 'rigs.ec2.server'), sudo=True))
         with open(self.log, 'w') as log:
             # a group, no session: sudo's ticket is the terminal's, and Ctrl-C there the test's
             self._child = subprocess.Popen(

@@ -7,6 +7,6 @@ EC2 in a box, for tests of what uses EC2: see :class:`Ec2Box`.
 ``cloud_config``, ``metadata``) and the network (``network``, ``netns``).
 """
 
-from fogros2.testing.ec2.box import Call, Ec2Box, Instance
+from rigs.ec2.box import Call, Ec2Box, Instance
 
 __all__ = ['Call', 'Ec2Box', 'Instance']

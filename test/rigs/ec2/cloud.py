@@ -16,9 +16,9 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError
-from fogros2.testing.ec2 import computer, guest, metadata, network, told
-from fogros2.testing.ec2.computer import Boot, Computer
 from fogros2.waiting import wait_until
+from rigs.ec2 import computer, guest, metadata, network, told
+from rigs.ec2.computer import Boot, Computer
 
 #: Seconds after which an instance that was asked to go down is cut off.
 _PATIENCE = 2.0

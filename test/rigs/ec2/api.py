@@ -18,9 +18,9 @@ import threading
 from typing import Any, Optional
 from urllib.parse import parse_qsl
 
-from fogros2.testing.ec2 import answers, hooks, market, rules
-from fogros2.testing.ec2.answers import Answer, Refusal
-from fogros2.testing.ec2.cloud import Cloud
+from rigs.ec2 import answers, hooks, market, rules
+from rigs.ec2.answers import Answer, Refusal
+from rigs.ec2.cloud import Cloud
 
 _SCOPE = re.compile(r'Credential=([^/]+)/\d+/([^/]+)/([^/]+)/aws4_request')
 #: Actions after which the router's rules may have to be others.

@@ -12,10 +12,10 @@ from typing import Any, Optional
 
 import yaml
 
-from fogros2.testing.cluster.client import Client
-from fogros2.testing.cluster.cluster import Cluster
-from fogros2.testing.cluster.pod_security import ALL
 from fogros2.waiting import wait_until
+from rigs.cluster.client import Client
+from rigs.cluster.cluster import Cluster
+from rigs.cluster.pod_security import ALL
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,8 +30,8 @@ from fogros2 import bootstrap, plan, process, wheels
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command, MachineSpec, Result, SyncReport
 from fogros2.provider.kubernetes.options import IMAGE
-from fogros2.testing.cluster import ros, services
-from fogros2.testing.cluster.node_process import run_node
+from rigs.cluster import ros, services
+from rigs.cluster.node_process import run_node
 
 BARE = 'fogros2.test/machine:bare'
 READY = 'fogros2.test/machine:ready'

@@ -9,8 +9,8 @@ import dataclasses
 import json
 from typing import Any
 
-from fogros2.testing.ec2 import cloud_config, network
-from fogros2.testing.ec2.computer import USER
+from rigs.ec2 import cloud_config, network
+from rigs.ec2.computer import USER
 
 
 def plan(instance: Any) -> dict[str, Any]:
