@@ -93,7 +93,7 @@ setup(
         ],
         'fogros2.configured': [
             'aws = fogros2.provider.aws.clients:configured',
-            'kubernetes = fogros2.kubernetes_api:configured',
+            'kubernetes = fogros2.kubernetes_client:configured',
         ],
         'fogros2.shell': [
             'kubernetes = fogros2.shell.kubernetes:KubernetesShell',

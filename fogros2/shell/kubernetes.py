@@ -21,7 +21,7 @@ from fogros2.errors import (
     DeadlineExceeded,
     FogError,
 )
-from fogros2.kubernetes_cancel import cancellable
+from fogros2.kubernetes_client.cancellation import cancellable
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
 from fogros2.shell.kubernetes_channel import Channel
@@ -247,8 +247,8 @@ class KubernetesShell:
 
 def _load() -> None:
     with contextlib.suppress(FogError, ImportError):
-        from fogros2 import kubernetes_api
-        kubernetes_api.connect()
+        from fogros2 import kubernetes_client
+        kubernetes_client.connect()
         import websocket  # noqa: F401
 
 

@@ -21,9 +21,9 @@ import threading
 import time
 from typing import Optional, TYPE_CHECKING
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
-from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_mux as mux
 from fogros2.shell.kubernetes_channel import Channel
@@ -152,10 +152,10 @@ class Link:
         source = _source()
         words = ['python3', '-ISc', _LOADER.format(size=len(source)), self._session,
                  'resume' if resume else 'new']
-        api = kubernetes_api.connect(self._context)
+        api = kubernetes_client.connect(self._context)
         try:
             link = api.websocket(
-                kubernetes_api.path('pods', self._namespace, self._pod, 'exec'),
+                kubernetes_client.path('pods', self._namespace, self._pod, 'exec'),
                 {'container': 'machine', 'command': words, 'stdin': 'true', 'stdout': 'true',
                  'stderr': 'true', 'tty': 'false'}, timeout=timeout)
         except ApiError as error:
@@ -244,7 +244,7 @@ class Link:
             with self._lock:
                 self._drop()
             if not self._closed:
-                kubernetes_api.connect(self._context).lost()
+                kubernetes_client.connect(self._context).lost()
             if self._closed or not self._resume():
                 return
 

@@ -19,11 +19,10 @@ LAYERS = [
     {'model'},
     {'errors', 'clock'},
     {'waiting', 'report', 'process', 'plugin_system'},
+    {'kubernetes_client'},
     {'store', 'journal', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
-     'agent_client', 'agent', 'cloud_launch', 'kubernetes_answers', 'kubernetes_api',
-     'kubernetes_cancel', 'kubernetes_config', 'kubernetes_watch', 'workspace', 'wheels',
-     'locked', 'modules', 'dependencies', 'bootstrap', 'container_scripts', 'containers',
-     'ros2_daemon'},
+     'agent_client', 'agent', 'cloud_launch', 'workspace', 'wheels', 'locked', 'modules',
+     'dependencies', 'bootstrap', 'container_scripts', 'containers', 'ros2_daemon'},
     {'deploy', 'monitor', 'testing'},
     {'actions'},
 ]
@@ -32,7 +31,7 @@ SEAMS = ('provider', 'shell', 'vpn', 'dds', 'image_transport')
 ROS_ALLOWED = ('actions', 'cloud_launch', 'monitor')
 ROS = ('launch', 'launch_ros', 'rclpy', 'ros2cli', 'ament_index_python')
 #: SDKs belong to one plugin each.
-SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_config',
+SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_client',
         'paramiko': 'shell', 'av': 'image_transport', 'foxglove': 'monitor'}
 
 

@@ -18,9 +18,9 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 import yaml
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
-from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.testing.shell_contract import raised
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
@@ -103,7 +103,7 @@ def server():
 def api(server, tmp_path, monkeypatch):
     path = kubeconfig(tmp_path / 'config', f'http://127.0.0.1:{server.server_port}')
     monkeypatch.setenv('KUBECONFIG', str(path))
-    return kubernetes_api.connect()
+    return kubernetes_client.connect()
 
 
 def refusal(status: int, reason: str, message: str) -> Answer:
@@ -137,14 +137,14 @@ def test_the_context_says_where_and_as_whom(api, server):
 
 
 def test_one_context_by_two_names_is_one(api):
-    assert kubernetes_api.connect('first') is api
-    other = kubernetes_api.connect('second')
+    assert kubernetes_client.connect('first') is api
+    other = kubernetes_client.connect('second')
     assert other is not api
     assert other.namespace == 'default'
 
 
 def test_a_context_that_is_not_there_is_named(api):
-    error = raised(PrerequisiteError, lambda: kubernetes_api.connect('third'))
+    error = raised(PrerequisiteError, lambda: kubernetes_client.connect('third'))
     assert "'third'" in str(error)
     assert 'first, second' in error.hint
 
@@ -152,19 +152,19 @@ def test_a_context_that_is_not_there_is_named(api):
 def test_a_kubeconfig_that_is_none_is_told(tmp_path, monkeypatch):
     path = tmp_path / 'config'
     monkeypatch.setenv('KUBECONFIG', str(path))
-    assert not kubernetes_api.configured()
-    error = raised(PrerequisiteError, kubernetes_api.connect)
+    assert not kubernetes_client.configured()
+    error = raised(PrerequisiteError, kubernetes_client.connect)
     assert 'kubeconfig' in str(error)
     for text in ('', 'no: [yaml', '[]', 'contexts: 3'):
         path.write_text(text)
-        assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_api.connect))
+        assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_client.connect))
 
 
 def test_credentials_that_a_plugin_does_not_give_are_told(tmp_path, monkeypatch):
     monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9', **{
         'exec': {'apiVersion': 'client.authentication.k8s.io/v1', 'interactiveMode': 'Never',
                  'command': '/no/such/plugin', 'args': []}})))
-    error = raised(PrerequisiteError, kubernetes_api.connect)
+    error = raised(PrerequisiteError, kubernetes_client.connect)
     assert '/no/such/plugin' in str(error)
 
 
@@ -185,7 +185,7 @@ def test_an_overloaded_server_is_asked_again(api, server):
 
 def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9')))
-    api = kubernetes_api.connect()
+    api = kubernetes_client.connect()
     begin = time.monotonic()
     error = raised(Unreachable, lambda: api.request('GET', '/x', patience=0.5))
     assert 0.4 < time.monotonic() - begin < 10.0
@@ -303,7 +303,7 @@ def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):
 def test_the_provider_is_there_without_the_client():
     """``ros2 fog list`` names it, and must not take the time that the client takes to load."""
     code = ('import sys; import fogros2.provider.kubernetes, fogros2.shell.kubernetes, '
-            'fogros2.kubernetes_api; '
+            'fogros2.kubernetes_client; '
             'print([m for m in ("kubernetes", "urllib3", "websocket") if m in sys.modules])')
     told = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           check=True, env={**os.environ, 'KUBECONFIG': '/nowhere'})

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 import yaml
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
-from fogros2.kubernetes_api import ApiError
+from fogros2.kubernetes_client import ApiError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.kubernetes import (
@@ -281,7 +281,7 @@ def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
             return {'metadata': {'name': 'it', 'uid': 'its-uid'}}
 
     cluster = Cluster()
-    monkeypatch.setattr(kubernetes_api, 'connect', lambda context='': cluster)
+    monkeypatch.setattr(kubernetes_client, 'connect', lambda context='': cluster)
     provider = KubernetesProvider()
 
     def create(name, **options):

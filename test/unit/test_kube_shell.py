@@ -15,9 +15,9 @@ import time
 
 import pytest
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, ConnectError, ShellError
-from fogros2.kubernetes_api import ApiError, Unreachable
+from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_link
 from fogros2.shell.kubernetes import KubernetesShell
@@ -80,11 +80,11 @@ class Pipe:
         self.child.wait()
 
 
-class FakeApi(kubernetes_api.Api):
+class FakeApi(kubernetes_client.Api):
     """An API server that runs what it is told here, or refuses."""
 
     def __init__(self) -> None:
-        self._lost = -kubernetes_api.DOUBT
+        self._lost = -kubernetes_client.DOUBT
         self.links: list[Pipe] = []
         self.sessions: set[str] = set()
         self.refusals: list[Exception] = []
@@ -105,7 +105,7 @@ class FakeApi(kubernetes_api.Api):
 @pytest.fixture
 def api(monkeypatch):
     fake = FakeApi()
-    monkeypatch.setattr(kubernetes_api, 'connect', lambda context='': fake)
+    monkeypatch.setattr(kubernetes_client, 'connect', lambda context='': fake)
     yield fake
     for link in fake.links:
         link.close()

@@ -213,7 +213,7 @@ def test_a_pod_s_service_keeps_the_callers_addresses():
 
 
 def test_a_service_that_can_not_be_removed_says_how():
-    from fogros2.kubernetes_api import ApiError
+    from fogros2.kubernetes_client import ApiError
 
     class Api:
         def request(self, *_, **__):

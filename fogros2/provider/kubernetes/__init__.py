@@ -9,7 +9,7 @@ import threading
 import time
 from typing import Any, ClassVar, Optional
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import (
     ConfigurationError,
     MachineNotFound,
@@ -17,7 +17,7 @@ from fogros2.errors import (
     PrerequisiteError,
     ProviderError,
 )
-from fogros2.kubernetes_api import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, items, path, selector
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
@@ -63,11 +63,11 @@ class KubernetesProvider(Provider):
     @classmethod
     def configured(cls) -> bool:
         """Return whether there is a kubeconfig, or this is a pod that may use the API."""
-        return kubernetes_api.configured()
+        return kubernetes_client.configured()
 
     def answers(self) -> str:
         """Return the API server's version and the namespace that is used."""
-        api = kubernetes_api.connect()
+        api = kubernetes_client.connect()
         version = api.request('GET', '/version', patience=_FIRST)
         return f"{api.server} answers, {version.get('gitVersion')}, namespace '{api.namespace}'"
 
@@ -170,7 +170,7 @@ class KubernetesProvider(Provider):
     ) -> Machine:
         """Watch the pod until it runs, then find the way that UDP takes to it."""
         where = MachineId.parse(machine_id)
-        api = kubernetes_api.connect(where.context)
+        api = kubernetes_client.connect(where.context)
         begin = time.monotonic()
         job = self._made.get(machine_id) or self._job(api, where)
         pod = Start(api, where, job, name=name).wait(timeout=timeout, cancel=cancel)
@@ -202,7 +202,7 @@ class KubernetesProvider(Provider):
     def describe(self, machine_id: str) -> Machine:
         """Return what the cluster knows of a machine now."""
         where = MachineId.parse(machine_id)
-        api = kubernetes_api.connect(where.context)
+        api = kubernetes_client.connect(where.context)
         job = self._job(api, where)
         pod = pods.pod_of(job, self._pods_of(api, where))
         known = self._pods.get(machine_id)
@@ -215,9 +215,9 @@ class KubernetesProvider(Provider):
         contexts = {'', *(context for context, _ in self._places)}
         seen: set[str] = set()
         for context in sorted(contexts):
-            if context == '' and not kubernetes_api.configured():
+            if context == '' and not kubernetes_client.configured():
                 continue
-            api = kubernetes_api.connect(context)
+            api = kubernetes_client.connect(context)
             labels = selector(names.wanted(tags))
             for namespace, jobs in self._jobs(api, labels):
                 wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
@@ -249,7 +249,7 @@ class KubernetesProvider(Provider):
     def destroy(self, machine_id: str) -> None:
         """Delete the Job; returns when it, its pod and its Service are gone."""
         where = MachineId.parse(machine_id)
-        api = kubernetes_api.connect(where.context)
+        api = kubernetes_client.connect(where.context)
         for known in (self._made, self._services, self._pods):
             known.pop(machine_id, None)
         with _translated(f"deleting '{where.job}'", where.namespace):
@@ -261,7 +261,7 @@ class KubernetesProvider(Provider):
         """Make a Service for a TCP port, or remove it; loads what it takes when asked alone."""
         from fogros2.provider.kubernetes import publishing
         where = MachineId.parse(machine.id)
-        api = kubernetes_api.connect(where.context)
+        api = kubernetes_client.connect(where.context)
         if not sources:
             publishing.close(api, where, port)
             return machine.vpn_host, port
@@ -273,7 +273,7 @@ class KubernetesProvider(Provider):
     # -- what all of them need ------------------------------------------------------------------
 
     def _place(self, options: Options) -> tuple[Api, str]:
-        api = kubernetes_api.connect(options.context)
+        api = kubernetes_client.connect(options.context)
         namespace = options.namespace or api.namespace
         with self._lock:
             self._places.add((options.context, namespace))

@@ -8,9 +8,9 @@ import contextlib
 import time
 from typing import Any, Optional
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import ProviderError
-from fogros2.kubernetes_api import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, items, path, selector
 from fogros2.provider.kubernetes import boot, names, pods
 from fogros2.provider.kubernetes.names import MachineId
 
@@ -33,7 +33,7 @@ def end(api: Api, where: MachineId) -> None:
     try:
         answer = api.request('DELETE', target, {
             'kind': 'DeleteOptions', 'apiVersion': 'v1', 'propagationPolicy': 'Foreground',
-            'preconditions': {'uid': where.uid}}, doubt=kubernetes_api.DOUBT)
+            'preconditions': {'uid': where.uid}}, doubt=kubernetes_client.DOUBT)
     except ApiError as error:
         # gone, or gone and another of the name in its place
         if error.status in (404, 409):

@@ -21,7 +21,7 @@ import time
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
-from fogros2.kubernetes_cancel import cancelled
+from fogros2.kubernetes_client.cancellation import cancelled
 
 #: Seconds between two questions.
 INTERVAL = 0.1

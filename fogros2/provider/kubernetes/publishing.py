@@ -14,7 +14,7 @@ import threading
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, ProviderError
-from fogros2.kubernetes_api import Api, ApiError, path
+from fogros2.kubernetes_client import Api, ApiError, path
 from fogros2.model import Machine
 from fogros2.provider.kubernetes import exposure, hints, names, ways
 from fogros2.provider.kubernetes.names import MachineId

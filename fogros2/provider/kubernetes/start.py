@@ -9,7 +9,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, ProviderError
-from fogros2.kubernetes_api import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, items, path, selector
 from fogros2.model import MachineState
 from fogros2.provider.kubernetes import hints, names, pods
 from fogros2.provider.kubernetes.names import MachineId

@@ -10,7 +10,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError
-from fogros2.kubernetes_api import Api, ApiError, path, Unreachable
+from fogros2.kubernetes_client import Api, ApiError, path, Unreachable
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.kubernetes import exposure, hints, manifests, names
 from fogros2.provider.kubernetes.exposure import Exposure

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.errors import NameTaken, ProviderError, ShellError
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.kubernetes import KubernetesProvider
@@ -94,7 +94,7 @@ def test_a_pod_has_no_token_of_the_cluster_s(pod):
 
 def test_a_launch_asks_the_cluster_seldom(place):
     """Everything a provider and a shell ask for a machine: the figure that is promised."""
-    api = kubernetes_api.connect()
+    api = kubernetes_client.connect()
     before = api.calls
     provider, machine_id, machine = run('counted')
     try:

@@ -11,7 +11,7 @@ import ssl
 
 import pytest
 
-from fogros2 import kubernetes_api
+from fogros2 import kubernetes_client
 from fogros2.provider.kubernetes import exposure
 from fogros2.waiting import wait_until
 from rigs.cluster import READY
@@ -50,7 +50,7 @@ def test_who_is_allowed_gets_in_by_the_node_s_port(
     if reason := kubernetes.why_not_ready:
         pytest.skip(reason)
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    own = exposure.own_address(kubernetes_api.connect('').server)
+    own = exposure.own_address(kubernetes_client.connect('').server)
     file = tmp_path / 'watched.launch.py'
     file.write_text(LAUNCH_FILE.format(
         image=READY, allow=[own if allowed else '198.51.100.77']))

@@ -10,7 +10,7 @@ import socket
 import threading
 from typing import Any, Optional, Protocol
 
-from fogros2.kubernetes_answers import ApiError, http_errors, parsed, refusal, Unreachable
+from fogros2.kubernetes_client.answers import ApiError, http_errors, parsed, refusal, Unreachable
 
 #: Seconds of silence after which a watch is begun anew: its connection may be gone.
 SILENCE = 240.0

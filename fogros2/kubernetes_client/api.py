@@ -18,28 +18,22 @@ import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode
 
-from fogros2 import kubernetes_config
 from fogros2.errors import DeadlineExceeded, ProviderError
-from fogros2.kubernetes_answers import (
+from fogros2.kubernetes_client import configuration as kubeconfig
+from fogros2.kubernetes_client.answers import (
     ApiError,
     http_errors,
-    items,
     parsed,
-    path,
     refusal,
-    selector,
     Unreachable,
 )
-from fogros2.kubernetes_cancel import cancellable
-from fogros2.kubernetes_config import configured, words
-from fogros2.kubernetes_watch import Watch
+from fogros2.kubernetes_client.cancellation import cancellable
+from fogros2.kubernetes_client.configuration import words
+from fogros2.kubernetes_client.watch import Watch
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
     import websocket
-
-__all__ = [
-    'Api', 'ApiError', 'configured', 'connect', 'items', 'path', 'selector', 'Unreachable']
 
 T = TypeVar('T')
 #: Query parameters; a list repeats the name.
@@ -64,7 +58,7 @@ class Api:
     """
 
     def __init__(self, context: str = '') -> None:
-        self.context, self.namespace, self._client = kubernetes_config.load(context)
+        self.context, self.namespace, self._client = kubeconfig.load(context)
         #: Requests made so far, for the figures.
         self.calls = 0
         self._lost = -DOUBT

@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The client of a cluster's API server, for the shell and the provider of pods.
+
+``configuration`` reads the kubeconfig, ``answers`` parses answers and errors, ``cancellation``
+interrupts blocking calls, ``watch`` follows objects, ``api`` makes the requests.
+"""
+
+from fogros2.kubernetes_client.answers import ApiError, items, path, selector, Unreachable
+from fogros2.kubernetes_client.api import Api, connect, DOUBT
+from fogros2.kubernetes_client.configuration import configured
+
+__all__ = ['Api', 'ApiError', 'configured', 'connect', 'DOUBT', 'items', 'path', 'selector',
+           'Unreachable']
