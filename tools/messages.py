@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Writes what FogROS2's errors say, and what to do, into doc/troubleshooting.md.
+Write the table of all error messages into doc/troubleshooting.md.
 
     python tools/messages.py [--check]
 
-The texts are the sources' own: every place that makes an error of ``fogros2/errors.py``. What
-stands by hand in the document, the part on each kind of error among it, is left as it is.
+Messages and hints are read from the places that create an error of ``fogros2/errors.py``. The rest
+of the page is written by hand: the table of kinds has the causes, and the remedies of messages
+without a hint.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ import sys
 ROOT = Path(__file__).parents[1]
 DOCUMENT = ROOT / 'doc' / 'troubleshooting.md'
 PACKAGES = ('fogros2', 'ros2fog_cli')
-#: What users of a package never meet.
+#: Packages whose errors no user sees.
 LEFT_OUT = ('testing',)
 BEGIN = '<!-- messages: written by tools/messages.py -->'
 END = '<!-- end of messages -->'
-#: Stands for what is known when it happens.
+#: Replaces each value that is known only at run time.
 OPEN = '…'
 
 
@@ -34,9 +35,9 @@ class Message:
     One error that can be raised.
 
     :param kind: its class.
-    :param text: what it says; OPEN stands for what isn't in the source.
-    :param hint: what to do, '' where that is said of the kind.
-    :param place: file and line, for whoever looks after the sources.
+    :param text: the message, with OPEN in the place of each value.
+    :param hint: the remedy, '' where the error has none of its own.
+    :param place: file and line of the call.
     """
 
     kind: str
@@ -49,6 +50,13 @@ def kinds() -> list[str]:
     """Return the classes of the tree in fogros2/errors.py, in its order."""
     tree = ast.parse((ROOT / 'fogros2' / 'errors.py').read_text())
     return [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+
+
+def remedies(page: str) -> dict[str, tuple[str, str]]:
+    """Return cause and remedy of each kind of error, from the page's table of kinds."""
+    table = page.partition('\n| Kind |')[2].partition('\n\n')[0]
+    return {kind: (why, remedy) for kind, why, remedy in re.findall(
+        r'^\| `(\w+)` \| (.*?) \| (.*?) \|$', table, re.MULTILINE)}
 
 
 def messages() -> list[Message]:
@@ -75,7 +83,7 @@ def _in_file(path: Path, known: set[str]) -> Iterator[Message]:
 
 
 def _text(node: ast.expr) -> str:
-    """Return what an expression says, as far as the source tells."""
+    """Return the text of an expression, with OPEN for each part that is not constant."""
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):
@@ -89,19 +97,27 @@ def _text(node: ast.expr) -> str:
     return OPEN
 
 
-def render() -> str:
-    """Return the lines of the document that are written by this program."""
-    lines = []
-    every = messages()
-    for kind in kinds():
-        own = {(one.text, one.hint) for one in every if one.kind == kind
-               and re.search(r'\w{3}', one.text)}
-        if own:
-            lines += ['', f'**{kind}**', '']
-            for text, hint in sorted(own):
-                remedy = '' if hint in ('', OPEN) else f': {_plain(hint)}'
-                lines.append(f'- `{_code(text)}`{remedy}')
-    return '\n'.join([BEGIN, *lines, '', END])
+def render(page: str) -> str:
+    """Return the table of all messages; those without a hint have the remedy of their kind."""
+    rows = set()
+    kind = remedies(page)
+    for one in messages():
+        if re.search(r'\w{3}', one.text):
+            why, remedy = kind[one.kind]
+            if one.hint not in ('', OPEN):
+                remedy = _plain(one.hint)
+            rows.add(f'| `{_cell(_code(one.text))}` | {why} | {remedy} |')
+    return '\n'.join([BEGIN, '', '| Message | Why | Remedy |', '|---|---|---|',
+                      *sorted(rows, key=_letters), '', END])
+
+
+def _letters(row: str) -> tuple[str, str]:
+    """Return the key to sort by: a reader looks for the first word that the source has."""
+    return ''.join(re.findall(r'[a-z0-9 ]+', row.lower())).strip(), row
+
+
+def _cell(text: str) -> str:
+    return text.replace('|', r'\|')
 
 
 def _code(text: str) -> str:
@@ -109,15 +125,15 @@ def _code(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text that Markdown shows as it is."""
+    """Return a text with the special characters of Markdown escaped."""
     return re.sub(r'([\\*_<>\[\]|#])', r'\\\1', _code(text))
 
 
 def main() -> int:
-    """Write the document, or with --check only say whether it would change."""
+    """Write the page; with --check, only report whether it would change."""
     before = DOCUMENT.read_text()
     begin, end = before.index(BEGIN), before.index(END) + len(END)
-    after = before[:begin] + render() + before[end:]
+    after = before[:begin] + render(before) + before[end:]
     if '--check' not in sys.argv:
         DOCUMENT.write_text(after)
     elif after != before:
