@@ -68,8 +68,8 @@ class Variant:
 
     def commands(self, readme: str) -> list[str]:
         """Return the commands of a README for this system, in order."""
-        unwanted = set(FAST.values() if self.whole else FAST)
-        return [command for command in readme_commands(readme) if command not in unwanted]
+        commands = readme_commands(readme)
+        return commands if self.whole else [FAST.get(command, command) for command in commands]
 
 
 VARIANTS = {variant.name: variant for variant in (
@@ -80,7 +80,7 @@ VARIANTS = {variant.name: variant for variant in (
 
 
 def readme_commands(readme: str) -> list[str]:
-    """Return the commands of the first block that a README shows at a terminal, word for word."""
+    """Return the commands of the first ``console`` block of a README."""
     found = re.search(r'```console\n(.*?)```', readme, re.DOTALL)
     assert found, 'the README shows no command'
     return [line[2:].partition('#')[0].strip() for line in found[1].splitlines()
