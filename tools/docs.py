@@ -14,7 +14,7 @@ COLUMNS = '88'
 _PAGE = """\
 # Command line
 
-What `ros2 fog -h` and each verb's `-h` say.
+The output of `ros2 fog -h` and of `-h` of each verb.
 """
 
 
