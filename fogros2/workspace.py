@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 import os
 from pathlib import Path
+import re
 import shlex
 import threading
 from typing import Optional, Protocol, TypedDict
@@ -30,6 +31,9 @@ EXCLUDES = ('.git', '.hg', '.svn', '__pycache__', '*.pyc', '.venv', '.cache', '.
             '.pytest_cache', '.ruff_cache', '.vscode', '.idea')
 #: Folders that colcon makes at the top; the install space is named apart.
 BUILT = ('build', 'install', 'log')
+#: ``e_machine`` in the header of an ELF file, and what ``uname -m`` calls it.
+_ELF_MACHINES = {3: 'i686', 40: 'armv7l', 62: 'x86_64', 183: 'aarch64', 243: 'riscv64'}
+_LIBRARY = re.compile(r'\.so(\.[0-9.]+)?$')
 _SKIPPED = {'.git', '.hg', '.svn', '__pycache__', '.venv', 'node_modules'}
 
 
@@ -46,8 +50,9 @@ class Workspace:
     :param linked: folders outside of the workspace that links below ``src`` lead to, with packages
         in them; those that the install space reaches.
     :param linked_sources: all such folders.
-    :param compiled: one of the shared libraries or compiled programs in the install space, None
-        where all is Python.
+    :param compiled: processor architectures (as ``uname -m`` has them) of the shared libraries and
+        compiled programs in the install space, each with one of these files; empty where all is
+        Python.
     :param python: version in the install space's own paths (``python3.12``), '' where none.
     """
 
@@ -58,7 +63,7 @@ class Workspace:
     outside: tuple[Path, ...] = ()
     linked: tuple[Path, ...] = ()
     linked_sources: tuple[Path, ...] = ()
-    compiled: Optional[Path] = None
+    compiled: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     python: str = ''
 
     @property
@@ -70,7 +75,7 @@ class Workspace:
     def python_only(self) -> bool:
         """Whether nothing in it is compiled, as far as can be seen."""
         if self.installed:
-            return self.compiled is None
+            return not self.compiled
         return all(_build_type(path) == 'ament_python' for path in self.sources.values())
 
     def executable(self, package: str, name: str) -> Optional[Path]:
@@ -212,9 +217,7 @@ def plan(
             (*EXCLUDES, '/log', *(f'/{top}/***' for top in ('build', 'src'))), workspace.linked,
             (), setup)
     if not workspace.sources:
-        raise WorkspaceError(
-            f"{root} can't go to machine '{name}' as it is ({reason}), and has no src/ to build",
-            'keep the sources in the workspace, or use a machine like this one')
+        raise no_sources(workspace, name, reason)
     if not can_build:
         raise WorkspaceError(
             f"{root} would have to be built on machine '{name}' ({reason}), which has no colcon",
@@ -222,6 +225,13 @@ def plan(
     return WorkspacePlan(
         root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)), workspace.linked_sources,
         tuple(_build(workspace, ros_setup)), setup, reason)
+
+
+def no_sources(workspace: Workspace, name: str, reason: str) -> WorkspaceError:
+    """Return the error of an install space that fits no machine like this, and has no sources."""
+    return WorkspaceError(
+        f"{workspace.root} can't go to machine '{name}' as it is ({reason}), and has no src/ to "
+        'build', 'keep the sources in the workspace, or use a machine like this one')
 
 
 class Destination(Protocol):
@@ -285,9 +295,10 @@ def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> st
     """Say why the install space can't be used on the machine as it is, '' if it can."""
     if not workspace.installed:
         return 'it is not built'
-    if workspace.compiled is not None:
-        if machine.architecture != robot.architecture:
-            return f'built for {robot.architecture}, there it is {machine.architecture}'
+    if workspace.compiled:
+        reason = why_not_on(workspace, machine.architecture)
+        if reason:
+            return reason
         if (machine.system, machine.release) != (robot.system, robot.release):
             return (f'built on {robot.system} {robot.release}, there it is '
                     f'{machine.system} {machine.release}')
@@ -297,6 +308,13 @@ def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> st
     if workspace.python and workspace.python not in here:
         return f'built for {workspace.python}, which is not there'
     return ''
+
+
+def why_not_on(workspace: Workspace, architecture: str) -> str:
+    """Say why the install space does not run on a processor architecture, '' if it does."""
+    return next((f'{path.relative_to(workspace.root)} is built for {built}, there it is '
+                 f'{architecture}' for built, path in workspace.compiled.items()
+                 if built != architecture), '')
 
 
 def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Iterator[Command]:
@@ -371,7 +389,7 @@ class _Found(TypedDict):
     links: tuple[Path, ...]
     outside: tuple[Path, ...]
     linked: tuple[Path, ...]
-    compiled: Optional[Path]
+    compiled: dict[str, Path]
     python: str
 
 
@@ -385,7 +403,7 @@ def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
     outside: set[Path] = set()
     linked: set[Path] = set()
     seen: set[Path] = set()
-    compiled: Optional[Path] = None
+    compiled: dict[str, Path] = {}
     python = ''
     todo = [install]
     while todo:
@@ -396,8 +414,8 @@ def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
                 reached.append(_target(entry.path))
             elif entry.name.endswith(('.egg-link', '.pth')):
                 reached.extend(_written_paths(Path(entry.path)))
-            elif compiled is None and _is_compiled(entry):
-                compiled = Path(entry.path)
+            elif '/lib/' in entry.path or '/bin/' in entry.path or _LIBRARY.search(entry.name):
+                _note_compiled(entry.path, compiled)
             if not python and '/site-packages/' in entry.path:
                 python = entry.path.split('/site-packages/')[0].rpartition('/')[2]
         for path in reached:
@@ -408,6 +426,7 @@ def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
             if way is None:
                 links.add(path)
                 todo.append(path)
+                _note_compiled(str(path), compiled)
                 continue
             real = Path(os.path.realpath(way))
             folders = [folder for folder in sources if real.is_relative_to(folder)]
@@ -415,6 +434,7 @@ def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
                 linked.update(folders)
                 links.update([way] if way.is_relative_to(root) else [])
                 todo.append(path)
+                _note_compiled(str(path), compiled)
             elif not real.is_relative_to('/opt/ros') and not real.is_relative_to('/usr'):
                 # ROS and the system are on the machine too
                 outside.add(real)
@@ -459,15 +479,15 @@ def _written_paths(file: Path) -> Iterator[Path]:
             yield Path(os.path.normpath(line))
 
 
-def _is_compiled(entry: os.DirEntry[str]) -> bool:
-    if '.so' in entry.name:
-        return True
-    if '/lib/' not in entry.path and '/bin/' not in entry.path:
-        return False
-    if entry.name.endswith(('.py', '.sh', '.txt', '.xml', '.yaml', '.pyc')):
-        return False
-    with open(entry.path, 'rb') as file:
-        return file.read(4) == b'\x7fELF'
+def _note_compiled(path: str, compiled: dict[str, Path]) -> None:
+    """Add the architecture of a file if it is a compiled program or shared library."""
+    if path.endswith(('.py', '.sh', '.txt', '.xml', '.yaml', '.pyc')) or not os.path.isfile(path):
+        return
+    with open(path, 'rb') as file:
+        header = file.read(20)
+    if header[:4] == b'\x7fELF':
+        number = int.from_bytes(header[18:20], 'little')
+        compiled.setdefault(_ELF_MACHINES.get(number, f'processor {number}'), Path(path))
 
 
 def _include(paths: Sequence[Path], root: Path) -> Iterator[str]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 import subprocess
@@ -20,6 +21,7 @@ from fogros2.waiting import Timeouts
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 ROBOT = HostFacts(system='ubuntu', release='24.04', architecture='x86_64', pythons=(PYTHON,),
                   ros={'jazzy': '/opt/ros/jazzy'})
+ARM = dataclasses.replace(ROBOT, architecture='aarch64')
 SETUP = ('/opt/ros/jazzy/setup.sh',)
 
 
@@ -35,6 +37,14 @@ def package(folder: Path, name: str, build_type: str = 'ament_python') -> Path:
           f'<package><name>{name}</name><export><build_type>{build_type}</build_type></export>'
           '</package>')
     return folder
+
+
+def elf(path: Path, machine: int = 62) -> Path:
+    """Write the header of a compiled file; 62 is x86-64, 183 AArch64."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b'\x7fELF\x02\x01\x01' + bytes(9) + b'\x03\0' + machine.to_bytes(2, 'little'))
+    path.chmod(0o755)
+    return path
 
 
 def install(root: Path, name: str, *, merged: bool = False) -> Path:
@@ -137,16 +147,47 @@ def test_another_python_builds_there(root: Path) -> None:
 
 
 def test_compiled_code_is_built_for_another_processor_or_system(root: Path) -> None:
-    write(root / 'install/beta/lib/libbeta.so')
+    library = elf(root / 'install/beta/lib/libbeta.so')
     write(root / 'install/beta/share/ament_index/resource_index/packages/beta')
     space = workspace.inspect(root)
-    assert not space.python_only
+    assert dict(space.compiled) == {'x86_64': library} and not space.python_only
     assert plan(space).commands == ()
-    arm = HostFacts(system='ubuntu', release='24.04', architecture='aarch64', pythons=(PYTHON,),
-                    ros={'jazzy': '/opt/ros/jazzy'})
-    assert 'aarch64' in plan(space, arm).reason
+    assert plan(space, ARM).reason == (
+        'install/beta/lib/libbeta.so is built for x86_64, there it is aarch64')
+    older = dataclasses.replace(ROBOT, release='22.04')
+    assert plan(space, older).reason == 'built on ubuntu 24.04, there it is ubuntu 22.04'
     with pytest.raises(WorkspaceError, match='has no colcon.*run colcon build here'):
-        plan(space, arm, can_build=False)
+        plan(space, ARM, can_build=False)
+
+
+def test_robots_own_processor_does_not_matter(root: Path) -> None:
+    # the other way round, and what was compiled here for the machine
+    elf(root / 'install/beta/lib/beta/node', 183)
+    space = workspace.inspect(root)
+    assert list(space.compiled) == ['aarch64']
+    assert plan(space, ARM).commands == ()
+    there = workspace.plan(space, ROBOT, ARM, ros_setup=SETUP, can_build=True, name='m')
+    assert there.reason == 'install/beta/lib/beta/node is built for aarch64, there it is x86_64'
+    # one file for another processor is enough
+    elf(root / 'install/beta/lib/python3.12/site-packages/beta/_beta.cpython-312.so', 62)
+    assert '_beta.cpython-312.so is built for x86_64' in plan(workspace.inspect(root), ARM).reason
+
+
+def test_compiled_programs_are_found_behind_links(root: Path) -> None:
+    program = elf(root / 'build/alpha/runner')
+    (root / 'install/alpha/lib/alpha/runner').symlink_to(program)
+    space = workspace.inspect(root)
+    assert dict(space.compiled) == {'x86_64': program}
+    assert plan(space, ARM).commands != ()
+
+
+def test_text_is_not_compiled_whatever_its_name(root: Path) -> None:
+    write(root / 'install/alpha/share/alpha/config.source')
+    write(root / 'install/alpha/lib/libtext.so', 'INPUT(-lfoo)')
+    # the system's own programs are on the machine, too
+    (root / 'install/alpha/bin').mkdir()
+    (root / 'install/alpha/bin/true').symlink_to('/usr/bin/true')
+    assert workspace.inspect(root).python_only
 
 
 def test_sources_alone_are_built_there(root: Path) -> None:
@@ -236,7 +277,7 @@ def test_a_linked_package_travels_with_its_link(
     facts = ROBOT if machine == 'alike' else HostFacts(
         system='ubuntu', release='24.04', architecture='aarch64', pythons=(PYTHON,))
     if machine == 'arm':
-        write(root / 'install/far/lib/libfar.so', 'ELF')
+        elf(root / 'install/far/lib/libfar.so')
     space = workspace.inspect(root)
     assert space.linked == (linked,) and space.outside == ()
     way = plan(space, facts)
