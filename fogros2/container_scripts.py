@@ -33,6 +33,16 @@ if ! there "$image"; then
         image=$(echo "$pulled" | tail -n 1)
     fi
 fi
+case $($as_root $engine image inspect -f '{{.Architecture}}' "$image") in
+    amd64) built=x86_64 ;; arm64) built=aarch64 ;; *) built= ;;
+esac
+# an emulator may run it; inside a container, nobody can see whether there is one
+emulators=/proc/sys/fs/binfmt_misc
+if [ -n "$built" ] && [ -e $emulators/status ] && [ "$built" != "$(uname -m)" ] \\
+        && ! grep -qsx enabled $emulators/*"$built"*; then
+    echo "Error: it is for $built processors, and the machine has $(uname -m)" >&2
+    exit 1
+fi
 if [ -n "$rmw" ]; then
     id=$($as_root $engine image inspect -f '{{.Id}}' "$image")
     id=${id#sha256:}

@@ -113,6 +113,8 @@ class Containers:
                 raise PrerequisiteError(
                     f"'{job.name}' can't get the image '{image}': "
                     f'{containers.reason(error.result.stderr)}',
+                    "build it for the machine's processors too, or choose another machine"
+                    if 'processors, and the machine has' in error.result.stderr else
                     'is its name right, and may anybody download it?') from error
             self._images[image, rmw] = printed.split()[-1]
         return self._images[image, rmw]

@@ -118,8 +118,18 @@ class ContainerProvider(Provider):
                                     'sudo modprobe tun')
         container_engine.answers(engine)
         container_options.check_network(engine, options)
-        if not options.image:
+        if options.image:
+            container_engine.check_architecture(engine, options.image)
+        else:
             check_root()
+
+    def architecture(self, spec: MachineSpec) -> str:
+        """Return that of the image; one that is still to be downloaded is chosen for this one."""
+        options = Options.parse(spec.options)
+        if not options.image:
+            return os.uname().machine
+        engine = container_engine.select(options.engine, options.image)
+        return container_engine.architecture(engine, options.image) or os.uname().machine
 
     def check_containers(self, spec: MachineSpec) -> None:
         """Look whether the machine is to be made with the rights for it."""

@@ -13,7 +13,7 @@ import threading
 from typing import Any, Optional
 
 from fogros2 import process
-from fogros2.errors import CommandError, PrerequisiteError, ProviderError
+from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import Command, Result
 
 ENGINES = ('podman', 'docker')
@@ -82,6 +82,34 @@ def sudo_hint(text: str) -> str:
     return ''
 
 
+def architecture(engine: Engine, image: str) -> str:
+    """
+    Return the processor architecture of an image, as ``uname -m`` has it.
+
+    :returns: '' for an image that is not on this computer yet, and for rare architectures.
+    """
+    found = engine.call('image', 'inspect', '--format', '{{.Architecture}}', image,
+                        what='looking at the image', check=False)
+    return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(found.stdout.strip(), '')
+
+
+def check_architecture(engine: Engine, image: str) -> None:
+    """
+    Check that programs of an image run on this computer.
+
+    :raises ConfigurationError: it is for another processor architecture, and nothing emulates it.
+    """
+    built, here = architecture(engine, image), os.uname().machine
+    if built in ('', here):
+        return
+    tried = engine.call('run', '--rm', '--network', 'none', '--entrypoint', '/bin/sh', *limits(),
+                        image, '-c', ':', what='trying the image', check=False)
+    if 'exec format error' in tried.stderr.lower():
+        raise ConfigurationError(
+            f"the image '{image}' is for {built} processors, and this computer has {here}",
+            f'{engine.name} rmi {image}, then get the one for {here}')
+
+
 def translate(error: CommandError) -> ProviderError:
     """Return an engine's failure as one line with a remedy where one is known."""
     text = error.result.stderr
@@ -91,6 +119,8 @@ def translate(error: CommandError) -> ProviderError:
         hint = "this root file system can't be overlaid: name an image with image='...'"
     elif 'no space left' in low:
         hint = 'the disk is full'
+    elif 'exec format error' in low:
+        hint = f'the image has to be for {os.uname().machine} processors'
     elif 'rlimit' in low or 'cgroup' in low:
         hint = 'see `ros2 fog doctor`'
     elif '/dev/net/tun' in low:

@@ -20,10 +20,10 @@ import pytest
 
 from fogros2 import container_scripts, containers, plan
 from fogros2.containers import Container
-from fogros2.errors import CommandError, DdsError
+from fogros2.errors import CommandError, ConfigurationError, DdsError
 from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
 from fogros2.process import run, which
-from fogros2.provider import container_engine
+from fogros2.provider import container_engine, container_root
 from fogros2.provider.container import ContainerProvider
 from fogros2.waiting import wait_until
 from rigs.launched import launching, ros2
@@ -116,6 +116,38 @@ def test_what_it_says_and_how_it_ends_is_told(image, launch, tmp_path):
     said = follower.communicate(timeout=60)[0]
     assert (said.splitlines(), follower.returncode) == (['hello'], 3)
     assert there(launch) == []
+
+
+@pytest.fixture
+def foreign(engine: str, tmp_path: Path) -> Iterator[str]:
+    """Import an image whose programs are for a processor that this computer has not."""
+    here = os.uname().machine
+    word, number = ('amd64', 62) if here == 'aarch64' else ('arm64', 183)
+    archive = container_root.Archive()
+    archive.file('bin/sh', b'\x7fELF\x02\x01\x01' + bytes(9) + b'\x02\0' + bytes([number])
+                 + bytes(45), 0o755)
+    path, name = tmp_path / 'image.tar', f'localhost/fogt-{secrets.token_hex(4)}:1'
+    path.write_bytes(archive.data())
+    run(Command((engine, 'import', '--arch', word, str(path), name), sudo=True), timeout=60)
+    yield name
+    run(Command((engine, 'rmi', '-f', name), sudo=True), timeout=60)
+
+
+def test_image_for_another_processor_is_named(foreign: str, image: str) -> None:
+    podman = container_engine.podman()
+    # as a container machine, before it is created
+    with pytest.raises(ConfigurationError, match='processors, and this computer has'):
+        container_engine.check_architecture(podman, foreign)
+    for unknown in (image, 'localhost/never-heard-of:1'):
+        container_engine.check_architecture(podman, unknown)
+    # for a node, on a machine that shows which emulators it has: none
+    fetch = containers.fetch(foreign)
+    with pytest.raises(CommandError) as caught:
+        at_machine(dataclasses.replace(fetch, argv=(
+            'unshare', '--mount', 'sh', '-ec',
+            'mount -t tmpfs none /proc/sys/fs/binfmt_misc; : >/proc/sys/fs/binfmt_misc/status; '
+            'exec "$@"', 'sh', *fetch.argv)))
+    assert 'processors, and the machine has' in containers.reason(caught.value.result.stderr)
 
 
 def test_it_stops_with_the_process_that_follows_it(image, launch, tmp_path):

@@ -344,7 +344,7 @@ def test_an_image_that_is_there_is_not_downloaded(engine):
     assert done(containers.fetch('ros:jazzy'), THERE='ros:jazzy')[0] == 'ros:jazzy'
     name, told = done(containers.fetch('ros:jazzy'))
     assert name == 'docker.io/library/ros:jazzy'
-    assert told[-1] == f'{engine} pull -q docker.io/library/ros:jazzy'
+    assert f'{engine} pull -q docker.io/library/ros:jazzy' in told
 
 
 def test_an_image_without_the_middleware_gets_it_once(engine):
