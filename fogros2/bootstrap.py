@@ -27,7 +27,7 @@ from fogros2 import dependencies as needs
 from fogros2 import host, locked, process
 from fogros2 import wheels as wheel_cache
 from fogros2 import workspace as workspaces
-from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
 from fogros2.plan import DEFAULT_RMW, extended, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
@@ -35,6 +35,7 @@ from fogros2.shell import Shell
 
 #: The system that ROS 2 Jazzy has packages for.
 APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
+APT_ARCHITECTURES = ('x86_64', 'aarch64')
 #: Below the login user's home: one folder for each version of what was sent.
 INSTALL_FOLDER = '.local/share/fogros2'
 #: Free bytes that the embedded default takes, and that ROS 2's packages take.
@@ -292,9 +293,9 @@ def plan_alike(
     Return the plan for a machine that has the robot's very environment, None for another one.
 
     That is an image made from it, the robot itself, or a computer set up alike: each folder of
-    the underlay is there with the same packages in it.
+    the underlay is there with the same packages in it, for the same processor architecture.
     """
-    same = all(
+    same = facts.architecture == robot.architecture and all(
         facts.environments.get(prefix, '?') == robot.environments.get(prefix)
         for prefix in under.prefixes)
     ours = _travelling(workspace) or ((facts.cloud_launch,) if facts.cloud_launch else ())
@@ -361,6 +362,48 @@ def plan(
             install, workspace, spec.name, todo.mode == 'apt' or _builds(facts)))
 
 
+def check_architecture(
+    spec: MachineSpec, architecture: str, workspace: Optional[workspaces.Workspace],
+    wheels: Callable[[], wheel_cache.Wheels],
+) -> None:
+    """
+    Check what a machine of a known architecture can't have, before it is created.
+
+    The rest depends on the machine's system, which only the machine knows: see ``plan``.
+
+    :param architecture: as ``uname -m`` has it.
+    :param wheels: returns what the robot can send; asked where it matters.
+    :raises PrerequisiteError: no bootstrap leads to ROS 2 there.
+    :raises WorkspaceError: the workspace is compiled for another one, and can't be built there.
+    """
+    machine = f"machine '{spec.name}' ({architecture})"
+    if spec.bootstrap == 'embedded':
+        sent = wheels()
+        names = [] if sent.architecture == architecture else [
+            _distribution(file) for file in sent.hashes if not file.endswith('-none-any.whl')]
+        lacking = locked.lacking(names, architecture)
+        if lacking:
+            raise PrerequisiteError(
+                f"{machine} can't take the embedded default: its {', '.join(lacking)} has no "
+                f'package for {architecture} processors',
+                f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
+                'machine with an x86_64 processor')
+    elif spec.bootstrap == 'apt' and architecture not in APT_ARCHITECTURES:
+        raise PrerequisiteError(
+            f"{machine} can't be made ready for ROS 2: "
+            f'{_why_not_apt(HostFacts(architecture=architecture))}',
+            'choose an image or computer that has ROS 2 already')
+    reason = workspaces.why_not_on(workspace, architecture) if workspace is not None else ''
+    if workspace is None or not reason:
+        return
+    if not workspace.sources:
+        raise workspaces.no_sources(workspace, spec.name, reason)
+    if spec.bootstrap == 'embedded':
+        raise WorkspaceError(
+            f'{workspace.root} would have to be built on {machine}: {reason}; the embedded '
+            'default builds nothing', "use bootstrap='auto' or 'apt'")
+
+
 def _builds(facts: HostFacts) -> bool:
     """Return whether a machine has what builds a workspace."""
     return {'colcon', 'rosdep'} <= facts.programs
@@ -421,6 +464,9 @@ def _why_not_embedded(
         return 'this robot runs ROS 2 itself and has no embedded default to send'
     if not python_only:
         return 'the workspace has compiled packages, which need ROS 2 itself'
+    lacking = locked.lacking(_asked(facts, wheels), facts.architecture)
+    if lacking:
+        return f"its {', '.join(lacking)} has no package for {facts.architecture} processors"
     if not any(p.venv and p.version >= MIN_PYTHON for p in facts.pythons):
         return "its Python lacks the module 'venv' (package python3-venv)"
     if facts.free_bytes is not None and facts.free_bytes < EMBEDDED_BYTES:
@@ -430,6 +476,9 @@ def _why_not_embedded(
 
 
 def _why_not_apt(facts: HostFacts) -> str:
+    if facts.architecture not in APT_ARCHITECTURES:
+        return (f"ROS 2 {DISTRO} has packages for {' and '.join(APT_ARCHITECTURES)} processors, "
+                f'and not for {facts.architecture}')
     if (facts.system, facts.release) != (APT_SYSTEM, APT_RELEASE):
         return f'ROS 2 {DISTRO} has packages for Ubuntu {APT_RELEASE} alone'
     if not facts.root:
@@ -445,6 +494,21 @@ def _fits(facts: HostFacts, wheels: wheel_cache.Wheels) -> Optional[Python]:
             wheels.libc, facts.libc):
         return None
     return next((p for p in facts.pythons if p.venv and p.version == wheels.python), None)
+
+
+def _asked(facts: HostFacts, wheels: wheel_cache.Wheels) -> list[str]:
+    """
+    Return the distributions that a machine asks its own package index for.
+
+    The robot's wheels of these are compiled for another Python, C library or processor.
+    """
+    if _fits(facts, wheels) is not None:
+        return []
+    return [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+
+
+def _distribution(file: str) -> str:
+    return locked.name_of(file.partition('-')[0])
 
 
 def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
@@ -472,15 +536,12 @@ def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     # pip runs from its own wheel: the venv needs none, and python3-venv needn't be installed
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
              '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
-    travel = {file: digest for file, digest in wheels.hashes.items()
-              if _fits(facts, wheels) is not None or file.endswith('-none-any.whl')}
-    # compiled for another Python or processor: the machine asks its own package index for these
-    asked = [locked.name_of(file.partition('-')[0]) for file in wheels.hashes
-             if file not in travel]
+    asked = _asked(facts, wheels)
     if not asked:
         words.append('--no-index')
-    lines = [locked.from_file(f'{target}/{file}', digest, locked.name_of(file.partition('-')[0]))
-             for file, digest in travel.items()]
+    lines = [locked.from_file(f'{target}/{file}', digest, name)
+             for file, digest in wheels.hashes.items()
+             if (name := _distribution(file)) not in asked]
     script = (
         f'cd {shlex.quote(folder)}\n'
         f'{_checked(wheels, wheels.pip)}'

@@ -16,6 +16,8 @@ import re
 from fogros2.errors import PrerequisiteError
 
 FILE = Path(__file__).with_name('locked.txt')
+#: Begins the line of the file that names distributions with wheels for x86_64 alone.
+X86_64_ALONE = '# Wheels for x86_64 alone:'
 #: Options of pip besides the requirements. Sources would be built by programs without hashes.
 OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
 
@@ -53,6 +55,20 @@ def requirements(names: Iterable[str]) -> list[str]:
                 'choose a machine with the same Python, processor and C library as the robot')
         lines += entries[name_of(name)]
     return lines
+
+
+def lacking(names: Iterable[str], architecture: str) -> list[str]:
+    """
+    Return those distributions that have no wheel for a processor architecture.
+
+    :param architecture: as ``uname -m`` has it.
+    """
+    if architecture == 'x86_64':
+        return []
+    lines = FILE.read_text().splitlines()
+    without = {name for line in lines if line.startswith(X86_64_ALONE)
+               for name in line.removeprefix(X86_64_ALONE).split()}
+    return [name for name in names if name_of(name) in without]
 
 
 def from_file(path: str, sha256: str, name: str) -> str:

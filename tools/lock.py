@@ -6,6 +6,7 @@ Write fogros2/locked.txt: what a machine may take from its package index, pinned
 
 It takes ``uv`` (``pip install uv``), which asks the index that it is set up with. A version is
 chosen for each Python that we support, and all its wheels are taken, whatever their processor.
+Distributions without one for 64-bit ARM are named: no machine of that kind can have them.
 """
 
 from __future__ import annotations
@@ -41,6 +42,15 @@ def resolved(requirements: list[str]) -> str:
              file.name], check=True, capture_output=True, text=True).stdout
 
 
+def lacks_aarch64(name: str, entries: list[str]) -> bool:
+    """Return whether a distribution has no wheel for 64-bit ARM and the Python of ROS 2 Jazzy."""
+    version = entries[-1].split()[0].removeprefix(f'{name}==')
+    return subprocess.run(
+        ['uv', 'pip', 'compile', '--quiet', '--no-deps', '--only-binary', ':all:',
+         '--python-version', '3.12', '--python-platform', 'aarch64-manylinux_2_39', '-'],
+        input=f'{name}=={version}\n', capture_output=True, text=True).returncode != 0
+
+
 def main() -> None:
     """Resolve all together, as they are used together, and keep those that are asked for."""
     requirements = list(dict.fromkeys(
@@ -50,7 +60,8 @@ def main() -> None:
     missing = [name for name in names if name not in entries]
     if missing:
         sys.exit(f'uv has no answer for {", ".join(missing)}')
-    TARGET.write_text(HEADER + ''.join(
+    alone = [name for name in names if lacks_aarch64(name, entries[name])]
+    TARGET.write_text(HEADER + f'{locked.X86_64_ALONE} {" ".join(alone)}\n' + ''.join(
         entry.replace(' --hash', ' \\\n    --hash') + '\n'
         for name in names for entry in entries[name]))
     print(f'{TARGET}: {", ".join(names)}')

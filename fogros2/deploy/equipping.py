@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+import platform
 import re
 import sys
 import threading
@@ -122,6 +123,9 @@ class Equipment:
             package = _PACKAGES.get(library[1])
             hint = (f'install {package} there with apt' if package else
                     f'install the package there that has it: apt-file search {library[1]}')
+        elif there.architecture != platform.machine():
+            hint = (f"take an image with them (pip install {names}): this robot's own are for "
+                    f'{platform.machine()} processors, and the machine has {there.architecture}')
         elif there.python != sys.version_info[:2]:
             version = '.'.join(map(str, there.python))
             hint = (f'take an image with them (pip install {names}), or a robot with Python '

@@ -15,7 +15,17 @@ import threading
 import time
 from typing import Optional
 
-from fogros2 import containers, model, plan, plugin_system, process, ros2_daemon, workspace
+from fogros2 import (
+    bootstrap,
+    containers,
+    model,
+    plan,
+    plugin_system,
+    process,
+    ros2_daemon,
+    wheels,
+    workspace,
+)
 from fogros2 import shell as shells
 from fogros2.dds import DdsVendor
 from fogros2.deploy import routing
@@ -120,9 +130,19 @@ class Launch:
                     plan.check_program(package, executable, prefixes, spec.workspace)
         choosing = [spec for spec in specs if not self._may_be_kept(spec)]
         with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
-            for choice in [
-                    pool.submit(self.choices.resolved, spec) for spec in choosing]:
+            for choice in [pool.submit(self._choose, spec) for spec in choosing]:
                 choice.result()
+
+    def _choose(self, spec: MachineSpec) -> None:
+        """Choose what the spec leaves open, and look whether what travels will run there."""
+        spec = self.choices.resolved(spec)
+        if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
+            return  # it depends on the machine's system alone
+        architecture = self.provider(spec.provider).architecture(spec)
+        if architecture:
+            bootstrap.check_architecture(
+                spec, architecture,
+                workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)
 
     def _may_be_kept(self, spec: MachineSpec) -> bool:
         """Return whether a machine of an earlier launch may be taken, whose choices hold."""

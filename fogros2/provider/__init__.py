@@ -117,6 +117,15 @@ class Provider(abc.ABC):
                 for key, value in sorted(chosen.options.items())
                 if asked.options.get(key) != value]
 
+    def architecture(self, spec: MachineSpec) -> str:
+        """
+        Return the processor architecture that a machine of a resolved spec will have.
+
+        :returns: as ``uname -m`` has it (``x86_64``, ``aarch64``), '' where it isn't known yet.
+        :raises FogError: nobody answers.
+        """
+        return ''
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return what a machine of a resolved spec will cost (US dollars), None if unknown."""
         return None

@@ -415,6 +415,17 @@ def test_what_does_not_exist_is_named_before_anything_is_made(aws, options, word
     assert not aws.asked('CreateSecurityGroup')
 
 
+@pytest.mark.parametrize(('options', 'architecture'), [
+    ({}, 'x86_64'),
+    ({'ec2_instance_type': 'm6g.large'}, 'aarch64'),
+    ({'ec2_instance_type': 'g5.xlarge', 'instance_types': ['m6g.large']}, ''),
+])
+def test_architecture_is_known_from_the_instance_type(aws, options, architecture):
+    spec, _ = ask(**options)
+    assert aws.provider.architecture(aws.provider.resolve(spec)) == architecture
+    assert not aws.asked('CreateSecurityGroup')
+
+
 def test_an_image_for_another_processor_is_refused(aws):
     arm = boto3.client('ssm', HOME).get_parameter(
         Name=images.UBUNTU['arm64'])['Parameter']['Value']

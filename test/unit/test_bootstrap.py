@@ -223,6 +223,80 @@ def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
     assert 'numpy-1' not in script and 'numpy==' in script
 
 
+ARM = dataclasses.replace(NOBLE, architecture='aarch64')
+FULL = dataclasses.replace(WHEELS, hashes={
+    **WHEELS.hashes, 'cyclonedds-11.0.1-cp312-cp312-manylinux_2_28_x86_64.whl': 'c1'})
+
+
+def test_arm_machine_gets_ros_where_cyclonedds_has_no_wheel() -> None:
+    assert plan(NOBLE, wheel=FULL).mode == 'embedded'
+    assert plan(DEBIAN, wheel=FULL).mode == 'embedded'  # the index has it for another Python
+    assert plan(ARM, wheel=FULL).mode == 'apt'
+    lacks = 'its cyclonedds has no package for aarch64 processors'
+    with pytest.raises(PrerequisiteError, match=f'embedded default: {lacks}'):
+        plan(ARM, 'embedded', wheel=FULL)
+    arm_debian = dataclasses.replace(DEBIAN, architecture='aarch64')
+    with pytest.raises(PrerequisiteError, match=f'{lacks}; .* Ubuntu 24.04 alone') as caught:
+        plan(arm_debian, wheel=FULL)
+    assert 'one that has ROS 2 already' in str(caught.value)
+    # one that has ROS 2 needs no wheel but ours; a robot of the same kind sends its own
+    assert plan(dataclasses.replace(ROS, architecture='aarch64'), wheel=FULL).mode == 'none'
+    own = dataclasses.replace(FULL, architecture='aarch64')
+    assert '--no-index' in scripts(plan(ARM, wheel=own).commands)
+
+
+def test_arm_robot_has_its_x86_machine_install_its_own() -> None:
+    built = dataclasses.replace(WHEELS, architecture='aarch64', libc='glibc 2.36', hashes={
+        **WHEELS.hashes, 'cyclonedds-11.0.1-cp312-cp312-linux_aarch64.whl': 'c1'})
+    script = scripts(plan(NOBLE, wheel=built, robot=ARM).commands)
+    assert 'cyclonedds==' in script and 'aarch64' not in script
+    with_ros = dataclasses.replace(WHEELS, architecture='aarch64', embedded=False)
+    assert plan(NOBLE, wheel=with_ros, robot=ARM).mode == 'apt'
+
+
+def test_ros_has_no_packages_for_rare_processors() -> None:
+    pi = dataclasses.replace(NOBLE, architecture='armv7l')
+    with pytest.raises(PrerequisiteError, match='for x86_64 and aarch64 .* not for armv7l'):
+        plan(pi, 'apt')
+
+
+def test_same_packages_of_another_processor_are_not_alike() -> None:
+    robot = dataclasses.replace(ROS, environments={'/robot/.venv': '1-2'},
+                                cloud_launch='/robot/.venv/x/cloud_launch.py')
+    arm = dataclasses.replace(robot, architecture='aarch64')
+    spec = MachineSpec('m', 'container')
+    assert bootstrap.plan_alike(spec, robot, robot, UNDER, None) is not None
+    # LD_LIBRARY_PATH has folders by the processor's name: the machine's own script sets it
+    assert bootstrap.plan_alike(spec, arm, robot, UNDER, None) is None
+
+
+def test_what_another_processor_lacks_is_named_before_creation(tmp_path: Path) -> None:
+    def check(architecture: str, space: Any = None, **spec: Any) -> None:
+        bootstrap.check_architecture(
+            MachineSpec('m', 'aws', **spec), architecture, space, lambda: FULL)
+
+    check('x86_64', bootstrap='embedded')
+    check('aarch64', bootstrap='apt')
+    check('aarch64')
+    with pytest.raises(PrerequisiteError, match='cyclonedds has no package for') as caught:
+        check('aarch64', bootstrap='embedded')
+    assert "bootstrap='apt' (Ubuntu 24.04)" in str(caught.value)
+    with pytest.raises(PrerequisiteError, match='and not for riscv64'):
+        check('riscv64', bootstrap='apt')
+    root = tmp_path / 'ws'
+    compiled = bootstrap.workspaces.Workspace(
+        root, {'a': root / 'install/a'}, {'a': root / 'src/a'},
+        compiled={'x86_64': root / 'install/a/lib/liba.so'})
+    check('x86_64', dataclasses.replace(compiled, sources={}))
+    check('aarch64', compiled)
+    with pytest.raises(WorkspaceError, match='liba.so is built for x86_64.*no src/ to build'):
+        check('aarch64', dataclasses.replace(compiled, sources={}))
+    pure = dataclasses.replace(FULL, hashes={})
+    with pytest.raises(WorkspaceError, match='the embedded default builds nothing'):
+        bootstrap.check_architecture(
+            MachineSpec('m', 'aws', bootstrap='embedded'), 'aarch64', compiled, lambda: pure)
+
+
 def test_a_robots_wheel_of_which_no_other_build_is_pinned_is_named() -> None:
     odd = dataclasses.replace(WHEELS, hashes={
         **WHEELS.hashes, 'fast_odd-1-cp312-cp312-linux_x86_64.whl': 'o1'})

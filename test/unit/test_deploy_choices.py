@@ -15,7 +15,7 @@ from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.job import Job
 from fogros2.deploy.robot_vpn import RobotVpn
-from fogros2.errors import NameTaken, ProviderError
+from fogros2.errors import NameTaken, ProviderError, WorkspaceError
 from fogros2.model import MachineSpec, VpnInterface
 from fogros2.report import StepDone, StepFailed, StepStarted
 from fogros2.store import Store
@@ -77,6 +77,29 @@ def test_a_choice_that_nothing_fits_ends_the_launch_before_anything_is_created(
     provider.failures['resolve'] = ProviderError('nothing costs less than $0.1')
     with pytest.raises(ProviderError, match='nothing costs less'):
         launch.prepare([SPEC])
+    assert 'create' not in provider.calls
+
+
+def test_compiled_workspace_is_refused_before_creation(launch, provider, tmp_path, monkeypatch):
+    prefix = tmp_path / 'ws/install/arm'
+    (prefix / 'share/ament_index/resource_index/packages').mkdir(parents=True)
+    (prefix / 'share/ament_index/resource_index/packages/arm').touch()
+    library = prefix / 'lib/libarm.so'
+    library.parent.mkdir()
+    library.write_bytes(b'\x7fELF' + bytes(14) + b'\x3e\0')
+    spec = dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws'))
+    launch.prepare([spec])  # where only the machine knows its processor
+    answers, asked = ['x86_64', 'aarch64'], []
+
+    def architecture(spec):
+        asked.append(spec.options)
+        return answers.pop(0)
+
+    monkeypatch.setattr(provider, 'architecture', architecture)
+    launch.prepare([spec])
+    with pytest.raises(WorkspaceError, match='libarm.so is built for x86_64'):
+        launch.prepare([spec])
+    assert asked == [{'size': 'small'}] * 2  # of the machine that was chosen
     assert 'create' not in provider.calls
 
 

@@ -297,6 +297,31 @@ def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
     assert asked[1:] == ['pods All', 'jobs', 'jobs', 'pods All', 'jobs']
 
 
+@pytest.mark.parametrize(('options', 'nodes', 'architecture'), [
+    ({'node_selector': {'kubernetes.io/arch': 'arm64'}}, None, 'aarch64'),
+    ({}, ['amd64', 'amd64'], 'x86_64'),
+    ({}, ['amd64', 'arm64'], ''),
+    ({}, [], ''),
+    ({}, ['s390x'], ''),
+    ({}, ApiError('you may not', status=403), ''),
+    ({'node_selector': {'pool': 'gpu'}}, ['amd64'], 'x86_64'),
+])
+def test_architecture_is_that_of_all_nodes_that_fit(monkeypatch, options, nodes, architecture):
+    class Cluster:
+        def request(self, method, path, *, labelSelector, **words):
+            assert (method, path) == ('GET', '/api/v1/nodes')
+            assert labelSelector == ','.join(
+                f'{k}={v}' for k, v in options.get('node_selector', {}).items())
+            if isinstance(nodes, ApiError):
+                raise nodes
+            return {'items': [{'metadata': {'labels': {'kubernetes.io/arch': arch}}}
+                              for arch in nodes]}
+
+    monkeypatch.setattr(KubernetesProvider, '_place', lambda self, options: (Cluster(), 'robots'))
+    spec = MachineSpec('m', 'kubernetes', options)
+    assert KubernetesProvider().architecture(spec) == architecture
+
+
 def test_a_pod_can_not_be_asked_to_stop():
     spec = MachineSpec('planner', 'kubernetes', on_exit='stop')
     error = raised(ConfigurationError, lambda: KubernetesProvider().check(spec))

@@ -144,6 +144,17 @@ class AWSProvider(Provider):
         return [f'{options.ec2_instance_type} in {options.region}',
                 *([f'without room there {", ".join(filter(None, more))}'] if any(more) else [])]
 
+    def architecture(self, spec: MachineSpec) -> str:
+        """Return that of the instance types that a resolved spec may take, if it is one."""
+        options = Options.parse(spec.options)
+        options = options.in_region(self._region(options))
+        names = dict.fromkeys(
+            [options.ec2_instance_type or DEFAULT_TYPE, *options.instance_types])
+        found = {kind.arch for kind in images.kinds(
+            self._account, self._region(options), list(names))}
+        (arch,) = found if len(found) == 1 else ('',)
+        return 'aarch64' if arch == 'arm64' else arch
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine (US dollars an hour); its disk and traffic come on top."""
         options = Options.parse(spec.options)

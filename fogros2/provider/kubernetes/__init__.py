@@ -28,6 +28,8 @@ from fogros2.provider.kubernetes.start import Start
 _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 #: Seconds for which an API server is waited for before anything has begun.
 _FIRST = 5.0
+#: Label of every node.
+_ARCHITECTURE = 'kubernetes.io/arch'
 #: Seconds for which rights that were there, and pods that were let in, are not tried again.
 _SURE = 30.0
 
@@ -98,6 +100,22 @@ class KubernetesProvider(Provider):
                     f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
                     f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
             self._reviewed[api.context, namespace] = time.monotonic()
+
+    def architecture(self, spec: MachineSpec) -> str:
+        """Return what ``node_selector`` says, or what all nodes have that carry its labels."""
+        options = Options.parse(spec.options)
+        api, _ = self._place(options)
+        found = {options.node_selector.get(_ARCHITECTURE, '')}
+        if found == {''}:
+            # by the rights of most users, nodes can't be listed
+            with contextlib.suppress(ApiError):
+                nodes = items(api.request(
+                    'GET', path('nodes'), labelSelector=selector(options.node_selector),
+                    patience=_FIRST, cancel=self.cancel))
+                found = {str((node['metadata'].get('labels') or {}).get(_ARCHITECTURE, ''))
+                         for node in nodes}
+        (arch,) = found if len(found) == 1 else ('',)
+        return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(arch, '')
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Try the pod's admission, then make the Job and what leads UDP to it."""
