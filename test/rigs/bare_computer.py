@@ -61,7 +61,7 @@ class BareComputer:
 @contextlib.contextmanager
 def bare_computer(
     name: str, folder: Path, network: str, *, mounts: Sequence[str] = (),
-    options: Sequence[str] = (),
+    options: Sequence[str] = (), base: str = '',
 ) -> Iterator[BareComputer]:
     """
     Run a computer for the time of the block.
@@ -71,6 +71,7 @@ def bare_computer(
     :param network: the container network it is in.
     :param mounts: folders of this computer that it sees, read-only.
     :param options: more words for ``podman run``.
+    :param base: a folder with the programs of another system, '' for this computer's own.
     """
     folder.mkdir(parents=True, exist_ok=True)
     key, root = folder / 'id', folder / 'root'
@@ -87,7 +88,8 @@ def bare_computer(
     for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
         words += ['--cap-add', right]
     for path in container_root.system_mounts():
-        words += ['-v', f'{path}:{path}:O']
+        other = f'{base}{path}' if path.startswith(('/usr', '/var')) else path
+        words += ['-v', f'{other}:{path}:O']
     for path in container_root.outermost(mounts):
         words += ['-v', f'{path}:{path}:ro']
     with contextlib.ExitStack() as undo:
