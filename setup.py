@@ -33,7 +33,7 @@ def data_files():
         yield f'share/{package}/launch', sorted(
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
-    yield 'lib/fogros2', ['fogros2/scripts/bridge']
+    yield 'lib/fogros2', ['fogros2_monitor/scripts/bridge']
 
 
 #: What builds the documentation.
@@ -58,8 +58,10 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[
-        'fogros2*', 'fogros2_examples*', 'image_transport_h264*', 'ros2fog_cli*']),
-    package_data={'fogros2': ['locked.txt', 'py.typed', 'monitor/dashboard/page.html']},
+        'fogros2*', 'fogros2_examples*', 'fogros2_monitor*', 'image_transport_h264*',
+        'ros2fog_cli*']),
+    package_data={'fogros2': ['locked.txt', 'py.typed'],
+                  'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
     extras_require={
@@ -94,6 +96,10 @@ setup(
         'fogros2.configured': [
             'aws = fogros2.provider.aws.clients:configured',
             'kubernetes = fogros2.kubernetes_client:configured',
+        ],
+        'fogros2.monitor': [
+            'foxglove = fogros2_monitor:FOXGLOVE',
+            'graph = fogros2_monitor:GRAPH',
         ],
         'fogros2.shell': [
             'kubernetes = fogros2.shell.kubernetes:KubernetesShell',

@@ -278,7 +278,7 @@ def by_bridge(what: str, count: int, seconds: float) -> tuple[list[Seen], float]
     port = free_port()
     with tempfile.TemporaryDirectory() as folder, \
             process(__file__, '--publish', what), process(
-                '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}',
+                '-m', 'fogros2_monitor.serve', '--listen', f'127.0.0.1:{port}',
                 '--secrets', folder) as served:
         listens(port)
         time.sleep(1.0)  # the bridge itself, behind the gate

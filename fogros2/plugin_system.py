@@ -20,9 +20,10 @@ GROUPS = {
     'fogros2.vpn': 'VPN',
     'fogros2.dds': 'DDS vendor',
     'fogros2.image_transport': 'image transport',
+    'fogros2.monitor': 'monitor',
 }
 #: Packages of this project: an index may have another project of such a name.
-_OWN = ('fogros2', 'image_transport_h264', 'ros2fog_cli')
+_OWN = ('fogros2', 'fogros2_monitor', 'image_transport_h264', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=None)

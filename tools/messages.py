@@ -20,7 +20,7 @@ import sys
 
 ROOT = Path(__file__).parents[1]
 DOCUMENT = ROOT / 'doc' / 'troubleshooting.md'
-PACKAGES = ('fogros2', 'ros2fog_cli')
+PACKAGES = ('fogros2', 'fogros2_monitor', 'ros2fog_cli')
 #: Packages whose errors no user sees.
 LEFT_OUT = ('testing',)
 BEGIN = '<!-- messages: written by tools/messages.py -->'

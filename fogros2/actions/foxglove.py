@@ -15,13 +15,14 @@ from launch.actions import OpaqueFunction, RegisterEventHandler
 from launch.event_handlers import OnProcessStart, OnShutdown
 import launch.logging
 
+from fogros2 import monitor_addresses as addresses
+from fogros2 import plugin_system
 from fogros2.actions import networks, words
 from fogros2.actions.carriers import Carrier
 from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.remote import send
 from fogros2.errors import ConfigurationError, Unsupported
 from fogros2.model import NodeSpec
-from fogros2.monitor import credentials, urls
 from fogros2.store import Store
 
 if TYPE_CHECKING:
@@ -57,9 +58,9 @@ class Foxglove(Action):
 
     def __init__(
         self, machine: SomeMachine, topics: Sequence[SomeSubstitutionsType] = ('*',),
-        port: Union[int, SomeSubstitutionsType] = urls.PORT, *,
+        port: Union[int, SomeSubstitutionsType] = addresses.PORT, *,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
-        image: SomeSubstitutionsType = urls.IMAGE, **kwargs: Any,
+        image: SomeSubstitutionsType = addresses.IMAGE, **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         if isinstance(topics, str) or not topics:
@@ -82,7 +83,7 @@ class Foxglove(Action):
         if coordinator.on_robot(self.machine):
             return self._on_robot(coordinator, port, topics)
         session = coordinator.session(self.machine)
-        folder = credentials.folder_of(_AGENT, port, coordinator.launch.id)
+        folder = addresses.folder_of(_AGENT, port, coordinator.launch.id)
         options = ['--secrets', folder, '--vpn', str(port)]
         provider = coordinator.launch.provider(session.spec.provider)
         if session.spec.monitored and provider.application_port:
@@ -91,7 +92,7 @@ class Foxglove(Action):
             provider.check_containers(session.spec)
             options += ['--image', words.resolve(context, self._image)]
         if allow:
-            options += ['--guarded', str(urls.guarded_port(port)), *(
+            options += ['--guarded', str(addresses.guarded_port(port)), *(
                 word for network in allow for word in ('--allow', network))]
         process = Carrier(_bridge(session.spec.name, port, topics, options))
         send(process, session.spec.name)
@@ -103,11 +104,11 @@ class Foxglove(Action):
         """Serve what the robot sees, on its loopback; the token goes with the launch."""
         machine = coordinator.resolve(self.machine)
         name = machine if isinstance(machine, str) else machine.name
-        folder = credentials.on_robot(Store(), name)
+        folder = addresses.on_robot(Store(), name)
         process = Carrier(_bridge('robot', port, topics, [
-            '--secrets', credentials.folder_of(str(folder), port, str(os.getpid()))]))
+            '--secrets', addresses.folder_of(str(folder), port, str(os.getpid()))]))
         return [process, _once_started(process, lambda: _logger().info(
-            f"{name}: Foxglove at {urls.bridge('localhost', port)}; "
+            f"{name}: Foxglove at {addresses.bridge('localhost', port)}; "
             f'in a browser: ros2 fog monitor {name}')),
             RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: shutil.rmtree(
                 folder, ignore_errors=True)))]
@@ -120,16 +121,17 @@ def _port(value: Union[int, str]) -> int:
         port = 0
     if not 0 < port < 65536:
         raise ConfigurationError(f'port={value!r} is no TCP port', f'use 1 to 65535, such as '
-                                 f'{urls.PORT}')
+                                 f'{addresses.PORT}')
     return port
 
 
 def _bridge(
     where: str, port: int, topics: Sequence[str], options: Sequence[str] = (),
 ) -> NodeSpec:
+    package, executable = plugin_system.load('fogros2.monitor', 'foxglove')
     return NodeSpec(
-        id=f'foxglove-{where}-{port}', name='foxglove_bridge', package='fogros2',
-        executable='bridge', respawn=True, respawn_delay=_RESPAWN,
+        id=f'foxglove-{where}-{port}', name='foxglove_bridge', package=package,
+        executable=executable, respawn=True, respawn_delay=_RESPAWN,
         # a stream is called for it as for a machine's nodes: who looks at its images would have
         # them come from the robot otherwise, raw
         arguments=('--name', where, '--listen', f'127.0.0.1:{port}', *options,
@@ -146,11 +148,11 @@ def _tell(session: Session, port: int, allow: Sequence[str]) -> None:
     session.running.serves(port)
     name = session.spec.name
     _logger().info(
-        f'{name}: Foxglove at {urls.bridge(session.running.vpn_address, port)}; '
+        f'{name}: Foxglove at {addresses.bridge(session.running.vpn_address, port)}; '
         f'in a browser: ros2 fog monitor {name}')
     if allow:
-        session.publish(urls.guarded_port(port), allow, lambda host, outside: _logger().info(
-            f"{name}: Foxglove for {', '.join(allow)} at wss://{urls.place(host, outside)}; "
+        session.publish(addresses.guarded_port(port), allow, lambda host, outside: _logger().info(
+            f"{name}: Foxglove for {', '.join(allow)} at wss://{addresses.place(host, outside)}; "
             f'with its token: ros2 fog monitor {name} --share'))
 
 

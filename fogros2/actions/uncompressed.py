@@ -12,16 +12,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import contextlib
 import json
 from pathlib import Path
-import sys
 import threading
 from typing import Any
 
-from fogros2 import process
+from fogros2 import plugin_system, process
 from fogros2.errors import FogError
 from fogros2.model import Command, NodeSpec
 
-#: Prints the topics that cross, in lines of JSON, until its standard input ends.
-PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
 #: Seconds between two looks at the counters; bits per second that are worth a look at the graph.
 INTERVAL, BUSY = 5.0, 20e6
 #: Looks at the counters that are left out after one at the graph.
@@ -69,17 +66,18 @@ def carried(interface: str) -> int:
 
 def crossing_images(
     machines: Mapping[str, Sequence[str]], environment: Mapping[str, str],
-    ended: threading.Event, program: Sequence[str] = PROGRAM,
+    ended: threading.Event,
 ) -> list[str]:
     """
     Return the image topics that have ends on both sides of the VPN.
 
     :param machines: by name, the names of the nodes there.
     :param environment: the variables of the robot's nodes.
-    :raises FogError: the launch ends, or the program hangs.
+    :raises FogError: the launch ends, the program hangs, or it isn't installed.
     """
     line = json.dumps({'machines': machines, 'pictures': False}) + '\n'
-    # it ends with its standard input
+    # prints the topics that cross, in lines of JSON, until its standard input ends
+    program = plugin_system.load('fogros2.monitor', 'graph')
     output = process.run(Command(
         ('sh', '-c', '{ cat; sleep "$0"; } | "$@"', str(LOOK), *program), input=line.encode(),
         environment=environment, what='look for images that cross the VPN'),

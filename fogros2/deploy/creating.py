@@ -12,7 +12,7 @@ import time
 from typing import Any, Optional
 import uuid
 
-from fogros2 import bootstrap, model, plan, process
+from fogros2 import bootstrap, model, monitor_addresses, plan, process
 from fogros2.deploy.job import Job
 from fogros2.errors import (
     ConfigurationError,
@@ -23,7 +23,6 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineState
-from fogros2.monitor import urls
 from fogros2.provider import (
     Provider,
     TAG_DEPENDENCIES,
@@ -126,7 +125,7 @@ class Creation:
         job.provider.adopt(machine.id, job.spec, self._tags())
         if before.monitor_open:
             # of a launch that was killed
-            job.provider.publish(machine, urls.guarded_port(before.monitor), ())
+            job.provider.publish(machine, monitor_addresses.guarded_port(before.monitor), ())
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             job.provider.start(machine.id)
 
@@ -157,7 +156,7 @@ class Creation:
                 token=token, authorized_key=key, tags=tags,
                 vpn_port=plan.machine_port(job.launch.id), agent_config=config,
                 dependencies=dependencies, cancel=job.cancel,
-                application=urls.IMAGE if job.spec.monitored else ''))
+                application=monitor_addresses.IMAGE if job.spec.monitored else ''))
         except FogError as error:
             # of one that was refused nothing has to be looked for
             self._asked = not error.refused

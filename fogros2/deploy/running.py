@@ -9,6 +9,7 @@ import dataclasses
 import threading
 from typing import Any, Optional, TYPE_CHECKING
 
+from fogros2 import monitor_addresses
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.beside import Containers
 from fogros2.deploy.equipping import Equipment
@@ -16,7 +17,6 @@ from fogros2.deploy.job import Job, SILENT
 from fogros2.deploy.watching import Watch
 from fogros2.errors import AgentError
 from fogros2.model import Machine, NodeSpec, VpnInterface
-from fogros2.monitor import urls
 from fogros2.shell import Shell
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class RunningMachine:
         if port not in self._published:  # what listens there may have been started again
             self.undo.callback(job.undone, 'port of the monitor', close)
             self._published[port] = job.provider.publish(self.machine, port, sources)
-            job.save(monitor_open=urls.place(*self._published[port]))
+            job.save(monitor_open=monitor_addresses.place(*self._published[port]))
         return self._published[port]
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:

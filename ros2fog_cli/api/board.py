@@ -13,7 +13,7 @@ from ros2fog_cli.api.live import Live
 
 class Board:
     """
-    The dashboard's source; see :class:`fogros2.monitor.dashboard.server.Source`.
+    The dashboard's source; see :class:`fogros2_monitor.dashboard.server.Source`.
 
     :param topics: whether to join launches, for rates of topics and pictures.
     """

@@ -9,18 +9,16 @@ import contextlib
 import json
 import os
 import subprocess
-import sys
 import threading
 import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError
 from fogros2.store import Record, Store
+from fogros2_monitor import GRAPH
 from ros2fog_cli.api import reach
 from ros2fog_cli.api.live import Live
 
-#: The program; a process of its own, as a launch has a DDS configuration of its own.
-_PROGRAM = (sys.executable, '-m', 'fogros2.monitor.dashboard.graph')
 #: Seconds after which one that ended is started anew, and that one may take to end.
 AGAIN, PATIENCE = 10.0, 5.0
 
@@ -39,8 +37,9 @@ class Graph:
         self._notes: dict[str, str] = {}
         self._said: deque[str] = deque(maxlen=5)
         self._told = ''
+        # a process of its own, as a launch has a DDS configuration of its own
         self._process = subprocess.Popen(
-            _PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            GRAPH, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, errors='replace', env=environment,
             # a Ctrl-C is for us, who close its standard input then
             start_new_session=True)

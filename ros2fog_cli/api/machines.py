@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Any, Optional, Protocol, runtime_checkable
 
-from fogros2 import plugin_system
+from fogros2 import monitor_addresses, plugin_system
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
@@ -21,7 +21,6 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Machine, MachineState
-from fogros2.monitor import urls
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import Record, robot_name, Store
 from ros2fog_cli.api.interrupts import interruptible
@@ -125,7 +124,7 @@ class Entry:
         record = self.record
         if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
             return ''
-        return urls.bridge(record.vpn.address, record.monitor)
+        return monitor_addresses.bridge(record.vpn.address, record.monitor)
 
     @property
     def launch(self) -> str:

@@ -15,13 +15,14 @@ import time
 from typing import Optional
 import urllib.parse
 
+from fogros2 import monitor_addresses
 from fogros2.deploy.guarding import AGENT_FOLDER
 from fogros2.errors import AgentError, CommandError, ConfigurationError
 from fogros2.model import Command
-from fogros2.monitor import credentials
-from fogros2.monitor.tunnel import Tunnel
 from fogros2.shell import Shell
 from fogros2.store import Store
+from fogros2_monitor import credentials
+from fogros2_monitor.tunnel import Tunnel
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
@@ -127,7 +128,7 @@ def has_application(port: int, token: str) -> bool:
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:
     """Return port and token of the bridge of a machine that is this computer, None without."""
-    folder = credentials.on_robot(Store(), name)
+    folder = monitor_addresses.on_robot(Store(), name)
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])
         with contextlib.suppress(OSError), socket.create_connection(
@@ -146,7 +147,7 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
     folder = (record.agent if record is not None else '') \
         or machines.load(entry.provider).agent_directory or f'{AGENT_FOLDER}/{entry.name}'
     return _read(entry, shell, ('sh', '-c', 'cat "$1"/*/token', 'sh',
-                                str(Path(credentials.folder_of(folder, port, '')))))
+                                str(Path(monitor_addresses.folder_of(folder, port, '')))))
 
 
 def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
@@ -165,7 +166,7 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
             f"nobody but this robot may watch '{entry.name}'",
             "monitor_allow=['198.51.100.0/28'] in its launch file lets others in")
     made = credentials.Credentials(Path(
-        credentials.folder_of(record.agent, record.monitor, record.launch)))
+        monitor_addresses.folder_of(record.agent, record.monitor, record.launch)))
     said = _read(entry, shell, ('cat', str(made.token), str(made.certificate)))
     token, _, certificate = said.partition('\n')
     return record.monitor_open, token.strip(), credentials.fingerprint(certificate)

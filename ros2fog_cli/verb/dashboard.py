@@ -24,7 +24,7 @@ class DashboardVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve until interrupted."""
         from fogros2.errors import ConfigurationError
-        from fogros2.monitor.dashboard.server import Dashboard
+        from fogros2_monitor.dashboard.server import Dashboard
         from ros2fog_cli.api.board import Board
         if not 0 <= args.port < 65536:
             raise ConfigurationError(f'--port {args.port} is no port', 'give one up to 65535')

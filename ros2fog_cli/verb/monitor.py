@@ -42,11 +42,11 @@ class MonitorVerb(VerbExtension):
 
 def serve(entry: Entry, port: int, browser: bool) -> int:
     """Carry a port of this computer to the machine's bridge until interrupted."""
+    from fogros2 import monitor_addresses as addresses
     from fogros2.errors import ConfigurationError
-    from fogros2.monitor import urls
-    from fogros2.monitor.tunnel import Tunnel
+    from fogros2_monitor.tunnel import Tunnel
     from ros2fog_cli.api import monitor, reach
-    there = (entry.record.monitor if entry.record is not None else 0) or urls.PORT
+    there = (entry.record.monitor if entry.record is not None else 0) or addresses.PORT
     with reach.session(entry) as shell:
         token = monitor.token_of(entry, shell, there)
         try:
@@ -58,7 +58,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         with monitor.carrying(tunnel) as ended:
             try:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
-                           urls.place('localhost', tunnel.port), token,
+                           addresses.place('localhost', tunnel.port), token,
                            application=monitor.has_application(tunnel.port, token))
                 with monitor.browser_at(page, start=browser):
                     ended.wait()
@@ -69,9 +69,9 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
 
 def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     """Say where the bridge of this computer is, with its token, and lead a browser there."""
-    from fogros2.monitor import urls
+    from fogros2 import monitor_addresses as addresses
     from ros2fog_cli.api import monitor
-    page = say(f'{name} is at {{}}; in a browser:', urls.place('localhost', port), token)
+    page = say(f'{name} is at {{}}; in a browser:', addresses.place('localhost', port), token)
     with monitor.browser_at(page, start=browser) as came:
         came.wait(PATIENCE)
     return 0
@@ -79,7 +79,7 @@ def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
 
 def say(what: str, where: str, token: str, *, application: bool = False) -> str:
     """Print a bridge's address, in place of the braces, and its pages; return the first one."""
-    from fogros2.monitor import urls
+    from fogros2_monitor import urls
     address = urls.with_token(where, token)
     pages = [urls.served(where, token)] if application else \
         [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
@@ -89,7 +89,7 @@ def say(what: str, where: str, token: str, *, application: bool = False) -> str:
 
 def share(entry: Entry) -> int:
     """Print the addresses that others take, with the token, which is the machine's to tell."""
-    from fogros2.monitor import urls
+    from fogros2_monitor import urls
     from ros2fog_cli.api import monitor, reach
     with reach.session(entry) as shell:
         where, token, fingerprint = monitor.credentials_of(entry, shell)

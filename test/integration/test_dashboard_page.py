@@ -15,8 +15,8 @@ import pytest
 pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed')
 
 from fogros2.errors import NameTaken
-from fogros2.monitor.dashboard.server import Dashboard
 from fogros2.waiting import wait_until
+from fogros2_monitor.dashboard.server import Dashboard
 from rigs.browser import Browser, program
 
 pytestmark = [

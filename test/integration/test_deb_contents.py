@@ -23,8 +23,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
 VPN = 'usr/libexec/fogros2/vpn'
-NODES = {package: {path.name for path in (ROOT / package / 'scripts').iterdir() if path.is_file()}
-         for package in ('fogros2', 'fogros2_examples', 'image_transport_h264')}
+#: ROS packages, and the folders whose scripts are their executables.
+SCRIPTS = {'fogros2': 'fogros2_monitor', 'fogros2_examples': 'fogros2_examples',
+           'image_transport_h264': 'image_transport_h264'}
+NODES = {package: {path.name for path in (ROOT / folder / 'scripts').iterdir() if path.is_file()}
+         for package, folder in SCRIPTS.items()}
 
 
 @pytest.fixture(scope='module')
@@ -102,7 +105,8 @@ def test_brings_our_packages_without_the_rigs(
     modules = {Path(name).relative_to(SITE) for name in files
                if name.startswith(f'{SITE}/') and name.endswith('.py')}
     assert {path.parts[0] for path in modules} == {
-        'fogros2', 'fogros2_examples', 'image_transport_h264', 'ros2fog_cli'}
+        'fogros2', 'fogros2_examples', 'fogros2_monitor', 'image_transport_h264', 'ros2fog_cli'}
+    assert f'{SITE}/fogros2_monitor/dashboard/page.html' in files
     assert {path.name for path in modules if path.parts[:2] == ('fogros2', 'testing')} == {
         '__init__.py', 'fakes.py', 'plugins.py', 'provider_contract.py', 'shell_contract.py'}
 

@@ -24,9 +24,9 @@ import threading
 import pytest
 
 from fogros2.model import Command
-from fogros2.monitor import page, urls
 from fogros2.process import run
 from fogros2.waiting import wait_until
+from fogros2_monitor import page, urls
 from ros2fog_cli.api.monitor import has_application
 
 
@@ -62,7 +62,7 @@ def program(module: str, *words: str) -> Iterator[queue.Queue[str]]:
     """Run one of the monitor's programs until the block's end; yield what it says."""
     said: queue.Queue[str] = queue.Queue()
     process = subprocess.Popen(
-        [sys.executable, '-m', f'fogros2.monitor.{module}', *words], stdin=subprocess.PIPE,
+        [sys.executable, '-m', f'fogros2_monitor.{module}', *words], stdin=subprocess.PIPE,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         cwd=Path(__file__).parents[2], env=dict(os.environ))
     reader = threading.Thread(target=lambda: [said.put(line.strip()) for line in process.stdout])

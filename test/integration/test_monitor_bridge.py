@@ -58,7 +58,7 @@ class Bench:
         self.executor.add_node(self.node)
         self._spinning = threading.Thread(target=self.executor.spin)
         self._spinning.start()
-        self.bridge = self.run('-m', 'fogros2.monitor.bridge', '--ros-args', '-p', 'port:=0')
+        self.bridge = self.run('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0')
         self.url = self.until(
             lambda: re.search(r'serving (ws://\S+)', ''.join(self.lines)), 'a bridge')[1]
 
@@ -285,7 +285,7 @@ def test_twenty_viewers_of_which_one_reads_nothing_leave_the_robot_alone(
         bench, seconds, tmp_path):
     token = tmp_path / 'token'
     token.write_text('sesame\n')
-    gate = bench.run('-m', 'fogros2.monitor.gate', '--to', bench.url.rpartition('/')[2],
+    gate = bench.run('-m', 'fogros2_monitor.gate', '--to', bench.url.rpartition('/')[2],
                      '--listen', '127.0.0.1:0', '--token-file', str(token))
     port = bench.until(lambda: re.search(
         r'listening on 127.0.0.1:(\d+)', ''.join(bench.lines)), 'a gate')[1]

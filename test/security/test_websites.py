@@ -80,7 +80,7 @@ def bridge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bridge]:
     with socket.create_server(('127.0.0.1', 0)) as probe:
         port = probe.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fogros2.monitor.serve', '--name', 'planner',
+        [sys.executable, '-m', 'fogros2_monitor.serve', '--name', 'planner',
          '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--guarded', str(port + 1),
          '--secrets', str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

@@ -15,9 +15,9 @@ import numpy
 
 from fogros2.image_transport import streams as transports
 from fogros2.image_transport.streams import StreamTopic
-from fogros2.monitor.dashboard import shots
-from fogros2.monitor.dashboard.meter import LARGE, Meter, ROUND
-from fogros2.monitor.dashboard.ways import (
+from fogros2_monitor.dashboard import shots
+from fogros2_monitor.dashboard.meter import LARGE, Meter, ROUND
+from fogros2_monitor.dashboard.ways import (
     Crossing,
     crossing,
     decoded,

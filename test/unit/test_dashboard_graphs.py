@@ -51,7 +51,7 @@ def launched(launch: str = 'abc123', **changes: Any) -> Record:
 
 def instead(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(graphs, '_PROGRAM', (sys.executable, '-c', program))
+    monkeypatch.setattr(graphs, 'GRAPH', (sys.executable, '-c', program))
 
 
 def test_what_a_program_tells(several: Graphs, monkeypatch: pytest.MonkeyPatch) -> None:

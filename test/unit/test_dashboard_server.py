@@ -16,7 +16,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2.errors import NameTaken
-from fogros2.monitor.dashboard.server import content_policy, Dashboard, HEADER, PAGE
+from fogros2_monitor.dashboard.server import content_policy, Dashboard, HEADER, PAGE
 
 
 class Canned:
@@ -177,7 +177,7 @@ def test_a_ticket_is_for_once_and_for_a_minute(
     assert enter('ticket-other') == (401, None) and enter(1)[0] == 400
     late = dashboard.url_with_ticket().partition('#')[2]
     clock = time.monotonic() + 61
-    monkeypatch.setattr('fogros2.monitor.dashboard.server.time.monotonic', lambda: clock)
+    monkeypatch.setattr('fogros2_monitor.dashboard.server.time.monotonic', lambda: clock)
     assert enter(late) == (401, None)
 
 

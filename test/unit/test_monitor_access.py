@@ -18,7 +18,7 @@ from launch import LaunchContext
 from launch.substitutions import TextSubstitution
 import pytest
 
-from fogros2 import ContainerInstance, Foxglove
+from fogros2 import ContainerInstance, Foxglove, monitor_addresses
 from fogros2.actions import carriers, foxglove, networks, streaming
 from fogros2.deploy import Launch, RunningMachine
 from fogros2.deploy import launch as launches
@@ -26,11 +26,11 @@ from fogros2.deploy.creating import Creation
 from fogros2.deploy.job import Job
 from fogros2.errors import AgentError, ConfigurationError, ProviderError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
-from fogros2.monitor import credentials
 from fogros2.provider.kubernetes import publishing
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.store import process_start, Record, record_from_json, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
+from fogros2_monitor import credentials
 from ros2fog_cli.api import monitor
 from ros2fog_cli.api.machines import Entry
 
@@ -161,10 +161,10 @@ def test_tunnel_reads_the_token_of_the_bridge_s_port():
 
 
 def test_bridge_of_this_computer_is_found_while_it_listens():
-    folder = credentials.on_robot(Store(), 'planner')
+    folder = monitor_addresses.on_robot(Store(), 'planner')
     with socket.create_server(('127.0.0.1', 0)) as bridge:
         port = bridge.getsockname()[1]
-        made = credentials.make_token(Path(credentials.folder_of(str(folder), port, '1')))
+        made = credentials.make_token(Path(monitor_addresses.folder_of(str(folder), port, '1')))
         assert monitor.on_robot('planner') == (port, made.token.read_text().strip())
         assert monitor.on_robot('another') is None
     assert monitor.on_robot('planner') is None
@@ -272,7 +272,7 @@ def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, made, runs, on_
     assert told[-2:] == ('-r', '/camera:=/fogros2/planner/camera')
     # the robot's own has neither others nor an application
     if on_robot:
-        folder = credentials.on_robot(Store(), 'planner')
+        folder = monitor_addresses.on_robot(Store(), 'planner')
         assert words[4:-5] == ['--secrets', f'{folder}/monitor-9000/{os.getpid()}']
     else:
         assert words[4:-5] == [

@@ -10,16 +10,16 @@ import stat
 
 import pytest
 
-from fogros2 import process
+from fogros2 import monitor_addresses, process
 from fogros2.model import Command
-from fogros2.monitor import credentials
+from fogros2_monitor import credentials
 
 with_openssl = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs openssl')
 
 
 @with_openssl
 def test_they_are_private_and_stay_for_a_launch(tmp_path):
-    folder = Path(credentials.folder_of(str(tmp_path), 8765, 'a1b2c3'))
+    folder = Path(monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3'))
     made = credentials.make(folder, 'planner')
     token = made.token.read_text()
     assert len(token.strip()) == 32
@@ -36,7 +36,7 @@ def test_they_are_private_and_stay_for_a_launch(tmp_path):
 
 @with_openssl
 def test_the_fingerprint_is_as_openssl_has_it(tmp_path):
-    made = credentials.make(Path(credentials.folder_of(str(tmp_path), 1, 'x')), 'planner')
+    made = credentials.make(Path(monitor_addresses.folder_of(str(tmp_path), 1, 'x')), 'planner')
     said = process.run(Command(('openssl', 'x509', '-in', str(made.certificate), '-noout',
                         '-fingerprint', '-sha256')), timeout=20).stdout
     assert said.strip().partition('=')[2] == credentials.fingerprint(
@@ -50,7 +50,7 @@ def test_folder_of_somebody_s_own_loses_nothing(tmp_path):
 
 
 def test_token_needs_no_openssl_and_gets_a_certificate_later(tmp_path, monkeypatch):
-    folder = Path(credentials.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
+    folder = Path(monitor_addresses.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
     token = credentials.make_token(folder).token.read_text()
     assert len(token.strip()) == 32
     assert stat.S_IMODE((tmp_path / 'new').stat().st_mode) == 0o700
@@ -62,7 +62,7 @@ def test_token_needs_no_openssl_and_gets_a_certificate_later(tmp_path, monkeypat
 def test_a_machine_without_openssl_lets_nobody_in(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(process, 'argv', lambda command: ['/no/such/openssl'])
     serve = pytest.importorskip(
-        'fogros2.monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
-    folder = credentials.folder_of(str(tmp_path), 8765, 'a1b2c3')
+        'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
+    folder = monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3')
     assert serve.guard(8766, folder, 'planner') == []
     assert 'nobody but the robot is let in: ' in capsys.readouterr().err

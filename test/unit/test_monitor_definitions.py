@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogros2.monitor.definitions import definition, message_class
+from fogros2_monitor.definitions import definition, message_class
 
 RULE = '=' * 80
 

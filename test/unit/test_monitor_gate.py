@@ -19,9 +19,10 @@ import threading
 
 import pytest
 
-from fogros2.monitor import credentials, page
-from fogros2.monitor.gate import endpoint, network, plain_address
-from fogros2.monitor.request import check, check_site, cookie, parse, Refused
+from fogros2 import monitor_addresses
+from fogros2_monitor import credentials, page
+from fogros2_monitor.gate import endpoint, network, plain_address
+from fogros2_monitor.request import check, check_site, cookie, parse, Refused
 
 TOKEN = 'sesame-0123456789'
 
@@ -213,10 +214,10 @@ class Running:
 def running(folder: Path, to: int, *words: str) -> Iterator[Running]:
     if shutil.which('openssl') is None:
         pytest.skip('needs openssl')
-    folder = Path(credentials.folder_of(str(folder), 8765, 'launch'))
+    folder = Path(monitor_addresses.folder_of(str(folder), 8765, 'launch'))
     made = credentials.make(folder, 'planner')
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fogros2.monitor.gate', '--to', f'127.0.0.1:{to}',
+        [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'127.0.0.1:{to}',
          '--listen', '127.0.0.1:0', '--guarded', ':0', '--certificate', made.certificate,
          '--key', made.key, '--token-file', made.token, *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -13,7 +13,7 @@ import sys
 import pytest
 
 serve = pytest.importorskip(
-    'fogros2.monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
+    'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
 
 
 def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
@@ -22,7 +22,7 @@ def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
     assert serve.command('127.9.9.9', 5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
         '--ros-args', '-r', 'b:=c', '-p', 'address:=127.9.9.9', '-p', 'port:=5',
         '-p', 'topic_whitelist:=["/a.*"]']
-    assert serve.command('127.9.9.9', 5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2.monitor.bridge']
+    assert serve.command('127.9.9.9', 5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2_monitor.bridge']
 
 
 def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
@@ -38,7 +38,7 @@ def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
         port = probe.getsockname()[1]
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '')
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fogros2.monitor.serve', '--listen', f'127.0.0.1:{port}',
+        [sys.executable, '-m', 'fogros2_monitor.serve', '--listen', f'127.0.0.1:{port}',
          '--secrets', str(tmp_path / 'secrets'), '--topic', '/camera/*'],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=Path(__file__).parents[2],
         env={**os.environ, 'AMENT_PREFIX_PATH': f'{tmp_path}{os.pathsep}{prefixes}'})

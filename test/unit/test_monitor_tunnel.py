@@ -12,8 +12,8 @@ import threading
 import pytest
 
 from fogros2.model import Endpoint
-from fogros2.monitor.tunnel import Tunnel
 from fogros2.shell.local import LocalShell
+from fogros2_monitor.tunnel import Tunnel
 
 
 @pytest.fixture

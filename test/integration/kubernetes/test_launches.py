@@ -25,6 +25,8 @@ pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2
 PATIENCE = 150.0
 #: Seconds after its end for which a Job stays here, by its ttlSecondsAfterFinished.
 TTL = 5
+#: Has a launch file take the tests' web application for Lichtblick.
+IMAGE = f"from fogros2 import monitor_addresses\nmonitor_addresses.IMAGE = '{APPLICATION}'\n"
 
 HEADER = """
 from fogros2 import CloudNode, FogROSLaunchDescription, KubeInstance
@@ -190,7 +192,7 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
 @pytest.mark.usefixtures('nothing_left')
 def test_pod_serves_the_web_application(launch, namespace):
     run = launch("talker(pod('watched', launch_foxglove=True))", 'listener()',
-                 before=f"from fogros2.monitor import urls\nurls.IMAGE = '{APPLICATION}'\n")
+                 before=IMAGE)
     run.wait_for('I heard', timeout=PATIENCE)
     opener = urllib.request.build_opener(
         urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor())
@@ -222,7 +224,7 @@ def test_pod_serves_the_web_application(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_application_ends_with_a_machine_that_ends_itself(launch, namespace):
     run = launch("talker(pod('watched', launch_foxglove=True, robot_timeout=3))", 'listener()',
-                 before=f"from fogros2.monitor import urls\nurls.IMAGE = '{APPLICATION}'\n")
+                 before=IMAGE)
     run.wait_for('I heard', timeout=PATIENCE)
     run.kill()
 

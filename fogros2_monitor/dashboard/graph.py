@@ -33,8 +33,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from fogros2.monitor.dashboard.meter import Meter
-from fogros2.monitor.dashboard.ways import (
+from fogros2_monitor.dashboard.meter import Meter
+from fogros2_monitor.dashboard.ways import (
     Crossing,
     crossing,
     decoded,
@@ -44,10 +44,10 @@ from fogros2.monitor.dashboard.ways import (
     streams,
     Topic,
 )
-from fogros2.monitor.definitions import message_class
+from fogros2_monitor.definitions import message_class
 
 if TYPE_CHECKING:
-    from fogros2.monitor.dashboard.cameras import Camera
+    from fogros2_monitor.dashboard.cameras import Camera
 
 #: Seconds between two looks at the graph.
 LOOK = 0.5
@@ -142,7 +142,7 @@ class GraphNode(Node):
     def _take_pictures(self, topics: list[Topic], streamed: list[Stream]) -> None:
         """Have a camera for each stream that has pictures, and let those that are due work."""
         try:
-            from fogros2.monitor.dashboard.cameras import Camera, StreamCamera
+            from fogros2_monitor.dashboard.cameras import Camera, StreamCamera
         except ModuleNotFoundError:
             return  # all streams are between machines: the robot needn't have what images take
         by_name = {topic.name: topic for topic in topics}

@@ -16,7 +16,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Empty
 
-from fogros2.monitor.dashboard import shots
+from fogros2_monitor.dashboard import shots
 from image_transport_h264 import stills
 from image_transport_h264.codec import CodecError, Decoder, Missing
 from image_transport_h264.message import KEY_REQUEST, picture

@@ -17,13 +17,11 @@ import ssl
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.store import Store
+from fogros2.monitor_addresses import CREDENTIALS
 
 #: Days for which a certificate is valid; longer than machines live.
 DAYS = 365
 _SECONDS = 60.0
-#: What the name of the folder begins with that the credentials of one port are in.
-_OURS = 'monitor-'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,31 +46,17 @@ class Credentials:
         return self.folder / 'token'
 
 
-def folder_of(agent: str, port: int, launch: str) -> str:
-    """
-    Return where they are on a machine.
-
-    :param agent: the agent's folder there.
-    :param port: the bridge's.
-    """
-    return f'{agent}/{_OURS}{port}/{launch}'
-
-
-def on_robot(store: Store, name: str) -> Path:
-    """Return the folder that stands for the agent's where the machine ``name`` is the robot."""
-    return store.root / f'monitor-{name}'
-
-
 def make_token(folder: Path) -> Credentials:
     """
-    Make the token unless it is there; remove earlier launches' beside one of :func:`folder_of`.
+    Make the token unless it is there; remove earlier launches' beside it.
 
-    :param folder: the launch's own; made with what is above it, 0700.
+    :param folder: the launch's own, see ``monitor_addresses.folder_of``; made with what is above,
+        0700.
     :raises OSError: it can't be written.
     """
     found = Credentials(folder)
     if not found.token.exists():
-        if folder.parent.name.startswith(_OURS):
+        if folder.parent.name.startswith(CREDENTIALS):
             shutil.rmtree(folder.parent, ignore_errors=True)
         for each in (*reversed(folder.parents), folder):
             each.mkdir(mode=0o700, exist_ok=True)

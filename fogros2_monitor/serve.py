@@ -10,7 +10,7 @@ Starts the bridge on a machine, with the gate before it and the web application 
 ``--image IMAGE``       the web application's, '' for none
 
 Where ROS 2's own ``foxglove_bridge`` is installed that runs, otherwise
-:mod:`~fogros2.monitor.bridge`. Either listens on the loopback, at a port and an address of its
+:mod:`~fogros2_monitor.bridge`. Either listens on the loopback, at a port and an address of its
 net 127.0.0.0/8 that no page in a browser can guess: it takes no token. The gate has the port that
 viewers know. Gate and application end when this process does, however that ends.
 """
@@ -30,8 +30,9 @@ import sys
 from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 
 from fogros2.errors import FogError
-from fogros2.monitor import credentials, urls
-from fogros2.monitor.application import say
+from fogros2.monitor_addresses import application_port
+from fogros2_monitor import credentials
+from fogros2_monitor.application import say
 
 #: What the parameter ``topics`` is called by ``foxglove_bridge``, which takes regular expressions.
 _WHITELIST = 'topic_whitelist'
@@ -70,7 +71,7 @@ def command(
     :param theirs: the path of ``foxglove_bridge``, '' for our own.
     :param patterns: of the topics that are shown.
     """
-    program = [theirs] if theirs else [sys.executable, '-m', 'fogros2.monitor.bridge']
+    program = [theirs] if theirs else [sys.executable, '-m', 'fogros2_monitor.bridge']
     name, values = ('topics', list(patterns)) if not theirs else (
         _WHITELIST, [regular_expression(pattern) for pattern in patterns])
     return [*program, '--ros-args', *ros_arguments, '-p', f'address:={address}',
@@ -129,14 +130,14 @@ def main() -> None:
     end, kept = os.pipe()
     os.set_inheritable(kept, True)  # by the bridge: when it is closed the others end
     if ours.image and ours.vpn is not None:
-        inside = urls.application_port(ours.vpn)
+        inside = application_port(ours.vpn)
         gate += ['--application', f'{_LOOPBACK}:{inside}']
         subprocess.Popen(
-            [sys.executable, '-m', 'fogros2.monitor.application', '--image', ours.image,
+            [sys.executable, '-m', 'fogros2_monitor.application', '--image', ours.image,
              '--port', str(inside),
              '--name', ours.name], stdin=end)
     subprocess.Popen(
-        [sys.executable, '-m', 'fogros2.monitor.gate', '--to', f'{address}:{port}',
+        [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'{address}:{port}',
          '--until-eof', *gate], stdin=end)
     os.close(end)
     words = command(address, port, foxglove_bridge(), ours.topic or ['*'], words[at + 1:])

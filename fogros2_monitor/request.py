@@ -11,7 +11,7 @@ import ipaddress
 from typing import Optional
 import urllib.parse
 
-from fogros2.monitor import urls
+from fogros2_monitor import urls
 
 #: What desktop applications say in ``Origin``, where they say anything.
 _DESKTOP = ('null', 'file://')

@@ -31,8 +31,8 @@ import ssl
 import sys
 from typing import Optional, Union
 
-from fogros2.monitor import page
-from fogros2.monitor.request import check, check_site, parse, Refused, Request
+from fogros2_monitor import page
+from fogros2_monitor.request import check, check_site, parse, Refused, Request
 
 #: Variable of all nodes on a machine: its address in the VPN.
 VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'

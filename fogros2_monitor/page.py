@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import html
 
-from fogros2.monitor import urls
-from fogros2.monitor.request import cookie, is_loopback, Request
+from fogros2_monitor import urls
+from fogros2_monitor.request import cookie, is_loopback, Request
 
 #: Says of an answer that it is the gate's own, not the application's.
 MARK = 'X-FogROS2-Gate'

@@ -32,7 +32,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
-from fogros2.monitor.definitions import definition, message_class
+from fogros2_monitor.definitions import definition, message_class
 
 #: Seconds between two looks at which topics there are.
 LOOK = 0.5

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Addresses of a machine's bridge to Foxglove, and where its credentials are on the machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fogros2.store import Store
+
+#: Port on which viewers expect a bridge.
+PORT = 8765
+#: Lichtblick as a container, which serves HTTP on port 8080. By digest: it is what it was when it
+#: was chosen, or it isn't taken.
+IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
+         'ebaff0942173dc42c221ec0cc14d2bd7e6591e27c16cd11c8b2e557ce8da28d9')
+#: What the name of the folder begins with that the credentials of one port are in.
+CREDENTIALS = 'monitor-'
+
+
+def guarded_port(port: int) -> int:
+    """Return the port at which others than the robot are let in, beside a bridge's own."""
+    return port + 1
+
+
+def application_port(port: int) -> int:
+    """Return the port of the loopback that the web application has, beside a bridge's own."""
+    return port + 2
+
+
+def place(host: str, port: int) -> str:
+    """Return ``host:port``, an IPv6 address in brackets."""
+    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
+
+
+def bridge(host: str, port: int) -> str:
+    """Return a bridge's address without its token."""
+    return f'ws://{place(host, port)}'
+
+
+def folder_of(agent: str, port: int, launch: str) -> str:
+    """
+    Return where a launch's credentials are on a machine.
+
+    :param agent: the agent's folder there.
+    :param port: the bridge's.
+    """
+    return f'{agent}/{CREDENTIALS}{port}/{launch}'
+
+
+def on_robot(store: Store, name: str) -> Path:
+    """Return the folder that stands for the agent's where the machine ``name`` is the robot."""
+    return store.root / f'monitor-{name}'

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Watching a deployment from a browser: the bridge to Foxglove, its gate, and the dashboard.
+
+:mod:`~fogros2_monitor.serve` starts the bridge on a machine, :mod:`~fogros2_monitor.gate` lets in
+who has the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_monitor.page`,
+:mod:`~fogros2_monitor.credentials`), :mod:`~fogros2_monitor.bridge` speaks Foxglove's WebSocket
+protocol with :mod:`~fogros2_monitor.definitions` of messages,
+:mod:`~fogros2_monitor.application` runs the web application in a container, and
+:mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open it on the robot.
+:mod:`~fogros2_monitor.dashboard` is the page of ``ros2 fog dashboard``.
+
+``fogros2`` does not import this package. It finds the two programs below by the entry-point group
+``fogros2.monitor``.
+"""
+
+import sys
+
+#: Package and executable that serve a machine's topics to Foxglove.
+FOXGLOVE = ('fogros2', 'bridge')
+#: Command that prints the topics of a launch, see :mod:`~fogros2_monitor.dashboard.graph`.
+GRAPH = (sys.executable, '-m', 'fogros2_monitor.dashboard.graph')
