@@ -57,9 +57,8 @@ setup(
     description='Runs nodes of a ROS 2 launch file on machines in the cloud',
     license='Apache-2.0',
     python_requires='>=3.10',
-    packages=find_packages(include=[
-        'fogros2*', 'fogros2_examples*', 'fogros2_monitor*', 'image_transport_h264*',
-        'ros2fog_cli*']),
+    # folders with an __init__.py: a test compares them with plugin_system.OWN_PACKAGES
+    packages=find_packages(),
     package_data={'fogros2': ['locked.txt', 'py.typed'],
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),

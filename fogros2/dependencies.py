@@ -23,11 +23,11 @@ from fogros2 import locked, modules, plan
 from fogros2.errors import ConfigurationError
 from fogros2.host import DISTRO, HostFacts
 from fogros2.model import Command, MachineSpec
+from fogros2.plugin_system import OWN_PACKAGES
 from fogros2.workspace import run_dependencies, Workspace
 
 #: Packages that only this project's own wheels may bring, and the modules in them.
-OURS = ('fogros2', 'fogros2-examples', 'fogros2-monitor', 'image-transport-h264', 'ros2-embedded',
-        'ros2fog-cli')
+OURS = tuple(locked.name_of(name) for name in (*OWN_PACKAGES, 'ros2_embedded'))
 #: A package's name, with an architecture and a version where those are named.
 _APT = re.compile(r'[a-z0-9][a-z0-9+.-]+(:[a-z0-9-]+)?(=[A-Za-z0-9.+:~-]+)?')
 #: A requirement begins with a name (PEP 508): neither an option nor a bare address.

@@ -22,8 +22,9 @@ GROUPS = {
     'fogros2.image_transport': 'image transport',
     'fogros2.monitor': 'monitor',
 }
-#: Packages of this project: an index may have another project of such a name.
-_OWN = ('fogros2', 'fogros2_monitor', 'image_transport_h264', 'ros2fog_cli')
+#: All packages that setup.py installs: a package index may have other projects of these names.
+OWN_PACKAGES = (
+    'fogros2', 'fogros2_examples', 'fogros2_monitor', 'image_transport_h264', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=None)
@@ -55,7 +56,7 @@ def load(group: str, name: str) -> Any:
         return points[name].load()
     except ImportError as error:
         module = error.name or name
-        ours = module.partition('.')[0] in _OWN
+        ours = module.partition('.')[0] in OWN_PACKAGES
         raise PrerequisiteError(
             f"the {GROUPS.get(group, group)} '{name}' can't be loaded: {error}",
             'install FogROS2 again from the folder that it came from' if ours else

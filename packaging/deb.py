@@ -34,7 +34,7 @@ PREFIX = Path('opt/ros/jazzy')
 #: Of Ubuntu 24.04.
 SITE_PACKAGES = PREFIX / 'lib/python3.12/site-packages'
 #: Packages of this source tree, which are in the one that is built.
-OWN = {'fogros2', 'fogros2_examples', 'image_transport_h264'}
+OWN = {'fogros2', *(path.parent.name for path in ROOT.glob('*/package.xml'))}
 #: What rosdep's keys are in Ubuntu 24.04, with the version that it has, the oldest that is tried.
 UBUNTU = {
     'iproute2': 'iproute2',

@@ -175,8 +175,9 @@ checksum() { sha256sum | cut -c 1-16; }
 
 # Hash of the files that get installed, and of those that say what they need.
 sources_hash() {
-    find setup.py setup.cfg package.xml resource launch fogros2 fogros2_examples \
-        fogros2_monitor ros2fog_cli image_transport_h264 ros2_embedded -name __pycache__ -prune -o -name '*.egg-info' -prune \
+    # shellcheck disable=SC2046
+    find setup.py setup.cfg package.xml resource launch $(dirname -- */__init__.py) ros2_embedded \
+        -name __pycache__ -prune -o -name '*.egg-info' -prune \
         -o -name .cache -prune -o -name '*.pyc' -o -type f -print0 2>/dev/null \
         | sort -z | xargs -0 sha256sum | checksum
 }
