@@ -405,7 +405,7 @@ def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
 @pytest.mark.parametrize('module', [
     'rclpy.action', 'rclpy.guard_condition', 'rclpy.wait_for_message', 'rclpy.waitable',
     'example_interfaces.action', 'tf2_msgs.action', 'launch_ros.parameters_type',
-    'rosidl_runtime_py.get_interfaces'])
+    'rosidl_runtime_py.get_interfaces', 'launch_testing', 'launch_pytest'])
 def test_modules_that_are_lacking_are_named(module):
     with pytest.raises(ImportError, match=f'{module} is not part of the embedded default'):
         importlib.import_module(module)
