@@ -22,6 +22,8 @@ from fogros2.actions import override
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
+#: Pages without a limit of words: generated ones, and lists that readers search.
+REFERENCES = ('migration.md', 'not_verified.md', 'paper.md', 'troubleshooting.md')
 _BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
 
 
@@ -127,6 +129,13 @@ def test_links(page):
             assert anchor in anchors, f'{page.name}: {target}'
 
 
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_page_that_explains_is_short(page):
+    name = page.relative_to(ROOT).as_posix()
+    if not name.startswith('doc/reference/') and page.name not in REFERENCES:
+        assert len(page.read_text().split()) <= (800 if name == 'README.md' else 1500)
+
+
 def test_all_figures_are_shown():
     shown = set(re.findall(r'benchmarks/results/(.*\.md)', (ROOT / 'doc/figures.md').read_text()))
     assert shown == {path.name for path in (ROOT / 'benchmarks/results').glob('*.md')}
@@ -147,6 +156,15 @@ def test_files_that_stand_for_the_paper_exist():
     assert len(named) > 50
     assert [name for name in named if not name.startswith('.cache') and not (ROOT / name).exists()
             ] == []
+
+
+@pytest.mark.parametrize('page', [
+    'architecture', 'architecture_features', 'decisions', 'machine_life', 'security'])
+def test_modules_that_a_page_names_exist(page):
+    text = re.sub('```.*?```', '', (ROOT / f'doc/{page}.md').read_text(), flags=re.DOTALL)
+    named = re.findall(r'`([\w/]+(?:/|\.py))`', text)
+    assert [name for name in named if not (ROOT / name).exists()
+            and not (ROOT / 'fogros2' / name).exists()] == []
 
 
 def test_providers_import_what_their_page_says():
