@@ -93,7 +93,7 @@ def main() -> None:
 
         vendor = launch.dds()
         address = machine.machine.vpn_host
-        # the same nodes, told of the bridge's addresses instead of the VPN's
+        # the same nodes, with the bridge's addresses instead of the VPN's
         bridge = subprocess.run(
             ['ip', '-o', 'route', 'get', address], check=True, capture_output=True,
             text=True).stdout.split()

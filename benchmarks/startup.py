@@ -2,7 +2,7 @@
 """
 How long a launch on a rented machine takes from ``ros2 launch`` to the first message.
 
-Against EC2 in a box (``rigs.ec2``), whose instances boot as slowly as they are told.
+Against EC2 in a box (``rigs.ec2``), whose instances boot as slowly as configured.
 *Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
 without the installation of ROS 2 on an image that has none. The instances are this computer's own
 containers: where many boot at once they share its cores, as EC2's wouldn't. The robot's CPU is

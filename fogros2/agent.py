@@ -71,7 +71,7 @@ MAX_LINE = 16 << 20
 #: Bytes of one generation of the log; two are kept.
 LOG_BYTES = 64 << 20
 LAUNCH_LOG_BYTES = 8 << 20
-#: Bytes of its end that are told when the launch process fails.
+#: Bytes from the end of the log that are reported when the launch process fails.
 LAST_WORDS = 1000
 BLOCK = 1 << 18
 CLIENTS = 64
@@ -81,7 +81,7 @@ SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKI
 #: Seconds that a keep's command may take, and between attempts to end the machine.
 COMMAND_TIMEOUT = 30.0
 RETRY_END = 30.0
-#: Events that a watch may be for, and bytes of what its command prints that are told.
+#: Events that a watch may be for, and bytes of its command's output that are reported.
 WATCHED = ('notice',)
 REASON = 2000
 MARK = 'FOGROS2_AGENT_MARK'
@@ -1192,7 +1192,7 @@ class Agent:
             except BlockingIOError:
                 pass
             except OSError:
-                launch.out.clear()  # it died; that is told when its status has been collected
+                launch.out.clear()  # it died; that is reported when its status has been collected
         if mask & selectors.EVENT_READ:
             self._receive(launch)
         wanted = 0 if launch.silent else selectors.EVENT_READ

@@ -350,7 +350,7 @@ class AgentClient:
             if silent > self._silence:
                 stream.close()
             elif self._writing.acquire(timeout=self._silence / 4):
-                # whoever holds it for longer is stuck in a dead link himself
+                # a thread that holds the lock for longer is stuck in a dead link
                 self._writing.release()
                 self._send(stream, _PING)
 

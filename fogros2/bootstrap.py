@@ -152,8 +152,8 @@ def ensure(
     :param under: the environment of the robot's launch.
     :param timeout: seconds that each command may take.
     :param wheel_folder: the robot's wheel cache, if not the usual one.
-    :param on_plan: is told how things will run there as soon as files can be sent and the VPN set
-        up, which needs nothing of what takes longest.
+    :param on_plan: called with the plan as soon as files can be sent and the VPN set up, which do
+        not need the slowest steps.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :param packages: those of the nodes that will run there.
     :returns: how things run there, and a few words on what was done.

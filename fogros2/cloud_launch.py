@@ -87,7 +87,7 @@ class Node:
         self.stopping = False
         self.expected = True
         self.waiting: list[str] = []  # signals that came before the process
-        self.held: list[tuple[str, str]] = []  # output that launch told of before its process
+        self.held: list[tuple[str, str]] = []  # output that launch reported before its process
         decoder = codecs.getincrementaldecoder('utf-8')
         self.decoders = {name: decoder('replace') for name in ('stdout', 'stderr')}
 

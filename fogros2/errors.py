@@ -42,7 +42,7 @@ class FogError(RuntimeError):
 
     #: Set by who was asked to make something: nothing was made, and there is nothing to look for.
     refused: bool = False
-    #: What of its own whoever raises this could not take away again: to be told beside it.
+    #: Resources that the failed step could not clean up; reported with the error.
     undo_failures: tuple[FogError, ...] = ()
 
     def __init__(self, message: str, hint: str = '') -> None:

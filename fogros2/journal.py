@@ -155,7 +155,7 @@ def steps(lines: list[str]) -> list[Step]:
             elif kind in ('done', 'failed'):
                 seconds = float(event['seconds'])
                 if index is None:
-                    # an undo that failed is told in the end alone
+                    # an undo that failed is reported only at the end
                     found.append(Step(machine, name, at - seconds))
                     index = len(found) - 1
                 found[index] = dataclasses.replace(

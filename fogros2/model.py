@@ -111,7 +111,7 @@ class Machine:
     :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' where it
         can't, so that the machine has to dial the robot.
     :param robot_host: where ``vpn_host`` is '': the robot's address as this machine can dial it
-        (UDP, the robot's VPN port); whoever knows that address, an option or the provider.
+        (UDP, the robot's VPN port), from an option or from the provider.
     :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same.
     :param inner_network: names the network in which ``inner_host`` means something (a cluster, a
         VPC); two machines of one inner network dial each other there.

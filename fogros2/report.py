@@ -35,7 +35,7 @@ class StepFailed:
     """
     A step failed after ``seconds``; an undo that failed is one too.
 
-    :param fatal: the error goes on up and will be told there too; otherwise this is all.
+    :param fatal: the error goes on up and will be reported there too; otherwise this is all.
     """
 
     machine: str
@@ -89,7 +89,7 @@ def step(
 
     An exception is reported as StepFailed and goes on up.
 
-    :param fatal: whether whoever takes the exception tells it once more.
+    :param fatal: whether the exception's handler reports it once more.
     """
     detail: list[str] = []
     report(StepStarted(machine, name))

@@ -299,7 +299,7 @@ def _contents(
         if relative.parts[0] != 'bin':
             yield f'{data}/data/{relative}', source
         elif source.name not in scripts:
-            # those of entry points are made anew by whoever installs
+            # the installer makes those of entry points anew
             yield f'{data}/scripts/{source.name}', source
 
 

@@ -76,8 +76,8 @@ class _Topic:
         if self._requests is not None:
             self._requests.publish(Empty())
         if self._subscription is not None and self._latched:
-            # Only a new subscription is told again. The others hear it twice, which a topic of
-            # this kind doesn't mind.
+            # Only a new subscription receives latched messages again. The other viewers receive
+            # them twice, which does no harm for a latched topic.
             self._unsubscribe()
         if self._subscription is None:
             self._subscribe()

@@ -3,7 +3,7 @@
 H.264 byte streams, and the unit in them that carries what a ROS image has and H.264 has not.
 
 Annex B of ITU-T H.264 puts start codes between NAL units. A SEI message "user data unregistered"
-(D.1.6, payload type 5) belongs to whoever owns its UUID; every decoder skips those it doesn't
+(D.1.6, payload type 5) belongs to the owner of its UUID; every decoder skips those it doesn't
 know, so a stream with ours in it is a plain stream to all others.
 """
 

@@ -29,7 +29,7 @@ IMAGE_QOS = QoSProfile(
 FEEDBACK_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE)
-#: Pieces of packets: whoever takes them has no use for those that come late.
+#: Pieces of packets: late ones are of no use to their reader.
 PIECES_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE)

@@ -211,7 +211,7 @@ class VideoSender(Sender):
     def _matched(self) -> None:
         known = self.listeners()
         if known > self._known:
-            # whoever is new has nothing to begin with
+            # a new reader has no key picture to begin with
             with self._lock:
                 self._key_wanted = True
         self._known = known

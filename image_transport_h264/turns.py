@@ -24,8 +24,8 @@ class Turns:
     """
     Advisory locks on what is there anyway, so that nothing is made; the kernel frees a dead one's.
 
-    Whoever has the turn can't take it again before one who waits: there is a lock for the next in
-    line as well, which he holds until it is his turn.
+    A process that has the turn can't take it again before one that waits: the next in line holds a
+    second lock until its turn comes.
 
     :param path: a file, the same for all who take turns; its folder stands for the line.
     """

@@ -18,7 +18,7 @@ import urllib.request
 
 import pytest
 
-#: What ``colcon test`` runs unless it is told otherwise: what makes no machine.
+#: What ``colcon test`` runs by default: what makes no machine.
 QUICK = ['test/unit', 'test/contract', 'test/launch']
 #: Regions that the AWS of the tests has.
 MOTO_REGIONS = ('eu-central-1', 'us-east-1')

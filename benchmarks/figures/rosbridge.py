@@ -34,7 +34,7 @@ def fields(message: Any) -> Any:
 
 
 class Server:
-    """Serves one topic to whoever subscribes."""
+    """Serves one topic to its subscribers."""
 
     def __init__(self, topic: str, kind: Any) -> None:
         self._topic = topic

@@ -152,7 +152,7 @@ class Coordinator:
 
     def engage(self) -> None:
         """
-        Take it that this launch uses the cloud: from now on its nodes get the DDS environment.
+        Note that this launch uses the cloud: from now on its nodes get the DDS environment.
 
         :raises FogError: the environment can't be had, such as for an unknown RMW_IMPLEMENTATION.
         """

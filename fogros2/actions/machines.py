@@ -242,10 +242,10 @@ class CloudInstance:
         self.takes_containers()
 
     def takes_containers(self) -> None:
-        """Take it that containers will run on the machine."""
+        """Note that containers will run on the machine."""
 
     def is_up(self, running: RunningMachine) -> None:
-        """Take it that the machine is up; for the launch to call."""
+        """Note that the machine is up; called by the launch."""
         self._running = running
 
     def spec(self, context: LaunchContext) -> MachineSpec:

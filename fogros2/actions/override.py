@@ -100,7 +100,7 @@ class Overrides:
         for override in self._overrides:
             if not any(fnmatch.fnmatchcase(name, override.pattern) for name in names):
                 raise ConfigurationError(
-                    f'--machine {override.pattern}=...: no machine of this launch is called so',
+                    f'--machine {override.pattern}=...: this launch has no machine of this name',
                     keywords.near(override.pattern, names, all_too=True)
                     or 'it has no machine at all')
 

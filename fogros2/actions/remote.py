@@ -33,7 +33,7 @@ class RemoteProcess(ExecuteLocal):
 
     _fogros2_machine: SomeMachine
     _fogros2_streams: Sequence[Entry] = ()
-    #: Container image that the process runs in there, and what ``docker run`` is told besides.
+    #: Container image that the process runs in there, and options of its ``docker run``.
     _fogros2_image = ''
     _fogros2_image_options: Sequence[str] = ()
     _fogros2_session: Session

@@ -143,7 +143,7 @@ class RemoteRun:
         self.action.come_here(self._context)
 
     def unseen(self) -> None:
-        """Take it that its end there won't be told of."""
+        """Stop waiting for the remote process: the agent will not report its exit."""
         if self._moving:
             self._arrive()
         else:

@@ -59,10 +59,10 @@ class Run(Protocol):
         """Take an event of the agent that names this process."""
 
     def end(self) -> None:
-        """Take it that nothing more will happen."""
+        """Stop waiting for events of the process: none will come."""
 
     def unseen(self) -> None:
-        """Take it that its end there won't be told of."""
+        """Stop waiting for the remote process: the agent will not report its exit."""
 
     def move(self, *, stop: bool) -> None:
         """Go on on the robot, once the machine has ended it if it has to ``stop`` it."""
@@ -172,7 +172,7 @@ class Session:
             self._told = None
 
     def give_up(self) -> None:
-        """Take it that the machine won't come up any more, if it isn't up."""
+        """Stop waiting for the machine to come up, if it isn't up."""
         if not self.came_up.done():
             self.came_up.set_result(False)
 
@@ -240,7 +240,7 @@ class Session:
             self.spec = dataclasses.replace(self.asked, options=options)
 
     def up(self, running: RunningMachine) -> None:
-        """Take it that the machine is up: what waited for it starts."""
+        """Note that the machine is up, and start what waited for it."""
         self.running = running
         if not self.came_up.done():
             self.came_up.set_result(True)
@@ -360,7 +360,7 @@ class Session:
             run.move(stop=not self.lost and run not in ended)
 
     def end_all(self) -> None:
-        """Take it that all that ran on a machine that is gone has ended."""
+        """Note the end of all processes of a machine that is gone."""
         for run in list(self._runs.values()):
             run.end()
 

@@ -31,7 +31,7 @@ class Router:
 
 class DdsVendor(abc.ABC):
     """
-    A ROS middleware that can be told its interfaces and peers; pure.
+    A ROS middleware whose interfaces and peers can be configured; pure.
 
     :param domain: ROS_DOMAIN_ID of the launch.
     :raises DdsError: the middleware has no such domain.
@@ -41,7 +41,7 @@ class DdsVendor(abc.ABC):
     rmw: ClassVar[str]
     #: Ranges of UDP ports, first and last, that the robot's nodes listen at beside the domain's.
     ports: ClassVar[Sequence[tuple[int, int]]] = ()
-    #: Whether the VPN's interface is told by its address in place of its name.
+    #: Whether the VPN's interface is configured by its address in place of its name.
     by_address: ClassVar[bool] = False
     #: What the configuration's file is called, where the middleware minds.
     file_name: ClassVar[str] = 'dds.xml'

@@ -61,7 +61,7 @@ class Choices:
             return None  # a price is for people to read; what limits it was checked
 
     def begin(self, name: str, price: Optional[Decimal]) -> None:
-        """Take it that a machine costs money since the first time that this is called."""
+        """Note that a machine costs money since the first call of this."""
         if price is None:
             return
         with self._lock:
@@ -69,7 +69,7 @@ class Choices:
             self._costs[name] = (price, begin, None)
 
     def end(self, name: str) -> None:
-        """Take it that a machine costs this launch nothing more; harmless twice."""
+        """Note that a machine costs this launch nothing more; harmless twice."""
         with self._lock:
             known = self._costs.get(name)
             if known is not None and known[2] is None:

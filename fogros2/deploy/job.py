@@ -48,7 +48,8 @@ class Job:
         self.former = ''
         #: Until the machine is up.
         self.failed = True
-        #: Whether it runs no longer, by the provider's word, and whether it is no more at all.
+        #: ``gone``: the provider reports the machine as stopped.
+        #: ``deleted``: the provider no longer knows the machine.
         self.gone = self.deleted = False
         self.shell: Optional[Shell] = None
         #: Asks the machine's agent for a sign of life, within so many seconds.
@@ -76,7 +77,7 @@ class Job:
         """
         Push an undo step; its failure is reported, and the others run all the same.
 
-        What a machine that doesn't answer keeps is told together, in the end.
+        What stays on a machine that doesn't answer is reported once, in the end.
         """
         self.undo.callback(self.undone, name, undo)
 
@@ -149,7 +150,7 @@ class Job:
                 raise
 
     def hurry(self) -> None:
-        """Take it that the machine doesn't answer: the rest of the way down is tried shortly."""
+        """Shorten the time-outs of the remaining undo steps: the machine doesn't answer."""
         self._hurried = True
 
     def patience(self, seconds: float) -> float:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Seconds between two uses of sudo's ticket, which lives for some minutes after each.
 TICKET_REFRESH = 30.0
-#: Seconds that a new machine waits for the others to have been told of it.
+#: Seconds that a new machine waits until the others know it as a peer.
 TELLING = 5.0
 #: Seconds between two attempts to repair the interface, at the most, where they fail.
 SELDOM = 15.0
@@ -106,9 +106,9 @@ class RobotVpn:
 
     def spread(self, new: VpnMember) -> None:
         """
-        Let the machines that are there already know of a new one.
+        Add a new machine to the peers of the others.
 
-        One that can't be told now is told as soon as it can be: the new machine needn't wait.
+        A machine that can't be updated now is updated later: the new one needn't wait.
         """
         new.update(self)
         with self._lock:
@@ -132,12 +132,12 @@ class RobotVpn:
                 if pause == 1.0 and not self._launch.ending:
                     self._launch.report(StepFailed(
                         member.name, 'VPN peers', 0.0,
-                        f'not told of a new machine yet, will be again: {error}', fatal=False))
+                        f'does not know a new machine yet, trying again: {error}', fatal=False))
             self._stop.wait(pause)
             pause = min(2 * pause, 5.0)
 
     def remove(self, name: str) -> None:
-        """Forget a machine; the robot's interface is told unless it goes as well."""
+        """Forget a machine; update the robot's interface unless it goes as well."""
         with self._lock:
             gone = self._members.pop(name, None)
             if gone is not None and self._up and not self._launch.ending:
@@ -160,7 +160,7 @@ class RobotVpn:
                     return
                 if self._launch.ending:
                     continue  # with the machines go the networks that lead to them
-                # what can't be repaired is told now and then, not each second
+                # what can't be repaired is reported now and then, not each second
                 pause = min(2 * pause, SELDOM)
                 try:
                     alive = process.run(self.vpn.alive(self.interface), check=False,

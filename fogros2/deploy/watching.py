@@ -27,7 +27,7 @@ class Watch:
     """
     Asks the provider about a machine whose heartbeat stays away, until it is known to be gone.
 
-    A machine that is merely out of reach exists still: nothing is told of it. An error of no known
+    A machine that is merely out of reach still exists: nothing is reported. An error of no known
     kind is a fault of ours, or of a plugin: it is said at once, as nobody watches from then on,
     and raised by ``close``, so that the nodes needn't suffer from it.
 

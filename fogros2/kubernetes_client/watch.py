@@ -34,7 +34,7 @@ class Server(Protocol):
 
 class Watch:
     """
-    One watch: a thread asks and reads its lines, so that whoever waits can be cancelled.
+    One watch: a thread asks and reads its lines, so that a waiting caller can be cancelled.
 
     An API server that takes the connection and says nothing holds up that thread alone.
     """
@@ -113,7 +113,7 @@ class Watch:
             self._ended = True
             response, self._response = self._response, None
         if response is None:
-            return  # it has ended, or asks still, and whoever does closes it
+            return  # it has ended, or its thread still asks, and closes it
         with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
             _wake(response)
         self._thread.join(2.0)

@@ -55,8 +55,8 @@ class Provider(abc.ABC):
     #: Command line that an agent runs as root every few seconds; once it exits with 0 the machine
     #: is about to be taken away, and what it printed says why and when. Empty: no such notice.
     notice: ClassVar[tuple[str, ...]] = ()
-    #: Set when the launch that this provider works for is to end: whoever asks for something on
-    #: the way up, and takes long, gives up with Cancelled. What begins later is the way down.
+    #: Set when the launch that this provider works for is to end: long calls on the way up give
+    #: up with Cancelled. Calls that begin later belong to the way down.
     cancel: Optional[threading.Event] = None
 
     @classmethod
@@ -105,7 +105,7 @@ class Provider(abc.ABC):
         """
         Return the spec with every open choice made ('nearest' region, 'cheapest' type).
 
-        Asks whoever it takes, at no cost; called once, after ``check`` and before ``create``.
+        May ask the provider, at no cost; called once, after ``check`` and before ``create``.
 
         :raises FogError: nothing there is fits, or nobody answers.
         """

@@ -48,7 +48,7 @@ ETC = (
 #: links takes a file system longer than a mount.
 MANY = 40
 
-#: Never copied, wherever it lies and whoever may read it.
+#: Never copied, with any path and any permissions.
 _SECRET = re.compile(
     r'/auth\.conf|/opasswd|/private(/|$)|_key$|\.key$|/id_(rsa|ecdsa|ed25519)'
     r'|credential|secret|htpasswd|(\.bak|\.old|\.orig|-)$', re.IGNORECASE)

@@ -57,7 +57,7 @@ class Channel:
             self._lost = error
             self._changed.notify_all()
 
-    # -- for whoever has it ---------------------------------------------------------------------
+    # -- for its user ----------------------------------------------------------------------------
 
     @property
     def exit_status(self) -> Optional[int]:

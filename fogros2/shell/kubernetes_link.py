@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 RESUME = 45.0
 #: Seconds of silence after which the pod is asked for a word.
 ASK = 15.0
-#: Seconds for which a frame may stand still half-way, in or out: whoever moves one holds the lock,
-#: and a cut in the middle of it would hold up everybody else, the end of the launch too.
+#: Seconds for which a frame may stand still half-way, in or out: its thread holds the lock, so a
+#: cut in the middle of it would block all other threads, the end of the launch too.
 STALL = 10.0
 _STDIN, _STDOUT, _STDERR, _ERROR = range(4)
 #: Reads the program from its standard input, of which it is the beginning.

@@ -47,7 +47,7 @@ CHUNK = 1 << 15
 SILENCE = 60.0
 #: Seconds for which commands outlive a lost connection.
 OUTLIVE = 60.0
-#: Counted bytes after which the other side is told that they have come.
+#: Counted bytes after which their arrival is acknowledged.
 ACK_EVERY = 1 << 18
 
 

@@ -2,8 +2,8 @@
 """
 WireGuard whose interfaces on the robot may be made by a helper of root's, without a password.
 
-An administrator installs the helper and says who may use it (``packaging/vpn_helper``). Which way
-an interface was made is told by where its key is, in records of earlier launches too: below
+An administrator installs the helper and says who may use it (``packaging/vpn_helper``). The
+folder of its key shows which way an interface was made, in records of earlier launches too: below
 ``KEYS`` it is the helper's, elsewhere root's commands make it. Machines' interfaces always are
 made by those.
 """

@@ -248,8 +248,8 @@ def _link(interface: VpnInterface) -> _Step:
     Return the step that makes the interface.
 
     ``wireguard-go`` exits when its socket goes, and makes the TUN itself where there is none; made
-    by ``ip tuntap`` it stays when that process dies, and so do the sockets of the nodes. It is
-    told from others of its name, in containers say, by its network namespace.
+    by ``ip tuntap`` it stays when that process dies, and so do the sockets of the nodes. Its
+    network namespace tells it from other processes of its name, such as those in containers.
 
     A port that somebody has is found before: ``wireguard-go`` may bind it after all has been set,
     and tell nobody that it couldn't.

@@ -56,7 +56,7 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
     """
     Return the first motion that a search finds, or why none did.
 
-    :raises SystemExit: whoever asked has gone; the searches are ended.
+    :raises SystemExit: the caller has gone; the searches are ended.
     :param asked: ``start``, ``goal``, ``seconds``; of ``seeds`` each is a search, by the planner
         of ``planners`` whose turn it is.
     """

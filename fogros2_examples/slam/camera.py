@@ -41,7 +41,7 @@ from fogros2_examples.slam.tum import DatasetError
 
 #: Seconds for the last poses, and the path, to come back.
 PATIENCE = 5.0
-#: Poses of which an error can be told.
+#: Poses from which an error can be computed.
 FEWEST = 3
 #: Pixels: ORB looks for corners 31 from an image's edge; no codec takes more.
 NARROWEST, WIDEST = 64, 4096

@@ -99,7 +99,7 @@ class GraphNode(Node):
         self._pictures = pictures
 
     def tell(self, what: dict[str, Any]) -> None:
-        """Print a line; whoever no longer reads it has closed the standard input, too."""
+        """Print a line; a reader that is gone has closed the standard input, too."""
         with contextlib.suppress(BrokenPipeError):
             sys.stdout.write(json.dumps(what) + '\n')
             sys.stdout.flush()
@@ -191,7 +191,7 @@ def _take_lines(node: GraphNode, ended: functools.partial[None]) -> None:
 
 def main() -> None:
     """Run until the standard input ends."""
-    os.nice(5)  # whoever looks must not take the processor from those who work
+    os.nice(5)  # watching must not take the processor from the nodes
     rclpy.init(args=[])
     node = GraphNode()
     threading.Thread(target=_take_lines, args=(

@@ -26,7 +26,7 @@ class Meter:
         self._listening = True
         self._rate: Optional[float] = None
         self._bandwidth: Optional[float] = None
-        #: Whether what is told is of a taste.
+        #: Whether the rate was measured for a part of the time only.
         self.sampled = False
 
     def heard(self, now: float, size: int) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Serves the page and its data on the loopback, to whoever has the token.
+Serves the page and its data on the loopback, to clients that have the token.
 
 The token stands in the fragment of the page's address, which no browser sends: the page puts it
 into a header of each request, which no other site's page can. ``Host`` has to be the loopback's
@@ -80,7 +80,7 @@ class Dashboard:
 
     @property
     def url(self) -> str:
-        """Where a browser finds it; whoever knows it may look and delete."""
+        """Address for a browser; everyone who knows it may look and delete."""
         return f'http://{self.hosts[0]}/#{self.token}'
 
     def url_with_ticket(self) -> str:

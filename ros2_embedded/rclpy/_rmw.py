@@ -99,8 +99,8 @@ def configuration(domain: int) -> str:
     if given == 'LOCALHOST' and not _names_interfaces(uri):
         # ROS 2's Cyclone DDS says hello over the loopback, and hears those who have this computer
         # among their peers, whatever interface it has chosen; this one hears nothing from an
-        # interface that it wasn't told of. It asks peers from the first one alone, which leads
-        # nowhere from a loopback
+        # interface that its configuration lacks. It asks peers from the first one alone,
+        # which leads nowhere from a loopback
         chosen = '<NetworkInterface autodetermine="true"/>' if _leads_away() else ''
         last = ' priority="-1"' if peers else ''
         general += f'<Interfaces><NetworkInterface name="lo"{last}/>{chosen}</Interfaces>'

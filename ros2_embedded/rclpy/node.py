@@ -133,7 +133,7 @@ class Node(NodeParameters, NodeGraph):
             except RCLError:
                 if self_context.ok():
                     raise
-                # a signal came in between: it went to the console, nobody is told any more
+                # a signal came in between: the message went to the console only
 
         self_context = self._context
         self._rosout = publish

@@ -29,7 +29,7 @@ class RequestId(NamedTuple):
 
     @property
     def gid(self) -> bytes:
-        """The client's id, as others are told it."""
+        """The client's id, as published to others."""
         return struct.pack('<QQ', self.writer_guid, self.publication)
 
 

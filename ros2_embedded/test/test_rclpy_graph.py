@@ -276,7 +276,7 @@ def test_rosout(world):
 # --- lifecycle ----------------------------------------------------------------------------------
 
 class Managed(LifecycleNode):
-    """Fails as it is told."""
+    """Fails on request."""
 
     def __init__(self, name, **kwargs):
         super().__init__(name, **kwargs)

@@ -35,7 +35,7 @@ from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
-#: Seconds that a stopped machine is kept unless gc is told otherwise.
+#: Seconds that gc keeps a stopped machine by default.
 KEEP_STOPPED = 7 * 86400.0
 #: Seconds after the end of its lifetime in which a machine may still be ending itself.
 GRACE = 60.0

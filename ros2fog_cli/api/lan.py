@@ -3,7 +3,7 @@
 Finds DDS participants on the networks of this computer, without joining DDS.
 
 The robot announces a participant that has no endpoints, as the RTPS specification's SPDP has it
-(OMG RTPS 2.5, 8.5.3 and 9.6.2): whoever is there answers with its own announcement, at once and
+(OMG RTPS 2.5, 8.5.3 and 9.6.2): each participant answers with its own announcement, at once and
 to the address the announcement names. It withdraws by a lease of two seconds.
 """
 

@@ -237,7 +237,7 @@ def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
     try:
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
     except FogError:
-        return True  # to be told with its name, as any other failure
+        return True  # reported with its name, as any other failure
     return kind.configured() or bool(regions) and issubclass(kind, HasRegions)
 
 

@@ -37,7 +37,7 @@ class DashboardVerb(VerbExtension):
                 'another --port, or none for one that is free') from error
         board.start()
         print(f'The dashboard is at {dashboard.url} until Ctrl-C.\n'
-              'Whoever has this address may look, and delete machines.', flush=True)
+              'Everyone with this address may look, and delete machines.', flush=True)
         if not args.no_browser:
             import webbrowser
             webbrowser.open(dashboard.url_with_ticket())

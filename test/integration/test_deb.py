@@ -336,7 +336,7 @@ def test_nothing_stays_after_it_is_purged(
     assert installed.run('getent', 'group', 'fogros2', check=False).returncode != 0
     after = frozenset(installed.run('sh', '-c', ALL_FILES).stdout.splitlines())
     assert after <= files_before
-    # which no package owns, so that whoever leaves it empty takes it along
+    # which no package owns, so the package that leaves it empty removes it
     assert files_before - after <= {'/opt'}
 
 

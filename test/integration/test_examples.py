@@ -132,7 +132,7 @@ def test_looking_at_a_launch_file_makes_nothing(name, option, state_home):
     assert list(state_home.iterdir()) == []
 
 
-#: A managed node that says what it is told to do.
+#: A managed node that prints the transitions that it makes.
 MANAGED = """
 import rclpy
 from rclpy.executors import ExternalShutdownException

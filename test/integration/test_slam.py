@@ -178,7 +178,7 @@ class Side:
 
 
 def test_what_cameras_send_at_times():
-    """Each fault is told on slam_state, and the node goes on: with poses, path, points, /tf."""
+    """Each fault is reported on slam_state, and the node goes on: poses, path, points, /tf."""
     made = room.Room(room.camera(320, 240))
     shots = [made.colour_and_depth(pose, number)
              for number, pose in enumerate(room.trajectory(3))]

@@ -168,7 +168,7 @@ def test_this_computer_without_rsync_is_told_so(shell, source, tmp_path, monkeyp
 
 
 def test_a_full_disk_is_said_to_be_full(shell, tmp_path, root):
-    """Tests that the machine's full disk is told from all other failures."""
+    """Tests that the machine's full disk has its own error."""
     disk = tmp_path / 'sync-target'
     disk.mkdir()
     (tmp_path / 'source').mkdir()

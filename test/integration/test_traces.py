@@ -103,7 +103,7 @@ def test_an_interface_of_ours_is_found(look, tun, launch_id, state_home, request
 
 
 def test_what_another_launch_makes_is_its_own(look, tun, start, elsewhere, launch_id, request):
-    """Whether it can be told whose it is or not: another user's can't."""
+    """Whether its owner is known or not: another user's is not."""
     with nothing_left(look(), timeout=0.1):
         request.getfixturevalue('interface')
         start(*fake_agent(elsewhere, launch_id), **{RUN: 'another'})

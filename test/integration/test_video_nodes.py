@@ -242,7 +242,7 @@ def test_no_subscriber_no_work(bench: Bench) -> None:
 
 
 def test_who_joins_late_gets_a_key(bench: Bench) -> None:
-    """Hours of P-pictures away from the next key, whoever comes gets one with the next image."""
+    """Hours of P-pictures away from the next key, a new reader gets one with the next image."""
     bench.pair('-p', 'gop:=1000000')
     publish = source(bench)
     seen = bench.heard(Image, '/seen/camera')

@@ -16,7 +16,7 @@ from fogros2.report import step
 
 
 class FakeMachine:
-    """A RunningMachine that notes what is asked of it and says what a test wants said."""
+    """A RunningMachine that notes its requests and answers as a test wants."""
 
     def __init__(self, launch, spec):
         self.launch = launch
@@ -173,7 +173,7 @@ def run(fake, package, monkeypatch, tmp_path):
     # launch leaves the parameter files it makes
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     before = dict(os.environ)
-    # whoever logged before did so to streams and folders of another test
+    # earlier loggers wrote to streams and folders of another test
     launch.logging.reset()
 
     def run(description, **arguments):

@@ -114,7 +114,7 @@ def test_on_exit_of_a_group_process_stays_on_the_machine(run, fake, planner):
 
 
 def test_a_timer_of_the_robot_is_not_drawn_into_a_group(run, fake, planner, capfd):
-    """The timers of a launch share an event handler, whoever of them registered it."""
+    """The timers of a launch share an event handler, which any of them may have registered."""
     fake.on_start = ends
     assert run(LaunchDescription([
         CloudGroup(planner, [TimerAction(period=0.01, actions=[node()])]),

@@ -177,7 +177,7 @@ def test_a_launch_without_machines_takes_no_override(run, fake, capfd):
 
 @pytest.fixture
 def program(package):
-    """Have demo's talker say what it is told, and end."""
+    """Have demo's talker print its arguments, and end."""
     path = package / 'lib/demo/talker'
     path.write_text('#!/bin/sh\necho "here: $0 $* [$CYCLONEDDS_URI]"\n')
     return path
@@ -201,7 +201,7 @@ def test_nodes_run_here_and_nothing_is_made(run, fake, capfd, program, wrapped, 
     assert run(elsewhere(description, '*=robot')) == 0
     said = capfd.readouterr().out
     assert 'here: ' in said and '__node:=first' in said and '__node:=second' in said
-    assert said.count(' []') == 2, 'DDS was told of a VPN that there is not'
+    assert said.count(' []') == 2, 'DDS was configured for a VPN that does not exist'
     assert fake.notes == []
     assert fake.report is None, 'a VPN was to be had'
     assert ended == [0]

@@ -396,7 +396,7 @@ def test_components_are_told(run, fake, planner, caplog, box, streams):
 
 
 def test_a_group_that_only_loads_components_starts_their_streams(run, fake, planner, box, caplog):
-    """Into a container that another group has; its streams are known when they are told."""
+    """Into a container that another group has; its streams are known when they are loaded."""
     ends_when_all_started(fake, 3)
     load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
     assert run(watched(

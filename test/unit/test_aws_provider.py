@@ -120,7 +120,7 @@ def test_a_spot_instance_that_should_stop_is_refused_before_anything():
         check_spec(dataclasses.replace(spec(spot=True), on_exit='stop'))
 
 
-# -- what is asked of EC2 -----------------------------------------------------------------------
+# -- requests to EC2 -----------------------------------------------------------------------------
 
 
 def request(options=None, **changes):

@@ -286,7 +286,7 @@ def test_containers_start_once_their_configuration_is_there(engine, monkeypatch)
     assert sum(' create ' in line for line in notes()) == 1
 
 
-# --- the scripts, with an engine that notes what it is told --------------------------------------
+# --- the scripts, with an engine that notes its arguments ----------------------------------------
 
 ENGINE = r"""#!/bin/sh
 printf '%s\n' "$0 $*" >> "$NOTES"

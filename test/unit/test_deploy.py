@@ -432,7 +432,7 @@ def test_a_new_machine_does_not_fail_as_another_cannot_be_told_of_it(members, mo
     assert members.told[-1] == ('m3', ['m2', 'robot'])
     members.away = set()
     wait_until(lambda: ('m2', ['m3', 'robot']) in members.told, timeout=10,
-               what='the first machine to be told')
+               what='an update of the first machine')
 
 
 def test_everybody_knows_of_a_new_machine_when_it_is_up(members):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tests of fogros2.deploy where a provider chooses, costs money, or is told what is needed."""
+"""Tests of fogros2.deploy where a provider chooses, costs money, or gets dependencies."""
 
 from __future__ import annotations
 

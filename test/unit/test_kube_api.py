@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The API server's side of requests and watches, with an API server that does as it is told."""
+"""The API server's side of requests and watches, with an API server that the tests control."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ def test_a_server_that_takes_the_question_and_says_nothing_holds_up_no_ctrl_c(ap
 
 
 def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):
-    """The request was under way: whoever undoes it has to know what it made."""
+    """The request was under way: its undo has to know what it made."""
     cancel = threading.Event()
 
     def late() -> Answer:

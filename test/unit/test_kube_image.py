@@ -72,7 +72,7 @@ def test_commands(tmp_path):
 
 @pytest.fixture
 def engine(tmp_path, monkeypatch):
-    """Return a folder on PATH with a buildah that notes what it is told, and may fail."""
+    """Return a folder on PATH with a buildah that notes its arguments, and may fail."""
     folder = tmp_path / 'bin'
     folder.mkdir()
     program = folder / 'buildah'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of a cluster, and what its answers mean: by value, without a cluster."""
+"""Requests to a cluster, and what its answers mean: by value, without a cluster."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class Pipe:
 
 
 class FakeApi(kubernetes_client.Api):
-    """An API server that runs what it is told here, or refuses."""
+    """An API server that runs commands here, or refuses."""
 
     def __init__(self) -> None:
         self._lost = -kubernetes_client.DOUBT

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which bridge runs on a machine, and what it is told."""
+"""Which bridge runs on a machine, and with which options."""
 
 from __future__ import annotations
 

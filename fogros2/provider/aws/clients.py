@@ -71,7 +71,7 @@ class Account:
         #: Instances that this process has made, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
         #: Security groups that this process has made and not changed since, by attempt: the id,
-        #: and the rule for SSH, as it is told EC2.
+        #: and the rule for SSH, as sent to EC2.
         self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
         #: Ids of the disks that go with instances that this process has seen run.
         self.disks: dict[str, set[str]] = {}

@@ -86,7 +86,7 @@ def sweep(account: Account, region: str, attempt: str, gone: Collection[str] = (
     if groups:
         network.delete_groups(account, region, groups, timeout=PATIENCE)
     else:
-        # tags are told a little late: its name tells for sure
+        # EC2 reports tags a little late: the name is certain
         drop_groups(account, region, attempt)
     for address in left:
         if address.startswith('eipalloc-'):

@@ -245,7 +245,7 @@ def denied_action(
     Return the action that a policy lacks, such as 'ec2:RunInstances'.
 
     A call may need more than its own action (tags at creation, a role handed over): AWS says
-    which in plain words, or in words that whoever may ``sts:DecodeAuthorizationMessage`` reads.
+    which in plain words, or encoded for users who may ``sts:DecodeAuthorizationMessage``.
     """
     encoded = _ENCODED.search(said)
     if encoded and decode:

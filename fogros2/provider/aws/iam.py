@@ -54,7 +54,7 @@ CHANGE_IMAGES = (
     'ec2:DeregisterImage',
 )
 TAG = ('ec2:CreateTags',)
-#: Not needed; with it, what is refused is told better.
+#: Optional: with it, messages name the action that was refused.
 HELPFUL = ('sts:DecodeAuthorizationMessage',)
 
 ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_IMAGES, *TAG, *HELPFUL)

@@ -62,7 +62,7 @@ def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) 
         _here.call = call
         try:
             outcome.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - handed to whoever waits
+        except BaseException as error:  # noqa: BLE001 - handed to the waiting thread
             outcome.set_exception(error)
 
     def over(seconds: float = LOOK) -> bool:
@@ -81,7 +81,7 @@ def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) 
 
 
 def teach(client: Any) -> None:
-    """Have a boto3 client look at the cancel of whoever uses it, and not ask in vain."""
+    """Have a boto3 client obey its caller's cancel, and not ask in vain."""
     service = client.meta.service_model.service_id.hyphenize()
     # last: what limits the rate waits in such a handler as well
     client.meta.events.register_last('before-send', _sending)

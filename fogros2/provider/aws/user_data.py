@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What an instance is told at its first breath: a #cloud-config, gzipped, within EC2's 16 KB.
+The user data of an instance: a #cloud-config, gzipped, within EC2's 16 KB.
 
 In this order: the one-time SSH host key and the login key (before sshd starts), then the guard
 (before anything slow), last, in the background, the programs that an Ubuntu image lacks. Written
@@ -111,7 +111,7 @@ def user_data(
     data = gzip.compress(text.encode(), 9, mtime=0)
     if len(data) > LIMIT:
         raise ProviderError(
-            f"what '{name}' is told at its boot has {len(data)} bytes, and EC2 takes {LIMIT}")
+            f"the user data of '{name}' has {len(data)} bytes, and EC2 takes {LIMIT}")
     return data
 
 

@@ -94,7 +94,7 @@ class KubernetesProvider(Provider):
                 'POST', _REVIEW, {'spec': {'namespace': namespace}}, patience=_FIRST)
             status = review.get('status') or {}
             lacking = hints.missing_rights(status.get('resourceRules') or ())
-            # a cluster whose authorizer can't list all rules says so; what it refuses is told then
+            # a cluster whose authorizer can't list all rules says so, and its refusals come later
             if lacking and not status.get('incomplete'):
                 raise PrerequisiteError(
                     f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "

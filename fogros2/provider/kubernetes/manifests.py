@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of a cluster for a machine: a Job, its pod, a Service; pure."""
+"""The manifests of a machine: a Job, its pod, a Service; pure."""
 
 from __future__ import annotations
 

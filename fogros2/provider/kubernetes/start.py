@@ -112,7 +112,7 @@ class Start:
         now = time.monotonic()
         late = self._trouble is not None and now - self._since >= PATIENCE
         if now >= self._next_events and (late or self._trouble is None):
-            # seldom: what it tells can't be watched without being told of everybody's
+            # seldom: a watch would report the events of all pods
             self._next_events = now + 4 * QUIET
             self._events()
         if late and self._trouble is not None and not self._scales_up:

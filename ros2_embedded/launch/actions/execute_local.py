@@ -211,7 +211,7 @@ class ExecuteLocal(_base.Action):
             self.__shutdown_future.set_result(None)
             return None
         if self.__process_event_args is None or self._subprocess_transport is None:
-            # It is being started: shut it down as soon as it is there.
+            # It is being started: shut it down as soon as it runs.
             context.register_event_handler(OnProcessStart(
                 on_start=lambda event, context: self._shutdown_process(
                     context, send_sigint=send_sigint)))

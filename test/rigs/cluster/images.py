@@ -337,7 +337,7 @@ def write_archive(
 
     Layers stay as they are, uncompressed: they only go from one folder to another.
 
-    :param leave_out: layers that whoever reads the archive has already.
+    :param leave_out: layers that the reader of the archive has already.
     """
     manifests: list[dict[str, Any]] = []
     written = {_digest(path) for path in leave_out}

@@ -7,7 +7,7 @@ The node of a test's cluster: one program, run as root, standard library only.
 
 All of a node (services, pods, mounts, bridges, firewall rules) is in process, mount and network
 namespaces of its own, so it ends with their first process, whatever happens. That one ends when
-its standard input does: when whoever started it closes it, or dies. What namespaces don't hold is
+its standard input does: when its parent process closes it, or dies. What namespaces don't hold is
 control groups, and FOLDER; both are taken away by the outer process, or by ``forget`` at the start
 of the next cluster if that was killed too.
 
@@ -137,7 +137,7 @@ def claimed(folder: Path) -> Iterator[bool]:
 
 def outside(folder: Path) -> int:
     """Run the node until its first process ends, then take everything away."""
-    # a Ctrl-C in the terminal is for whoever started us; the end of our input is for us. A handler
+    # a Ctrl-C in the terminal is for the parent process; the end of our input is for us. A handler
     # rather than SIG_IGN, which all that is started here would inherit, pods included
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's program as a child of this process, root whoever we are."""
+"""The node's program as a child of this process, as root for any user."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ def start_sshd() -> subprocess.Popen[bytes]:
 
 
 def first_process() -> None:
-    """Boot, take in orphans until the instance is told to end, and end it."""
+    """Boot, take in orphans until a request to end the instance, and end it."""
     code: list[int] = []
     wake, waker = os.pipe()
     for end in (wake, waker):

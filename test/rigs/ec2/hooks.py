@@ -19,7 +19,7 @@ from rigs.ec2.market import ENABLED, PublicImage
 
 #: Moto's account.
 ACCOUNT = '123456789012'
-#: What the request that a thread serves asked for beside what Moto's methods are told.
+#: Parts of the request that a thread serves which Moto's methods don't get.
 REQUEST = threading.local()
 
 

@@ -116,7 +116,7 @@ class Box:
         hooks.install(self.cloud)
         self.api = Api(DomainDispatcherApplication(create_backend_app), self.cloud)
         inside = netns.listener(self.net.router, ROUTER, PORT)
-        # answers nothing but the connection itself, which is what the nearest region is told by
+        # accepts connections and answers nothing: the nearest region is the quickest to connect
         regions = netns.listener(self.net.router, ROUTER, 443)
         servers = [
             make_server('127.0.0.1', 0, self.api, threaded=True, request_handler=Quiet),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of processes: what happens in them, and what is asked of them."""
+"""Events of processes: what happens in them, and requests to them."""
 from __future__ import annotations
 
 import functools
