@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``make lint`` refuses phrases that are hard to read."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = ROOT / 'tools' / 'phrases.py'
+
+spec = importlib.util.spec_from_file_location('phrases', PROGRAM)
+assert spec is not None and spec.loader is not None
+phrases = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(phrases)
+
+
+def refused(folder: Path, name: str, text: str) -> list[str]:
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text(text)
+    return list(phrases.found(folder))
+
+
+@pytest.mark.parametrize('phrase', phrases.PHRASES)
+@pytest.mark.parametrize('name, text', [
+    ('a.py', '"""Do. {}."""\n'), ('a.py', '# {}\n'), ('a.py', "raise VpnError('{} x')\n"),
+    ('doc/page.md', 'Here {} there.\n'), ('script', '#!/bin/sh\n# {}\n')])
+def test_phrase_is_refused(tmp_path, phrase, name, text):
+    (line,) = refused(tmp_path, name, text.format(phrase.capitalize()))
+    assert line.startswith(f'{name}:{text.count(chr(10))}: ') and phrase in line.lower()
+
+
+@pytest.mark.parametrize('phrase', [each for each in phrases.PHRASES if ' ' in each])
+@pytest.mark.parametrize('text', [
+    '# a {}\n    # {} b\n', "'a {} '\n    f'{} b'\n", 'a {}\n{} b\n'])
+def test_phrase_over_two_lines_is_refused(tmp_path, phrase, text):
+    assert len(refused(tmp_path, 'a.py', text.format(*phrase.split(' ', 1)))) == 1
+
+
+@pytest.mark.parametrize('text', ['this told', 'retake it that', 'is_told', 'what is asked'])
+def test_other_words_are_not_refused(tmp_path, text):
+    assert refused(tmp_path, 'a.py', f'# {text}\n') == []
+
+
+def test_built_files_and_binary_files_are_not_read(tmp_path):
+    (tmp_path / 'picture.png').write_bytes(b'\xff' + phrases.PHRASES[0].encode())
+    assert refused(tmp_path, 'build/a.py', f'# {phrases.PHRASES[0]}\n') == []
+
+
+def test_lint_fails_on_a_phrase(tmp_path):
+    run = [sys.executable, str(PROGRAM), str(tmp_path)]
+    (tmp_path / 'a.py').write_text('# clean\n')
+    assert subprocess.run(run).returncode == 0
+    (tmp_path / 'a.py').write_text(f'# {phrases.PHRASES[0]}\n')
+    found = subprocess.run(run, capture_output=True, text=True)
+    assert (found.returncode, found.stdout.count('\n')) == (1, 1)
+    assert 'tools/phrases.py' in (ROOT / 'tools/lint.sh').read_text()
+
+
+def test_project_has_no_such_phrase():
+    assert list(phrases.found(ROOT)) == []
