@@ -11,15 +11,17 @@ stopped is guarded again, and one made of a baked image isn't guarded by the for
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping, Sequence
+import base64
+import bz2
+from collections.abc import Mapping
 import functools
 import gzip
+import io
 import json
 from pathlib import Path
-import re
 import shlex
-import threading
-from typing import Any, Optional
+import tokenize
+from typing import Any
 
 from fogros2.errors import ProviderError
 from fogros2.provider.agent_file import agent_file
@@ -69,7 +71,9 @@ if [ "$(cat {folder}/instance 2>/dev/null)" != "$INSTANCE_ID" ]; then
 else
     owned=  # at a later boot it is whose launch comes first
 fi
-cat >{program} <<'{mark}'
+python3 -ISc 'import base64, bz2, sys
+sys.stdout.buffer.write(bz2.decompress(base64.b64decode(sys.stdin.read())))' \\
+    >{program} <<'{mark}'
 {agent}
 {mark}
 cat >{folder}/guard.sh <<'{mark}'
@@ -133,118 +137,36 @@ def cloud_config(
         'runcmd': [['sh', '-c', _TOOLS]],
     }
     if agent_config:
+        path = agent_file()
+        if path is None:
+            raise ProviderError('this installation of FogROS2 has no agent.py', 'install it again')
         armed = {'user': user, **agent_config}
         armed['end_command'] = armed.get('end_command') or list(END_COMMAND)
         names = {'user': user, 'folder': FOLDER, 'program': AGENT_PROGRAM, 'log': LOG,
                  'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command'])}
         config['bootcmd'] = [['sh', '-c', _BOOT.format(
-            agent=agent_program(), guard=_GUARD.format(**names), mark='FOGROS2-END',
+            agent=packed_agent(path), guard=_GUARD.format(**names), mark='FOGROS2-END',
             config=json.dumps(armed), **names)]]
     return config
 
 
-_shrinking = threading.Lock()
-
-
-def agent_program() -> str:
-    """
-    Return the agent's program without what only people read, which is most of it.
-
-    :raises ProviderError: this installation has no agent.
-    """
-    path = agent_file()
-    if path is None:
-        raise ProviderError('this installation of FogROS2 has no agent.py', 'install it again')
-    with _shrinking:  # a tenth of a second, which the machines of a launch shouldn't take each
-        return _agent_program(path)
-
-
 @functools.lru_cache(maxsize=1)
-def _agent_program(path: Path) -> str:
-    return shrunk(path.read_text(encoding='utf-8'))
+def packed_agent(path: Path) -> str:
+    """Return the agent's program for the boot script; bzip2 is smaller here than gzip or xz."""
+    return base64.b64encode(bz2.compress(bare(path.read_text(encoding='utf-8')).encode())).decode()
 
 
-def shrunk(source: str) -> str:
-    """Return a program without comments, docstrings and annotations, narrowly indented."""
-    tree = _Shrinker().visit(ast.parse(source))
-    ast.fix_missing_locations(tree)
-    text = ast.unparse(tree)
-    narrow = re.sub(r'^(?: {4})+', lambda found: ' ' * (len(found[0]) // 4), text,
-                    flags=re.MULTILINE)
-    # a string over several lines may begin one of them with spaces of its own
-    return narrow if ast.dump(ast.parse(narrow)) == ast.dump(ast.parse(text)) else text
-
-
-def _fields(parts: Sequence[ast.expr], values: list[ast.expr]) -> str:
-    """Return an f-string's parts as ``format`` has them; the values go to the end of a list."""
-    text = ''
-    for part in parts:
-        if isinstance(part, ast.FormattedValue):
-            values.append(part.value)
-            text += '{' + ('' if part.conversion < 0 else f'!{chr(part.conversion)}')
-            if isinstance(part.format_spec, ast.JoinedStr):
-                text += ':' + _fields(part.format_spec.values, values)
-            text += '}'
-        elif isinstance(part, ast.Constant):
-            text += str(part.value).replace('{', '{{').replace('}', '}}')
-    return text
-
-
-class _Shrinker(ast.NodeTransformer):
-    """Takes away what isn't needed to run."""
-
-    def _body(self, node: Any) -> Any:
-        self.generic_visit(node)
-        first = node.body[0] if node.body else None
-        if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) \
-                and isinstance(first.value.value, str):
-            node.body = node.body[1:]
-        node.body = node.body or [ast.Pass()]
-        return node
-
-    visit_Module = visit_ClassDef = _body
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
-        """Drop the annotations."""
-        node.returns = None
-        words = node.args
-        for word in (*words.posonlyargs, *words.args, *words.kwonlyargs, words.vararg,
-                     words.kwarg):
-            if word is not None:
-                word.annotation = None
-        shorter: ast.AST = self._body(node)
-        return shorter
-
-    def visit_If(self, node: ast.If) -> Optional[ast.AST]:
-        """Drop what is for type checkers."""
-        self.generic_visit(node)
-        if isinstance(node.test, ast.Name) and node.test.id == 'TYPE_CHECKING' \
-                and not node.orelse:
-            return None
-        return node
-
-    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
-        """
-        Make an f-string a call of ``format``.
-
-        Python 3.12 writes f-strings that older ones, which a machine may have, can't read (PEP
-        701): with the outer quotes inside once more.
-        """
-        self.generic_visit(node)
-        values: list[ast.expr] = []
-        text = _fields(node.values, values)
-        return ast.Call(ast.Attribute(ast.Constant(text), 'format', ast.Load()), values, [])
-
-    def visit_FormattedValue(self, node: ast.FormattedValue) -> ast.AST:
-        """Leave a format's own fields to the f-string that it is in."""
-        node.value = self.visit(node.value)
-        if isinstance(node.format_spec, ast.JoinedStr):
-            node.format_spec.values = [self.visit(part) for part in node.format_spec.values]
-        return node
-
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        """Make an annotated assignment a plain one; a bare annotation stays."""
-        self.generic_visit(node)
-        if node.value is None:
-            return node
-        return ast.Assign(targets=[node.target], value=node.value)
+def bare(source: str) -> str:
+    """Blank a program's comments and docstrings; every line keeps its number."""
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column].rstrip()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) \
+                and ast.get_docstring(node, clean=False) is not None:
+            text = node.body[0]
+            begin, end = text.lineno - 1, text.end_lineno or text.lineno
+            lines[begin:end] = [' ' * text.col_offset + '""'] + [''] * (end - begin - 1)
+    return '\n'.join(lines)
