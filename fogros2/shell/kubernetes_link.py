@@ -1,19 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The robot's end of a pod's multiplexer: one ``exec``, many channels, resumed after a loss.
-
-What was sent and not confirmed is kept, so a connection that breaks (an API server that restarts,
-a cut of some seconds) costs nothing but time: the next one goes on where the last one was.
-"""
+"""The robot's end of a pod's multiplexer: one ``exec``, many channels."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Iterator
 import contextlib
 import functools
 import json
 from pathlib import Path
-import secrets
 import select
 import ssl
 import struct
@@ -31,8 +25,6 @@ from fogros2.shell.kubernetes_channel import Channel
 if TYPE_CHECKING:
     import websocket
 
-#: Seconds for which a lost connection is tried again, less than commands outlive it there.
-RESUME = 45.0
 #: Seconds of silence after which the pod is asked for a word.
 ASK = 15.0
 #: Seconds for which a frame may stand still half-way, in or out: its thread holds the lock, so a
@@ -61,24 +53,19 @@ class Link:
         self._name = name
         self._user = endpoint.user or 'root'
         self._context, self._namespace, self._pod = parse_host(endpoint.host)
-        self._session = secrets.token_hex(16)
         self._lock = threading.Lock()
         self._channels: dict[int, Channel] = {}
         self._next = 1
-        self._kept: deque[bytes] = deque()
-        self._sent = self._received = self._unconfirmed = 0
         self._incoming = bytearray()
-        self._socket: Optional[websocket.WebSocket] = None
-        self._closed = False
         self._error: Optional[FogError] = None
-        self._heard = 0.0
-        self._connect(timeout, resume=False)
+        self._closed = False
+        self._socket = self._connect(timeout)
         threading.Thread(target=self._run, name='fog-pod', daemon=True).start()
 
     @property
     def alive(self) -> bool:
-        """Whether commands can be begun, at once or when the connection is back."""
-        return not self._closed and self._error is None
+        """Whether commands can be begun."""
+        return self._error is None
 
     def open(self, command: Command, *, terminal: Optional[tuple[int, int, str]] = None,
              login: bool = False) -> Channel:
@@ -87,7 +74,7 @@ class Link:
 
         :param terminal: rows, columns and kind of the terminal it gets.
         :param login: the user's login shell in place of the command.
-        :raises ConnectError: the connection is gone for good.
+        :raises ConnectError: the connection is lost.
         """
         what = {
             'argv': [] if login else list(command.argv), 'env': dict(command.environment),
@@ -101,28 +88,34 @@ class Link:
 
     def send(self, kind: int, number: int, payload: bytes = b'') -> None:
         """
-        Send a frame, now or as soon as the connection is back.
+        Send a frame.
 
-        :raises ConnectError: it is gone for good.
+        :raises ConnectError: the connection is lost.
         """
-        data = mux.frame(kind, number, payload)
+        with self._using() as link:
+            link.send_binary(bytes([_STDIN]) + mux.frame(kind, number, payload))
+
+    @contextlib.contextmanager
+    def _using(self) -> Iterator[websocket.WebSocket]:
+        """Hold the connection alone; its first error ends it for everybody."""
         with self._lock:
             if self._error is not None:
                 raise self._error
-            if self._closed:
-                raise ConnectError(f"the connection to '{self._name}' was closed")
-            self._sent += 1
-            self._kept.append(data)
-            self._write(data)
+            try:
+                yield self._socket
+            except _websocket_errors() as error:
+                self._error = self._broken(error)
+                self._wake()
+                raise self._error from error
 
-    def _write(self, data: bytes) -> None:
-        """Write to the connection, if there is one; the lock is held."""
-        if self._socket is None:
-            return
-        try:
-            self._socket.send_binary(bytes([_STDIN]) + data)
-        except _websocket_errors():
-            self._drop()
+    def _broken(self, error: BaseException) -> ConnectError:
+        return ConnectError(f"the connection to '{self._name}' was lost: {error}")
+
+    def _wake(self) -> None:
+        """Wake the reader, which closes the connection."""
+        if self._socket.sock is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sock.shutdown(2)
 
     def forget(self, number: int) -> None:
         """Let a command go."""
@@ -134,24 +127,18 @@ class Link:
 
     def close(self) -> None:
         """End the connection and what runs over it."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            self._write(mux.frame(mux.GONE, 0, b''))
-            link = self._socket
-        if link is not None and link.sock is not None:
-            with contextlib.suppress(*_websocket_errors()):
-                link.sock.shutdown(2)  # wakes the reader, which closes it
+        self._closed = True
+        with contextlib.suppress(FogError):
+            self.send(mux.GONE, 0)
         self._lose(ConnectError(f"the connection to '{self._name}' was closed"))
+        self._wake()
 
     # -- the connection -------------------------------------------------------------------------
 
-    def _connect(self, timeout: float, *, resume: bool) -> None:
-        """Begin an ``exec``, and wait for the multiplexer's first word."""
+    def _connect(self, timeout: float) -> websocket.WebSocket:
+        """Begin an ``exec``, and wait for the multiplexer's first frame."""
         source = _source()
-        words = ['python3', '-ISc', _LOADER.format(size=len(source)), self._session,
-                 'resume' if resume else 'new']
+        words = ['python3', '-ISc', _LOADER.format(size=len(source))]
         api = kubernetes_client.connect(self._context)
         try:
             link = api.websocket(
@@ -165,11 +152,9 @@ class Link:
                 from error
         try:
             # in pieces: some API servers take small frames alone
-            hello = source + mux.frame(mux.HELLO, 0, struct.pack('>Q', self._received))
-            for begin in range(0, len(hello), mux.CHUNK):
-                link.send_binary(bytes([_STDIN]) + hello[begin:begin + mux.CHUNK])
-            self._incoming.clear()
-            count = self._greeting(link, time.monotonic() + timeout)
+            for begin in range(0, len(source), mux.CHUNK):
+                link.send_binary(bytes([_STDIN]) + source[begin:begin + mux.CHUNK])
+            self._greeting(link, time.monotonic() + timeout)
         except _websocket_errors() as error:
             link.close(timeout=0.1)
             raise ConnectError(f"the connection to '{self._name}' was lost at once: {error}",
@@ -178,14 +163,10 @@ class Link:
             link.close(timeout=0.1)
             raise
         link.settimeout(STALL)
-        with self._lock:
-            self._confirmed(count)
-            self._socket = link
-            for data in list(self._kept):
-                self._write(data)
+        return link
 
-    def _greeting(self, link: websocket.WebSocket, deadline: float) -> int:
-        """Return how many frames the multiplexer has had; what came with it is kept."""
+    def _greeting(self, link: websocket.WebSocket, deadline: float) -> None:
+        """Wait for the multiplexer's first frame."""
         errors = b''
         while True:
             link.settimeout(max(0.1, deadline - time.monotonic()))
@@ -197,12 +178,8 @@ class Link:
                 raise self._no_program(errors + data)
             elif kind == _STDOUT:
                 self._incoming += data
-                frame = self._pop_frame()
-                if frame is not None and frame[0] == mux.GONE:
-                    raise ShellError(
-                        f"what ran on '{self._name}' ended when the connection was lost")
-                if frame is not None:
-                    return int(json.loads(frame[2])['received'])
+                if self._pop_frame() is not None:
+                    return
             if time.monotonic() > deadline:
                 raise DeadlineExceeded(f"'{self._name}' doesn't answer")
 
@@ -234,76 +211,51 @@ class Link:
     # -- reading --------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while not self._closed:
-            try:
-                self._serve()
-            except FogError:
-                pass
-            except _websocket_errors():
-                pass  # whatever it was, the next connection shows whether it can be mended
-            with self._lock:
-                self._drop()
-            if not self._closed:
-                kubernetes_client.connect(self._context).lost()
-            if self._closed or not self._resume():
-                return
-
-    def _drop(self) -> None:
-        link, self._socket = self._socket, None
-        if link is not None:
-            with contextlib.suppress(*_websocket_errors()):
-                link.close(timeout=0)
-
-    def _resume(self) -> bool:
-        deadline = time.monotonic() + RESUME
-        while not self._closed:
-            try:
-                self._connect(min(10.0, RESUME), resume=True)
-                return True
-            except (ConnectError, DeadlineExceeded) as error:
-                if time.monotonic() > deadline:
-                    self._lose(error)
-                    return False
-                threading.Event().wait(0.2)
-            except FogError as error:
-                self._lose(ConnectError(
-                    f"the connection to '{self._name}' was lost: {error.args[0]}", error.hint))
-                return False
-        return False
+        try:
+            self._serve()
+        except FogError as error:
+            lost = error
+        except _websocket_errors() as error:
+            lost = self._broken(error)
+        if not self._closed:
+            kubernetes_client.connect(self._context).lost()
+        self._lose(lost)
+        with self._lock, contextlib.suppress(*_websocket_errors()):
+            self._socket.close(timeout=0)
 
     def _lose(self, error: FogError) -> None:
         with self._lock:
             self._error = self._error or error
             channels = list(self._channels.values())
             self._channels.clear()
-            self._kept.clear()
         for channel in channels:
-            channel.lose(error)
+            channel.lose(self._error)
 
     def _serve(self) -> None:
-        """Hand out what comes, until the connection is lost."""
-        link = self._socket
-        if link is None:
-            return
-        assert link.sock is not None
+        """
+        Hand out what comes.
+
+        :raises ConnectError: the connection is lost or closed.
+        """
+        sock = self._socket.sock
+        assert sock is not None
         poll = select.poll()
-        poll.register(link.sock, select.POLLIN)
-        self._heard = time.monotonic()
-        while self._socket is link and not self._closed:
+        poll.register(sock, select.POLLIN)
+        heard = time.monotonic()
+        while True:
             self._frames()
-            pending = isinstance(link.sock, ssl.SSLSocket) and link.sock.pending()
+            pending = isinstance(sock, ssl.SSLSocket) and sock.pending()
             if not pending and not poll.poll(ASK * 1000):
-                if time.monotonic() - self._heard > 3 * ASK:
+                if time.monotonic() - heard > 3 * ASK:
                     raise ConnectError(f"'{self._name}' has fallen silent")
-                with self._lock:
-                    self._write(mux.frame(mux.PING, 0, b''))
+                self.send(mux.PING, 0)
                 continue
-            with self._lock:
-                # not while another thread writes: TLS keeps one state for both
+            # not while another thread writes: TLS keeps one state for both
+            with self._using() as link:
                 data = _bytes(link.recv())
             if not data:
                 raise ConnectError(f"'{self._name}' has closed the connection")
-            self._heard = time.monotonic()
+            heard = time.monotonic()
             if data[0] == _STDOUT:
                 self._incoming += data[1:]
             elif data[0] == _ERROR:
@@ -325,24 +277,9 @@ class Link:
     def _frames(self) -> None:
         while (found := self._pop_frame()) is not None:
             kind, number, payload = found
-            if kind in (mux.ACK, mux.PONG):
-                with self._lock:
-                    self._confirmed(struct.unpack('>Q', payload)[0])
-            if kind >= mux.CONTROL:
-                continue
-            self._received += 1
-            self._unconfirmed += len(payload) + mux.HEADER.size
-            if self._unconfirmed >= mux.ACK_EVERY:
-                self._unconfirmed = 0
-                with self._lock:
-                    self._write(mux.frame(mux.ACK, 0, struct.pack('>Q', self._received)))
             channel = self._channels.get(number)
             if channel is not None:
                 channel.take(kind, payload)
-
-    def _confirmed(self, count: int) -> None:
-        while self._kept and self._sent - len(self._kept) < count:
-            self._kept.popleft()
 
 
 def parse_host(host: str) -> tuple[str, str, str]:

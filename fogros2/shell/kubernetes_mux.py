@@ -2,13 +2,11 @@
 """
 Runs in a pod, as root: many commands over the one stream that ``exec`` gives.
 
-``exec`` takes a tenth of a second each time, knows no end of input, and ends with the API server's
-connection. So one ``exec`` begins this program, whose daemon runs commands as asked and outlives
-the connection for a minute: the next ``exec`` hands its streams over, and what was under way
-goes on where it was. Standard library alone; its source comes over its standard input.
+``exec`` takes a tenth of a second each time and knows no end of input. So one ``exec`` runs this
+program, which runs commands as asked and ends with the connection. Standard library alone; its
+source comes over its standard input.
 
-Frames, both ways: type, channel, length, payload. Those below ``CONTROL`` are counted, and kept
-until the other side says that it has them.
+Frames, both ways: type, channel, length, payload.
 """
 
 from __future__ import annotations
@@ -23,32 +21,25 @@ import os
 import pwd
 import selectors
 import signal
-import socket
 import struct
 import subprocess
-import sys
 import termios
 import time
 
 TYPE_CHECKING = False  # each pod would wait for typing itself
 if TYPE_CHECKING:
-    from typing import Any, NoReturn
+    from typing import Any
 
 HEADER = struct.Struct('>BII')
-# counted
 OUT, ERR, EXIT, OPEN, IN, CLOSE, WINDOW, RESIZE = range(1, 9)
-# not counted
-CONTROL = 64
-HELLO, ACK, PING, PONG, GONE = range(64, 69)
+#: Of the connection, on no channel.
+HELLO, PING, PONG, GONE = range(64, 68)
 #: Bytes that may be under way on a channel, each way.
 CREDIT = 4 << 20
 CHUNK = 1 << 15
-#: Seconds without a word after which a connection counts as lost.
+#: Seconds of silence after which a connection counts as lost.
 SILENCE = 60.0
-#: Seconds for which commands outlive a lost connection.
-OUTLIVE = 60.0
-#: Counted bytes after which their arrival is acknowledged.
-ACK_EVERY = 1 << 18
+_STDIN, _STDOUT = 0, 1
 
 
 class Process:
@@ -76,102 +67,58 @@ class Process:
             os.killpg(self.child.pid, name)
 
 
-class Daemon:
-    """The commands of one session, and its connection while there is one."""
+class Multiplexer:
+    """The commands of one connection."""
 
-    def __init__(self, listener: socket.socket) -> None:
-        self.listener = listener
+    def __init__(self) -> None:
         self.selector = selectors.DefaultSelector()
-        self.listen_to(listener, self.accept)
         self.processes: dict[int, Process] = {}
         self.ending: list[Process] = []
-        self.link: socket.socket | None = None
-        self.source = self.sink = -1
+        self.connected = True
         self.incoming = bytearray()
         self.outgoing: collections.deque[bytes] = collections.deque()
-        self.kept: collections.deque[bytes] = collections.deque()
-        self.sent = self.received = self.unacked = 0
-        #: Whether the other side has said what it has, so that it gets what it hasn't.
-        self.greeted = False
         self.heard = time.monotonic()
         self.woken, wake = os.pipe()
-        os.set_blocking(wake, False)
-        os.set_blocking(self.woken, False)
+        for stream in (wake, self.woken, _STDIN, _STDOUT):
+            os.set_blocking(stream, False)
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         self.listen_to(self.woken, self.reap)
+        self.listen_to(_STDIN, self.read)
+        self.send(HELLO, 0)
 
-    def listen_to(self, stream: socket.socket | int, call: Callable[[], None]) -> None:
-        """Have something called when there is something to read."""
+    def listen_to(self, stream: int, call: Callable[[], None]) -> None:
+        """Call a function when there is something to read."""
         self.selector.register(stream, selectors.EVENT_READ, call)
 
     def run(self) -> None:
-        """Serve until the session has ended, or nobody came back to it."""
-        while True:
+        """Serve until the connection has ended, then end the commands."""
+        while self.connected and time.monotonic() - self.heard < SILENCE:
             for key, _ in self.selector.select(1.0):
                 if key.fileobj in self.selector.get_map():
                     key.data()
-            now = time.monotonic()
-            if self.link is not None and now - self.heard > SILENCE:
-                self.drop()
-            if self.link is None and now - self.heard > OUTLIVE:
-                break
             for process in self.ending:
-                if not process.exited and now - process.killed_at > 2.0:
+                if not process.exited and time.monotonic() - process.killed_at > 2.0:
                     process.signal(signal.SIGKILL)
             self.ending = [p for p in self.ending if not p.exited]
-        for name in (signal.SIGTERM, signal.SIGKILL):
-            for process in (*self.processes.values(), *self.ending):
+        left = (*self.processes.values(), *self.ending)
+        for name in (signal.SIGTERM, signal.SIGKILL) if left else ():
+            for process in left:
                 process.signal(name)
             time.sleep(0.5)
 
     # -- the connection -------------------------------------------------------------------------
 
-    def accept(self) -> None:
-        """Take the streams that an ``exec`` hands over."""
-        link, _ = self.listener.accept()
-        peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
-        _, streams, _, _ = socket.recv_fds(link, 1, 2)
-        if struct.unpack('3i', peer)[1] != os.geteuid() or len(streams) != 2:
-            for stream in streams:
-                os.close(stream)
-            link.close()
-            return
-        self.drop()
-        self.link = link
-        self.source, self.sink = streams
-        for stream in streams:
-            os.set_blocking(stream, False)
-        self.heard = time.monotonic()
-        self.listen_to(self.source, self.read)
-        hello = {'received': self.received, 'python': sys.version.split()[0]}
-        self.outgoing.append(frame(HELLO, 0, json.dumps(hello).encode()))
-        self.want_write()
-
-    def drop(self) -> None:
-        """Let the connection go; what it had not taken yet stays for the next one."""
-        if self.link is None:
-            return
-        for stream in (self.source, self.sink):
-            with contextlib.suppress(KeyError):
-                self.selector.unregister(stream)
-            os.close(stream)
-        self.link.close()
-        self.link = None
-        self.greeted = False
-        self.incoming.clear()
-        self.outgoing.clear()
-
     def read(self) -> None:
         """Read frames, and do what they say."""
         try:
-            data = os.read(self.source, 1 << 18)
+            data = os.read(_STDIN, 1 << 18)
         except BlockingIOError:
             return
         except OSError:
             data = b''
         if not data:
-            self.drop()
+            self.connected = False
             return
         self.heard = time.monotonic()
         self.incoming += data
@@ -182,12 +129,7 @@ class Daemon:
                 break
             payload = bytes(self.incoming[HEADER.size:end])
             del self.incoming[:end]
-            if kind < CONTROL:
-                self.received += 1
-                self.unacked += end
             self.take(kind, number, payload)
-        if self.unacked >= ACK_EVERY:
-            self.acknowledge(ACK)
 
     def take(self, kind: int, number: int, payload: bytes) -> None:
         """Do what a frame says."""
@@ -195,19 +137,9 @@ class Daemon:
         if kind == OPEN:
             self.open(number, json.loads(payload))
         elif kind == PING:
-            self.acknowledge(PONG)
-        elif kind in (ACK, HELLO):
-            count, = struct.unpack('>Q', payload)
-            while self.kept and self.sent - len(self.kept) < count:
-                self.kept.popleft()
-            if kind == HELLO:
-                # a new connection: what the last one had not brought over
-                self.greeted = True
-                self.outgoing.extend(self.kept)
-                self.want_write()
+            self.send(PONG, 0)
         elif kind == GONE:
-            self.drop()
-            self.heard = -1e9
+            self.connected = False
         elif process is None:
             pass  # it was closed meanwhile
         elif kind == IN:
@@ -225,43 +157,30 @@ class Daemon:
         elif kind == CLOSE:
             self.close(process)
 
-    def acknowledge(self, kind: int) -> None:
-        """Tell how many counted frames have come."""
-        self.unacked = 0
-        if self.link is not None:
-            self.outgoing.append(frame(kind, 0, struct.pack('>Q', self.received)))
-            self.want_write()
-
     def send(self, kind: int, number: int, payload: bytes = b'') -> None:
-        """Send a counted frame, now or over the next connection."""
-        data = frame(kind, number, payload)
-        self.sent += 1
-        self.kept.append(data)
-        if self.greeted:
-            self.outgoing.append(data)
-            self.want_write()
+        """Send a frame."""
+        self.outgoing.append(frame(kind, number, payload))
+        self.want_write()
 
     def want_write(self) -> None:
         """Write as much as the connection takes, and the rest as soon as it takes more."""
-        if self.link is None:
-            return
         try:
             while self.outgoing:
                 data = self.outgoing[0]
-                count = os.write(self.sink, data)
+                count = os.write(_STDOUT, data)
                 if count < len(data):
                     self.outgoing[0] = data[count:]
                     continue
                 self.outgoing.popleft()
         except BlockingIOError:
             with contextlib.suppress(KeyError):
-                self.selector.register(self.sink, selectors.EVENT_WRITE, self.want_write)
+                self.selector.register(_STDOUT, selectors.EVENT_WRITE, self.want_write)
             return
         except OSError:
-            self.drop()
+            self.connected = False
             return
         with contextlib.suppress(KeyError, ValueError):
-            self.selector.unregister(self.sink)
+            self.selector.unregister(_STDOUT)
 
     # -- commands -------------------------------------------------------------------------------
 
@@ -434,45 +353,7 @@ def begin(number: int, what: dict[str, Any]) -> Process:
     return Process(number, child, stdin, streams, bool(what['pty']))
 
 
-def main(session: str, resume: bool) -> None:
-    """Hand this process's streams to the session's daemon, and stay as long as it has them."""
-    name = '\0fogros2-shell-' + session
-    link = socket.socket(socket.AF_UNIX)
-    try:
-        link.connect(name)
-    except ConnectionRefusedError:
-        if resume:
-            os.write(1, frame(GONE, 0, b''))
-            return
-        listener = socket.socket(socket.AF_UNIX)
-        listener.bind(name)
-        listener.listen(4)
-        if os.fork() == 0:
-            daemon(listener)
-        listener.close()
-        link.connect(name)
-    socket.send_fds(link, [b'x'], [0, 1])
-    nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1):
-        os.dup2(nothing, stream)
-    with contextlib.suppress(OSError):
-        link.recv(1)
-
-
-def daemon(listener: socket.socket) -> NoReturn:
-    """Serve, out of reach of what becomes of the ``exec`` that began this."""
-    try:
-        os.setsid()
-        os.chdir('/')
-        os.umask(0o022)
-        nothing = os.open(os.devnull, os.O_RDWR)
-        for stream in (0, 1, 2):
-            os.dup2(nothing, stream)
-        os.close(nothing)
-        Daemon(listener).run()
-    finally:
-        os._exit(0)
-
-
 if __name__ == '__main__':
-    main(sys.argv[1], sys.argv[2] == 'resume')
+    os.chdir('/')
+    os.umask(0o022)
+    Multiplexer().run()
