@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time: the deadlines of a deployment, and the only polling loop."""
+"""Time: the deadlines of a deployment, the only polling loop, and calls that a cancel leaves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent import futures
 import dataclasses
 import threading
 import time
@@ -65,3 +66,47 @@ def wait_until(
             raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
         cancel.wait(min(interval, left))
         interval = min(interval * 1.5, longest)
+
+
+def cancellable(
+    call: Callable[[], T], cancel: Optional[threading.Event], *, what: str,
+    grace: Callable[[], float] = lambda: 1.0, late: Optional[Callable[[T], None]] = None,
+) -> T:
+    """
+    Return what a blocking call returns, or raise what it raises.
+
+    The call runs in a thread of its own, which is left alone after a cancel.
+
+    :param cancel: None to call in this thread.
+    :param what: completes '... was cancelled'.
+    :param grace: returns the seconds that the call gets once ``cancel`` is set; it may be making
+        something, which can be undone only when it is known.
+    :param late: gets the result of a call that was left alone.
+    :raises Cancelled: ``cancel`` was set before, or the call had not returned in time.
+    """
+    if cancel is None:
+        return call()
+    if cancel.is_set():
+        raise Cancelled(what)
+    answer: futures.Future[T] = futures.Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - raised again below
+            answer.set_exception(error)
+
+    def pass_on(done: futures.Future[T]) -> None:
+        if late is not None and done.exception() is None:
+            late(done.result())
+
+    # no pool: the interpreter would wait for its threads at its end
+    threading.Thread(target=run, name='fog-call', daemon=True).start()
+    until: Optional[float] = None
+    while not futures.wait([answer], 0.05).done:
+        if cancel.is_set():
+            until = until or time.monotonic() + grace()
+            if time.monotonic() >= until:
+                answer.add_done_callback(pass_on)
+                raise Cancelled(what)
+    return answer.result()

@@ -2,8 +2,8 @@
 """
 The client of a cluster's API server, for the shell and the provider of pods.
 
-``configuration`` reads the kubeconfig, ``answers`` parses answers and errors, ``cancellation``
-interrupts blocking calls, ``watch`` follows objects, ``api`` makes the requests.
+``configuration`` reads the kubeconfig, ``answers`` parses answers and errors, ``watch`` follows
+objects, ``api`` makes the requests.
 """
 
 from fogros2.kubernetes_client.answers import ApiError, items, path, selector, Unreachable

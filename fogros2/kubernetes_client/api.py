@@ -27,10 +27,9 @@ from fogros2.kubernetes_client.answers import (
     refusal,
     Unreachable,
 )
-from fogros2.kubernetes_client.cancellation import cancellable
 from fogros2.kubernetes_client.configuration import words
 from fogros2.kubernetes_client.watch import Watch
-from fogros2.waiting import wait_until
+from fogros2.waiting import cancellable, wait_until
 
 if TYPE_CHECKING:
     import websocket

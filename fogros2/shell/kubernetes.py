@@ -21,13 +21,12 @@ from fogros2.errors import (
     DeadlineExceeded,
     FogError,
 )
-from fogros2.kubernetes_client.cancellation import cancellable
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
 from fogros2.shell.kubernetes_channel import Channel
 from fogros2.shell.kubernetes_link import Link
 from fogros2.shell.lines import LineStream, Output
-from fogros2.waiting import wait_until
+from fogros2.waiting import cancellable, wait_until
 
 #: Seconds after a command's end in which something it left behind may hold its output open.
 _DRAIN = 2.0

@@ -9,13 +9,12 @@ a call for a launch waits for it beside the launch's cancel, and what is left of
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent import futures
 import threading
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import Cancelled
 from fogros2.provider.aws.failures import NO_ROOM
-from fogros2.waiting import wait_until
+from fogros2.waiting import cancellable
 
 T = TypeVar('T')
 
@@ -27,10 +26,6 @@ THROTTLED = frozenset({
 UNANSWERED = 2
 #: Seconds that a request on its way gets to be answered: it may be making something.
 ON_ITS_WAY = 4.0
-#: Seconds between two looks at a cancel.
-LOOK = 0.1
-#: More than any call takes.
-_FOREVER = 86400.0
 _here = threading.local()
 
 
@@ -56,28 +51,17 @@ def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) 
     if cancel is None:
         return work()
     call = _Call(cancel)
-    outcome: futures.Future[T] = futures.Future()
 
-    def run() -> None:
+    def run() -> T:
         _here.call = call
-        try:
-            outcome.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - handed to the waiting thread
-            outcome.set_exception(error)
+        return work()
 
-    def over(seconds: float = LOOK) -> bool:
-        return bool(futures.wait([outcome], seconds).done)
-
-    if not cancel.is_set():
-        # no pool: its threads would be waited for at the interpreter's end
-        threading.Thread(target=run, name='fog-aws-call', daemon=True).start()
     try:
-        wait_until(over, timeout=_FOREVER, cancel=cancel, interval=0.0, longest=0.0, what=what)
+        return cancellable(run, cancel, what=what,
+                           grace=lambda: ON_ITS_WAY if call.sent else 0.0)
     except Cancelled as error:
-        if not (call.sent and over(ON_ITS_WAY)):
-            error.refused = not (call.sent or call.unsure)
-            raise
-    return outcome.result()
+        error.refused = not (call.sent or call.unsure)
+        raise
 
 
 def teach(client: Any) -> None:

@@ -21,7 +21,7 @@ import time
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
-from fogros2.kubernetes_client.cancellation import cancelled
+from fogros2.errors import Cancelled
 
 #: Seconds between two questions.
 INTERVAL = 0.1
@@ -135,7 +135,8 @@ def first_to_answer(
     links: dict[socket.socket, tuple[str, int]] = {}
     try:
         while known and time.monotonic() < deadline:
-            cancelled(cancel, 'looking for a way into the cluster')
+            if cancel is not None and cancel.is_set():
+                raise Cancelled('looking for a way into the cluster')
             # From a port of its own each time: the node remembers what became of the first
             # datagram of a pair of ports, and that may have been before it knew the pod.
             for place in known:
