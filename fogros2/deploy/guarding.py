@@ -112,7 +112,8 @@ class Guard:
                 timeout=job.timeouts.agent, cancel=job.cancel,
                 what=f"the agent of '{job.name}'")
             job.undo.callback(agent.close)
-            job.ask = lambda seconds: agent.request('ping', timeout=seconds)
+            # a busy machine, whose nodes are heard meanwhile, has more time to answer
+            job.ask = lambda seconds: agent.request('ping', timeout=3 * seconds, silent=seconds)
             self.undo_nodes(agent)
             self._rearming = _Rearming(agent, job.launch.id, job.spec.robot_timeout / 4)
             job.undo.callback(self._rearming.close)
@@ -203,7 +204,6 @@ class Guard:
             raise
         heartbeat = Heartbeat(interface.address, plan.HEARTBEAT_PORT, job.launch.id)
         job.undo.callback(heartbeat.close)
-        job.heartbeat_age = lambda: heartbeat.age
         try:
             wait_until(
                 lambda: heartbeat.round_trip is not None, timeout=job.timeouts.vpn,

@@ -54,8 +54,6 @@ class Job:
         self.shell: Optional[Shell] = None
         #: Asks the machine's agent for a sign of life, within so many seconds.
         self.ask: Optional[Callable[[float], object]] = None
-        #: Returns the seconds since a heartbeat was answered, None before the first answer.
-        self.heartbeat_age: Callable[[], Optional[float]] = lambda: None
         self._hurried: Optional[bool] = None
         #: Set when the launch's is, or when a step failed: those beside it needn't go on.
         self.cancel = Either(launch.cancel)
@@ -164,9 +162,6 @@ class Job:
         return min(seconds, HURRIED) if self._hurried else seconds
 
     def _answers(self) -> bool:
-        age = self.heartbeat_age()
-        if age is not None and age < ANSWER:
-            return True  # a machine under load may take longer than that to answer a question
         try:
             if self.ask is not None:
                 self.ask(ANSWER)

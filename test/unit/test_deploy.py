@@ -23,7 +23,7 @@ from fogros2.deploy.creating import Creation
 from fogros2.deploy.deployment import Deployment
 from fogros2.deploy.entering import Entrance
 from fogros2.deploy.guarding import Guard
-from fogros2.deploy.job import HURRIED, Job
+from fogros2.deploy.job import Job
 from fogros2.deploy.joining import Joining
 from fogros2.deploy.robot_vpn import RobotVpn, VpnMember
 from fogros2.errors import (
@@ -480,16 +480,6 @@ def test_a_machine_with_a_network_that_overlaps_the_vpn_s_keeps_it(launch, provi
     assert joining.fit(plain, ['10.0.0.0/8', '172.17.0.0/16']) == plain
     fitted = joining.fit(plain, ['10.0.0.0/8', '198.18.0.0/16'])
     assert fitted.host_routes and launch.store.machine('planner').load().vpn == fitted
-
-
-@pytest.mark.parametrize(('age', 'waits'), [(1.0, 30.0), (60.0, HURRIED), (None, HURRIED)])
-def test_machine_with_a_fresh_heartbeat_gets_time_to_answer(launch, provider, age, waits):
-    def ask(timeout: float) -> None:
-        raise DeadlineExceeded(f'no answer to ping within {timeout:g} s')
-
-    mine = Job(launch, SPEC)
-    mine.ask, mine.heartbeat_age = ask, lambda: age
-    assert mine.patience(30.0) == waits
 
 
 @pytest.mark.parametrize('where', ['describe', 'found', 'gone'])
