@@ -159,7 +159,7 @@ def test_files_that_stand_for_the_paper_exist():
 
 
 @pytest.mark.parametrize('page', [
-    'architecture', 'architecture_features', 'decisions', 'machine_life', 'security'])
+    'architecture', 'architecture_features', 'decisions', 'machine_life', 'measured', 'security'])
 def test_modules_that_a_page_names_exist(page):
     text = re.sub('```.*?```', '', (ROOT / f'doc/{page}.md').read_text(), flags=re.DOTALL)
     named = re.findall(r'`([\w/]+(?:/|\.py))`', text)
