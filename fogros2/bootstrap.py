@@ -227,7 +227,7 @@ def _complete(
     if left:
         asked = run(needs.resolve(left, environment, install.setup), check=False)
         if asked.returncode == needs.NO_ROSDEP and able:
-            run(_apt_install([needs.rosdep_package(facts)], 'install rosdep'), check=False)
+            run(apt_install([needs.rosdep_package(facts)], 'install rosdep'), check=False)
             asked = run(needs.resolve(left, environment, install.setup), check=False)
         if asked.returncode == 0:
             more_apt, more_pip = needs.resolved(asked.stdout)
@@ -245,7 +245,7 @@ def _complete(
         if lacking and not able:
             notes.append(f"the machine lacks {', '.join(lacking)}")
         elif lacking:
-            run(_apt_install(lacking, f"install {', '.join(lacking)}"))
+            run(apt_install(lacking, f"install {', '.join(lacking)}"))
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip) and install.kind == 'ros':
         return notes
@@ -454,7 +454,7 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
         packages.append('wireguard-go')
     if not packages:
         return ()
-    return (_apt_install(packages, f"install {', '.join(packages)}"),)
+    return (apt_install(packages, f"install {', '.join(packages)}"),)
 
 
 def _why_not_embedded(
@@ -607,7 +607,7 @@ def _apt(
 ) -> Preparation:
     """Return what installs ROS 2's packages and the user's, then adds this one."""
     ours = _ros(facts, wheels, workspace)
-    commands = [_apt_install(packages, f'install ROS 2 {DISTRO}')]
+    commands = [apt_install(packages, f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
         commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
     return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))
@@ -629,10 +629,13 @@ dpkg -i "$folder/source.deb"
 """
 
 
-def _apt_install(packages: Sequence[str], what: str) -> Command:
+def apt_install(packages: Sequence[str], what: str) -> Command:
+    """Return the command that installs Debian packages."""
     return Command.script(
         'export DEBIAN_FRONTEND=noninteractive\n'
         # a machine that has just booted runs apt by itself: wait for its lock
         'apt-get -q -o DPkg::Lock::Timeout=300 update\n'
+        # apt refuses all after a dpkg that was killed; of one that still runs, apt knows the end
+        'dpkg --configure -a </dev/null || :\n'
         'apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends '
         f'{shlex.join(packages)}\n', sudo=True, what=what)

@@ -113,6 +113,9 @@ cd {folder}
 rm -rf site
 if python3 -m pip --version >/dev/null 2>&1; then
     set -- python3 -m pip
+elif wheel=$(ls "$VIRTUAL_ENV"/../wheels/pip-*.whl 2>/dev/null); then
+    # the embedded default brought it: Debian's venv cannot make one with pip by itself
+    set -- python3 "$wheel/pip"
 else
     python3 -m venv --clear pip
     set -- pip/bin/python -m pip

@@ -77,6 +77,8 @@ LIST
         [ -d /usr/include/fastdds ] || for name in libfastrtps-dev libfastdds-dev; do
             if known "$name"; then echo "$name"; break; fi
         done
+        # makes the root of isolated container machines
+        have debootstrap || echo debootstrap
         # test images hold it alone; Debian's other busybox needs libraries, and gives way to it
         have_static busybox || echo busybox-static
         have chromium || have google-chrome || ! known chromium || echo chromium

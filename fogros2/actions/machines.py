@@ -306,6 +306,9 @@ class ContainerInstance(CloudInstance):
 
     :param image: what it is made of; None for this computer's own root, seen through an
         allow-list (podman alone).
+    :param isolated: give it the root of a new system of this computer's release, made once by
+        debootstrap, in place of this computer's own: it has none of the packages that are
+        installed here, as a new machine in a cloud.
     :param engine: 'podman' or 'docker'; None for the one that works.
     :param user: login user, made if needed.
     :param network: name of an existing container network; None for the engine's own.
@@ -325,6 +328,7 @@ class ContainerInstance(CloudInstance):
 
     def __init__(
         self, *, image: Optional[SomeSubstitutionsType] = None,
+        isolated: Optional[Truth] = None,
         engine: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
         ip: Optional[SomeSubstitutionsType] = None,
@@ -339,7 +343,8 @@ class ContainerInstance(CloudInstance):
         **common: Any,
     ) -> None:
         super().__init__(options={
-            'image': image, 'engine': engine, 'network': network, 'ip': ip,
+            'image': image, 'isolated': words.truth(isolated), 'engine': engine,
+            'network': network, 'ip': ip,
             'cpus': words.number(cpus), 'memory': memory, 'ports': words.items(ports),
             'mounts': words.items(mounts), 'user': user, 'gpus': gpus,
             'devices': words.items(devices),

@@ -30,6 +30,7 @@ from fogros2.provider import (
     container_machine,
     container_options,
     container_root,
+    debian_root,
     Provider,
 )
 from fogros2.provider.container_engine import Engine
@@ -121,7 +122,7 @@ class ContainerProvider(Provider):
         if options.image:
             container_engine.check_architecture(engine, options.image)
         else:
-            check_root()
+            check_root(isolated=options.isolated)
 
     def architecture(self, spec: MachineSpec) -> str:
         """Return that of the image; one that is still to be downloaded is chosen for this one."""
@@ -173,14 +174,15 @@ class ContainerProvider(Provider):
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
     ) -> str:
         top = container_machine.directory(request.token)
-        system = container_root.system_mounts()
+        base = str(debian_root.root(cancel=request.cancel)) if options.isolated else ''
+        system = container_root.system_mounts(base)
         kept = spec.on_exit == 'stop'
         words = [*container_options.common_flags(engine, spec, request, options)]
         for path in system:
             # the engine's own layer ends with the run; a machine that is stopped keeps its disk
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
-            words += ['-v', f"{path}:{path}:O{upper if kept else ''}"]
-        for mount in container_root.environment_mounts(spec.workspace):
+            words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
+        for mount in () if base else container_root.environment_mounts(spec.workspace):
             words += ['-v', f'{mount}:{mount}:ro']
         for mount in options.mounts:
             words += ['-v', container_options.mount_flag(mount)]
@@ -193,13 +195,17 @@ class ContainerProvider(Provider):
             archive, user=options.user, authorized_key=request.authorized_key,
             environment=options.env, agent_config=request.agent_config,
             nested=container_options.runs_containers(spec, options))
+        if base:
+            archive.file('etc/apt/sources.list', ''.join(
+                f'{line}\n' for line in debian_root.release().sources).encode())
+            archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), '' if kept else removal_hook(top),
              ' '.join(system) if kept else '',
              engine.name, *flags, 'run', '-d', '--cidfile', f'{top}/cid', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
             sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
-            input=container_root.skeleton(options.user) + archive.data())
+            input=container_root.skeleton(options.user, base) + archive.data())
         try:
             return process.run(command, timeout=120.0).stdout.split()[-1]
         except CommandError as error:
@@ -384,15 +390,19 @@ def hook_flags(top: Path) -> Iterator[str]:
     yield from ('--hooks-dir', f'{top}/hooks')
 
 
-def check_root() -> None:
+def check_root(*, isolated: bool = False) -> None:
     """
     Look whether this computer's own root can serve as an image.
 
+    :param isolated: look whether there can be a new system's root.
     :raises PrerequisiteError: it can't be overlaid, or lacks what a machine needs.
     """
-    process.require(
-        ('sshd', 'ssh-keygen', 'sudo', 'rsync', 'tar'),
-        package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
+    if isolated:
+        debian_root.check()
+    else:
+        process.require(
+            ('sshd', 'ssh-keygen', 'sudo', 'rsync', 'tar'),
+            package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
     kinds = Path('/proc/filesystems').read_text().split()
     if 'overlay' not in kinds and not os.path.isdir('/sys/module/overlay'):
         process.run(Command(('modprobe', 'overlay'), sudo=True), timeout=10.0, check=False)

@@ -34,7 +34,7 @@ class Options:
     """
     What a launch file may ask of a container.
 
-    :param image: name of an image; '' for this computer's own root (podman alone).
+    :param image: name of an image; '' for a root without one (podman alone): this computer's own.
     :param engine: auto, podman or docker.
     :param user: login user, made with sudo rights and no password.
     :param network: network of the engine's; '' for its default.
@@ -47,6 +47,7 @@ class Options:
     :param mounts: folders visible there read-only: 'path' or 'path:path there'.
     :param env: variables of every login.
     :param containers: whether it may run containers of its own.
+    :param isolated: whether it gets a new system's root in place of this computer's own.
     """
 
     image: str = ''
@@ -62,6 +63,7 @@ class Options:
     mounts: tuple[str, ...] = ()
     env: Mapping[str, str] = dataclasses.field(default_factory=dict)
     containers: bool = False
+    isolated: bool = False
 
     @classmethod
     def parse(cls, given: Mapping[str, Any]) -> Options:

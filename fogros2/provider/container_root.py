@@ -116,15 +116,21 @@ class Archive:
         return self._buffer.getvalue()[:end]
 
 
-@functools.lru_cache(maxsize=1)
-def system_mounts() -> tuple[str, ...]:
-    """Return the system's folders to be laid under throw-away layers, outer ones first."""
-    found = [f'/{name}' for name in SYSTEM if _is_folder(Path('/', name))]
-    if os.path.isdir(PACKAGES):
-        found.append(PACKAGES)
-    # an overlay doesn't look below another file system that is mounted inside it
-    found += [point for point in mount_points() if point.startswith('/usr/')]
-    return (*found, *many_settings())
+@functools.lru_cache(maxsize=4)
+def system_mounts(base: str = '') -> tuple[str, ...]:
+    """
+    Return the system's folders to be laid under throw-away layers, outer ones first.
+
+    :param base: a folder with a system; '' for this computer's own.
+    """
+    found = [f'/{name}' for name in SYSTEM if _is_folder(Path(f'{base}/{name}'))]
+    if base:
+        found.append('/var/lib')  # no service of this computer's has its data there
+    else:
+        found += [PACKAGES] if os.path.isdir(PACKAGES) else []
+        # an overlay doesn't look below another file system that is mounted inside it
+        found += [point for point in mount_points() if point.startswith('/usr/')]
+    return (*found, *(path[len(base):] for path in many_settings(f'{base}/etc')))
 
 
 def _is_folder(path: Path) -> bool:
@@ -260,17 +266,19 @@ def _system(number: str) -> bool:
 
 
 @functools.lru_cache(maxsize=4)
-def skeleton(user: str) -> bytes:
+def skeleton(user: str, base: str = '') -> bytes:
     """
     Return the part of the root that all machines share, as an archive that another follows.
 
     Read once per process: a launch of many machines doesn't read /etc for each.
+
+    :param base: a folder with a system; '' for this computer's own.
     """
     archive = Archive()
     for name, mode in _FOLDERS.items():
         archive.folder(name, mode)
     for name in SYSTEM:
-        path = Path('/', name)
+        path = Path(f'{base}/{name}')
         if path.is_symlink():
             archive.link(name, os.readlink(path))
         elif path.is_dir():
@@ -278,8 +286,8 @@ def skeleton(user: str) -> bytes:
     archive.link('var/run', '/run')
     archive.link('var/lock', '/run/lock')
     archive.link('etc/mtab', '../proc/self/mounts')
-    settings(archive)
-    accounts(archive, user)
+    settings(archive, f'{base}/etc')
+    accounts(archive, user, Path(f'{base}/etc'))
     return archive.data(last=False)
 
 

@@ -22,7 +22,7 @@ from fogros2.agent_client import agent_source
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
-from fogros2.provider import container_root
+from fogros2.provider import container_root, debian_root
 from rigs.cluster import images as cluster_images
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
@@ -111,6 +111,18 @@ def cloud_network(engine: str) -> Iterator[str]:
         pytest.fail(f'no subnet for the tests is free: {made.stderr}')
     yield name
     run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
+
+
+@pytest.fixture(scope='session')
+def isolated_root() -> None:
+    """Skip where isolated container machines get no root, or its Python is not these tests'."""
+    try:
+        debian_root.check()
+    except PrerequisiteError as error:
+        pytest.skip(f'needs an isolated root: {error}')
+    python = Path(debian_root.root(), 'usr/bin/python3').resolve().name
+    if python != f'python{sys.version_info.major}.{sys.version_info.minor}':
+        pytest.skip(f'the robot has another Python than the isolated root, {python}')
 
 
 @pytest.fixture(scope='session')

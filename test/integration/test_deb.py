@@ -25,7 +25,7 @@ import pytest
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, Result
 from fogros2.process import run, which
-from rigs.cluster import images
+from fogros2.provider import debian_root
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'
@@ -123,7 +123,7 @@ def make(target: Path) -> None:
     if which('debootstrap') is None:
         pytest.skip('needs debootstrap')
     try:
-        _, address = images.debian()
+        own = debian_root.release()
     except PrerequisiteError as error:
         pytest.skip(f'needs a computer whose packages come from Debian: {error}')
     aside = Path(tempfile.mkdtemp(dir=target.parent, prefix='new-'))
@@ -131,7 +131,7 @@ def make(target: Path) -> None:
         # in a mount namespace of its own: an interrupted one leaves no mount
         run(Command((
             'unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec', MAKE, 'sh',
-            str(aside / 'root'), ','.join(INCLUDE), SUITE, address, str(aside / 'root.tar'),
+            str(aside / 'root'), ','.join(INCLUDE), SUITE, own.address, str(aside / 'root.tar'),
             str(os.getuid())), sudo=True, what='make a Debian system'), timeout=1000.0)
         (aside / 'root.tar').rename(target)
     except CommandError as error:

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""apt and pip packages on a container machine, from a repository and a folder of this test."""
+"""
+apt and pip packages on a container machine, from a repository and a folder of this test.
+
+The machine has a root of its own, so that nothing that is installed here is there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import dataclasses
 import hashlib
+import importlib.util
+import os
 from pathlib import Path
 import shutil
 import time
@@ -14,46 +20,75 @@ import zipfile
 
 import pytest
 
+from fogros2.bootstrap import apt_install
 from fogros2.deploy import Launch
 from fogros2.errors import CommandError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
+from fogros2.provider import debian_root
 from fogros2.report import StepDone
 from fogros2.waiting import wait_until
+from rigs.cluster.images import RootShell
 from rigs.rosdep import rosdep_source
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
     pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
     pytest.mark.skipif(shutil.which('dpkg-deb') is None, reason='needs dpkg'),
+    pytest.mark.usefixtures('isolated_root'),
 ]
 
 #: What apt reads in place of this computer's own sources.
 APT = 'Dir::Etc::sourcelist "/fogt/sources.list";\nDir::Etc::sourceparts "-";\n'
+#: rosdep, and what it imports.
+ROSDEP = ('rosdep2', 'rospkg', 'rosdistro', 'catkin_pkg', 'yaml', 'pyparsing', 'dateutil', 'six',
+          'distro', 'packaging', 'docutils')
 #: What the node says of the packages, and of a variable that it needs besides.
 NODE = ('import fogt_one, os, shutil; '
         'print(fogt_one.name, shutil.which("fogt-hello"), os.environ["PYTHONPATH"], flush=True)')
 
 
-@pytest.fixture(scope='module')
-def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return a folder with a Debian package, apt's list of it, and a wheel."""
-    folder = tmp_path_factory.mktemp('packages')
-    folder.chmod(0o755)
-    tree = folder / 'tree'
-    (tree / 'DEBIAN').mkdir(parents=True)
-    (tree / 'usr/bin').mkdir(parents=True)
-    control = ('Package: fogt-hello\nVersion: 1\nArchitecture: all\n'
+def debian_package(folder: Path, name: str, program: str, modules: Sequence[Path] = ()) -> str:
+    """
+    Write a Debian package with one program and some Python modules; return its entry for apt.
+
+    :param program: the program's text.
+    """
+    tree, deb = folder / 'tree' / name, folder / f'{name}.deb'
+    site = tree / 'usr/lib/python3/dist-packages'
+    for path in (tree / 'DEBIAN', tree / 'usr/bin', site):
+        path.mkdir(parents=True)
+    control = (f'Package: {name}\nVersion: 1\nArchitecture: all\n'
                'Maintainer: A <a@example.com>\nDescription: for a test\n')
     (tree / 'DEBIAN/control').write_text(control)
-    (tree / 'usr/bin/fogt-hello').write_text('#!/bin/sh\n')
-    (tree / 'usr/bin/fogt-hello').chmod(0o755)
-    deb = folder / 'fogt-hello.deb'
-    run(Command(('dpkg-deb', '--root-owner-group', '--build', str(tree), str(deb))), timeout=30.0)
+    file = tree / 'usr/bin' / ('rosdep' if 'rosdep' in name else name)
+    file.write_text(program)
+    file.chmod(0o755)
+    for module in modules:
+        if module.is_dir():
+            shutil.copytree(module, site / module.name,
+                            ignore=shutil.ignore_patterns('__pycache__', '*.so'))
+        else:
+            shutil.copy(module, site)
+    run(Command(('dpkg-deb', '--root-owner-group', '--build', '-Znone', str(tree), str(deb))),
+        timeout=30.0)
     data = deb.read_bytes()
+    return (f'{control}Filename: ./{deb.name}\nSize: {len(data)}\n'
+            f'SHA256: {hashlib.sha256(data).hexdigest()}\n\n')
+
+
+@pytest.fixture(scope='module')
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a folder with Debian packages, apt's list of them, and a wheel."""
+    folder = tmp_path_factory.mktemp('packages')
+    folder.chmod(0o755)
+    # rosdep is the one that these tests have, under the name of Debian's package
+    modules = [Path(spec.origin).parent if spec.submodule_search_locations else Path(spec.origin)
+               for spec in map(importlib.util.find_spec, ROSDEP) if spec and spec.origin]
     (folder / 'Packages').write_text(
-        f'{control}Filename: ./{deb.name}\nSize: {len(data)}\n'
-        f'SHA256: {hashlib.sha256(data).hexdigest()}\n')
+        debian_package(folder, 'fogt-hello', '#!/bin/sh\n')
+        + debian_package(folder, 'python3-rosdep2', '#!/usr/bin/python3\nimport rosdep2.main\n'
+                                                    'rosdep2.main.rosdep_main()\n', modules))
     (folder / 'sources.list').write_text('deb [trusted=yes] file:/fogt ./\n')
     (folder / 'apt.conf').write_text(APT)
     with zipfile.ZipFile(folder / 'fogt_one-1-py3-none-any.whl', 'w') as archive:
@@ -70,7 +105,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def spec(cloud_network: str, packages: Path) -> MachineSpec:
     return MachineSpec(
         f'needs-{uuid.uuid4().hex[:6]}', 'container', {
-            'network': cloud_network,
+            'network': cloud_network, 'isolated': True,
             'mounts': [f'{packages}:/fogt', f'{packages}/apt.conf:/etc/apt/apt.conf.d/99fogt']},
         environment={'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': '/fogt', 'PYTHONPATH': '/mine'},
         apt=('fogt-hello',), pip=('fogt-one',))
@@ -138,6 +173,25 @@ def test_what_the_workspace_runs_with_is_installed_once(spec, packages, workspac
     assert 'installed fogt-hello' in details[0] and 'installed fogt-one by pip' in details[0]
     assert 'the machine may lack fogt_unknown' in details[0]
     assert details[1] == 'there already'
+
+
+def test_apt_installs_after_a_dpkg_that_was_killed(packages, tmp_path):
+    base, shell = debian_root.root(), RootShell(debian_root.root(), tmp_path)
+    status = (base / 'var/lib/dpkg/status').read_text()
+    for name, text in (('fogt/Packages', (packages / 'Packages').read_text()),
+                       ('etc/apt/sources.list', 'deb [trusted=yes] file:/fogt ./\n'),
+                       # what dpkg was about to write when it was killed
+                       ('var/lib/dpkg/updates/0000', status.split('\n\n')[0] + '\n')):
+        path = tmp_path / 'files' / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    shutil.copy(packages / 'fogt-hello.deb', tmp_path / 'files/fogt')
+    try:
+        shell.run(apt_install(['fogt-hello'], 'install a package'), timeout=60.0)
+        assert os.listdir(tmp_path / 'files/var/lib/dpkg/updates') == []
+        assert (tmp_path / 'files/usr/bin/fogt-hello').exists()
+    finally:
+        debian_root.remove(tmp_path / 'files')
 
 
 def test_package_that_does_not_exist_is_named(spec):

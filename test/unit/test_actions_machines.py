@@ -40,13 +40,13 @@ def test_everything_that_a_container_takes(context):
         environment={'A': '1'}, image='ros:jazzy',
         engine='docker', network='net', ip='198.51.100.7', cpus=1.5, memory='2g',
         ports=['8080:80'], mounts=['/a:/b'], user='me',
-        gpus='all', devices=['/dev/video0'], containers=True)
+        gpus='all', devices=['/dev/video0'], containers=True, isolated='true')
     machine.add_docker_container('docker run hello-world')
     spec = machine.spec(context)
     assert spec.options == {
         'image': 'ros:jazzy', 'engine': 'docker', 'network': 'net', 'ip': '198.51.100.7',
         'cpus': 1.5, 'memory': '2g', 'ports': ['8080:80'], 'mounts': ['/a:/b'], 'user': 'me',
-        'gpus': 'all', 'devices': ['/dev/video0'], 'containers': True}
+        'gpus': 'all', 'devices': ['/dev/video0'], 'containers': True, 'isolated': True}
     assert (spec.workspace, spec.on_exit, spec.lifetime) == ('/robot/ws', 'keep', 5400)
     assert (spec.robot_timeout, spec.bootstrap, spec.environment) == (30, 'none', {'A': '1'})
     assert spec.launch_foxglove and spec.containers == ('docker run hello-world',)

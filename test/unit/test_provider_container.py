@@ -31,6 +31,7 @@ from fogros2.provider import (
     container_machine,
     container_options,
     container_root,
+    debian_root,
 )
 from fogros2.provider.container_engine import Engine
 from fogros2.provider.container_options import Options
@@ -448,3 +449,47 @@ def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
     with pytest.raises(Cancelled):
         container.ContainerProvider().create(
             MachineSpec('m', 'container', {'image': 'large'}), request)
+
+
+def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):
+    for name in ('usr/bin', 'etc/pam.d', 'var/lib/dpkg'):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / 'bin').symlink_to('usr/bin')
+    (tmp_path / 'etc/passwd').write_text('root:x:0:0:root:/root:/bin/bash\n')
+    (tmp_path / 'etc/group').write_text('root:x:0:\n')
+    (tmp_path / 'etc/os-release').write_text('ID=other\n')
+    assert container_root.system_mounts(str(tmp_path)) == ('/usr', '/var/lib')
+    found = content(
+        container_root.skeleton('fog', str(tmp_path)) + container_root.Archive().data())
+    assert found['bin'].linkname == 'usr/bin'
+    assert 'etc/os-release' in found and 'etc/ssl/certs' not in found
+
+
+TARGETS = """\
+Extra noble main http://x.example/ros
+Ubuntu noble main http://m.example/ubuntu/
+Ubuntu noble universe http://m.example/ubuntu/
+Ubuntu noble-security main http://s.example/ubuntu/
+Ubuntu jammy main http://m.example/ubuntu/
+"""
+
+
+def test_isolated_root_comes_from_the_releases_own_sources():
+    own = debian_root.parse_release('ubuntu', 'noble', TARGETS)
+    assert (own.address, own.components) == ('http://m.example/ubuntu/', ('main', 'universe'))
+    assert own.sources == (
+        'deb http://m.example/ubuntu/ noble main', 'deb http://m.example/ubuntu/ noble universe',
+        'deb http://s.example/ubuntu/ noble-security main')
+    folder = Path('/cache')
+    assert len({debian_root.path(folder, release, packages) for release, packages in (
+        (own, ('a', 'b')), (own, ('b', 'a')), (own, ('a',)),
+        (dataclasses.replace(own, codename='jammy'), ('a',)))}) == 3
+
+
+@pytest.mark.parametrize('system, targets', [
+    ('ubuntu', ''), ('fedora', TARGETS),
+    ('ubuntu', 'Ubuntu noble main http://me:secret@m.example/ubuntu/\n')])
+def test_computer_without_own_sources_gets_a_hint(system, targets):
+    with pytest.raises(PrerequisiteError, match='knows no packages') as error:
+        debian_root.parse_release(system, 'noble', targets)
+    assert 'image=' in error.value.hint

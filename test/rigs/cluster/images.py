@@ -29,6 +29,7 @@ from typing import Any, Optional
 from fogros2 import bootstrap, plan, process, wheels
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command, MachineSpec, Result, SyncReport
+from fogros2.provider import debian_root
 from fogros2.provider.kubernetes.options import IMAGE
 from rigs.cluster import ros, services
 from rigs.cluster.node_process import run_node
@@ -54,9 +55,6 @@ _CONFIG = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin
            'Cmd': ['/bin/sh']}
 #: In an image folder: why ``READY`` is no more than ``BARE``, if it isn't.
 _WHY_NOT = 'why-not-ready'
-#: Takes documentation and apt's lists out: they are half of a small system.
-_SHRINK = ('rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/apt/* "$1"/usr/share/doc/* '
-           '"$1"/usr/share/locale/* "$1"/usr/share/man/* "$1"/var/log/* "$1"/dev/*')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,49 +71,19 @@ class Image:
     config: dict[str, Any]
 
 
-def debian() -> tuple[str, str]:
-    """
-    Return this computer's Debian release and the address its packages come from.
-
-    :raises PrerequisiteError: it isn't Debian.
-    """
-    release = platform.freedesktop_os_release()
-    codename = release.get('VERSION_CODENAME', '')
-    targets = process.run(Command(
-        ('apt-get', 'indextargets', '--format', '$(CODENAME) $(COMPONENT) $(REPO_URI)',
-         'Created-By: Packages')), timeout=30.0, check=False).stdout
-    for line in targets.splitlines():
-        suite, component, address = line.split(' ', 2)
-        if release.get('ID') == 'debian' and (suite, component) == (codename, 'main'):
-            return codename, address
-    raise PrerequisiteError('the machine image is made from Debian, which this computer is not')
-
-
 def base(cache: Path, say: Callable[[str], None]) -> Path:
     """
     Return the bare system's root folder, made by debootstrap unless it is there.
 
     :param say: gets a line before something slow begins.
     """
-    codename, address = debian()
-    recipe = f'{codename} {platform.machine()} {PACKAGES} {_SHRINK}'
-    target = cache / f'root-{_checksum(recipe)}'
-    if not target.is_dir():
+    own = debian_root.release()
+    if own.system != 'debian':
+        raise PrerequisiteError(
+            'the machine image is made from Debian, which this computer is not')
+    if not debian_root.path(cache / 'roots', own, PACKAGES).is_dir():
         say('making the machine image by debootstrap (a minute)')
-        cache.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(dir=cache, prefix='new-root-'))
-        with contextlib.ExitStack() as undo:
-            undo.callback(_remove, aside)
-            # in a mount namespace of its own: an interrupted one leaves no mount
-            process.run(Command((
-                'unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec',
-                'debootstrap --variant=minbase --include="$2" "$3" "$1" "$4" >&2; '
-                f'umount "$1/proc" "$1/sys" 2>/dev/null || :; {_SHRINK}; '
-                'mknod -m 666 "$1/dev/null" c 1 3; chown 0:0 "$1"; chmod 755 "$1"',
-                'sh', str(aside), ','.join(PACKAGES), codename, address),
-                sudo=True, what='make a Debian system'), timeout=900.0)
-            process.run(Command(('mv', '-T', str(aside), str(target)), sudo=True), timeout=10.0)
-    return target
+    return debian_root.root(cache / 'roots', PACKAGES)
 
 
 class RootShell:
@@ -202,7 +170,7 @@ def alone(cache: Path) -> Iterator[None]:
     with open(cache / 'images.lock', 'w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         for path in cache.glob('new-*'):
-            _remove(path)
+            debian_root.remove(path)
         yield
 
 
@@ -212,7 +180,7 @@ def _make(
     layers = [aside / name for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
     upper, archive = aside / 'upper', aside / 'images.tar'
     with contextlib.ExitStack() as undo:
-        undo.callback(_remove, upper)
+        undo.callback(debian_root.remove, upper)
         upper.mkdir()
         _tar(layers[0], root)
         if not system.is_dir():
@@ -398,16 +366,11 @@ def _tar(target: Path, folder: Path) -> None:
         sudo=True, what='pack an image'), timeout=300.0)
 
 
-def _remove(folder: Path) -> None:
-    process.run(Command(('rm', '-rf', '--one-file-system', '--', str(folder)), sudo=True),
-                timeout=120.0)
-
-
 def _forget_old(cache: Path, prefix: str, *, keep: Path, number: int = 2) -> None:
     """Remove all but the last used."""
     others = [path for path in cache.glob(f'{prefix}*') if path != keep]
     for path in sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
-        _remove(path)
+        debian_root.remove(path)
 
 
 def _checksum(text: str) -> str:
