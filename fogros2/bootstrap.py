@@ -72,7 +72,7 @@ class RosInstall:
     :param setup: scripts for sh to source, in order, after ``environment`` is set; the
         workspace's is among them where it is needed.
     :param facts: of the machine, ``robot`` those of the robot.
-    :param workspace: how the workspace gets there, None without one.
+    :param workspaces: how workspaces get there, in the order in which they are sourced.
     """
 
     kind: Literal['ros', 'embedded']
@@ -81,7 +81,7 @@ class RosInstall:
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     facts: HostFacts = HostFacts()
     robot: HostFacts = HostFacts()
-    workspace: Optional[workspaces.WorkspacePlan] = None
+    workspaces: tuple[workspaces.WorkspacePlan, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,16 +115,17 @@ def apt_packages(rmw: str) -> tuple[str, ...]:
     return (first, f"ros-{DISTRO}-{rmw.replace('_', '-')}", *others)
 
 
-def dependencies(spec: MachineSpec, under: Underlay) -> str:
+def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = ()) -> str:
     """
     Return 16 hexadecimal digits that stand for what has to be installed on a machine.
 
-    The ROS distribution, the packages that every machine gets, and what the workspace depends on
-    outside itself; equal digits, equal needs. What travels each time, as the workspace itself,
-    doesn't count. An image of a machine is found by them.
+    The ROS distribution, the packages that every machine gets, what the workspaces depend on
+    outside themselves, and what only the launch names; equal digits, equal needs. What travels
+    each time, as the workspaces themselves, doesn't count. An image of a machine is found by them.
 
     :param under: the environment of the robot's launch.
-    :raises WorkspaceError: a manifest of the workspace can't be read.
+    :param packages: those of the nodes that will run there.
+    :raises WorkspaceError: a manifest of a workspace can't be read.
     """
     embedded = any(
         next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
@@ -134,9 +135,15 @@ def dependencies(spec: MachineSpec, under: Underlay) -> str:
         'bootstrap': spec.bootstrap,
         'kind': 'embedded' if embedded else 'ros',
         'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
-        'workspace': workspaces.dependencies(spec.workspace) if spec.workspace else [],
+        'workspace': workspaces.dependencies(*spec.workspaces),
         'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
     }
+    # the wheels bring ours, and the embedded default its own
+    ours = {name.replace('-', '_') for name in needs.OURS}
+    named = needs.keys(map(workspaces.inspect, spec.workspaces), {*packages} - ours)
+    named = tuple({*named} & {*packages})
+    if named := needs.outside(named, [sys.prefix] if embedded else []):
+        wanted['launch'] = sorted(named)
     return hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -169,9 +176,9 @@ def ensure(
     facts = host.parse_facts(there.stdout)
     if elsewhere:
         check_elsewhere(spec, facts, robot)
-    workspace = workspaces.inspect(spec.workspace) if spec.workspace is not None else None
-    keys = needs.keys(workspace, packages)
-    todo = plan_alike(spec, facts, robot, under, workspace)
+    chain = [workspaces.inspect(path) for path in spec.workspaces]
+    keys = needs.keys(chain, packages)
+    todo = plan_alike(spec, facts, robot, under, chain)
     if todo is not None:
         # it has the same ROS packages
         keys = needs.outside(keys, under.prefixes)
@@ -182,7 +189,7 @@ def ensure(
             raise PrerequisiteError(
                 f"what '{spec.name}' lacks can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
-        todo = plan(spec, facts, robot, under, wheels, workspace)
+        todo = plan(spec, facts, robot, under, wheels, chain)
         if todo.install.kind == 'embedded':
             # it gets this very environment
             keys = needs.outside(keys, [sys.prefix])
@@ -287,7 +294,7 @@ def _ask_robot(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
 
 def plan_alike(
     spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
-    workspace: Optional[workspaces.Workspace],
+    chain: Sequence[workspaces.Workspace] = (),
 ) -> Optional[Preparation]:
     """
     Return the plan for a machine that has the robot's very environment, None for another one.
@@ -298,25 +305,26 @@ def plan_alike(
     same = facts.architecture == robot.architecture and all(
         facts.environments.get(prefix, '?') == robot.environments.get(prefix)
         for prefix in under.prefixes)
-    ours = _travelling(workspace) or ((facts.cloud_launch,) if facts.cloud_launch else ())
+    ours = _travelling(chain) or ((facts.cloud_launch,) if facts.cloud_launch else ())
     if not same or not ours or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
         'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
     return Preparation(
-        'none', _with_workspace(install, workspace, spec.name, _builds(facts)),
+        'none', _with_workspaces(install, chain, spec.name, _builds(facts)),
         _tools(facts, spec.bootstrap, spec.name))
 
 
 def plan(
     spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
-    wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+    wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace] = (),
 ) -> Preparation:
     """
     Decide how a machine that isn't like the robot gets what its nodes need.
 
     :param wheels: what the robot can send.
+    :param chain: the workspaces, the one whose packages win first.
     :raises PrerequisiteError: the machine can't be made ready in ``spec.bootstrap``'s way.
     :raises WorkspaceError: the workspace can't go there.
     """
@@ -325,7 +333,7 @@ def plan(
         raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
                                 'install python3 there')
     tools = _tools(facts, mode, spec.name)
-    python_only = workspace is None or workspace.python_only or mode == 'embedded'
+    python_only = mode == 'embedded' or all(space.python_only for space in chain)
     no_embedded = _why_not_embedded(facts, wheels, python_only)
     if under.rmw != DEFAULT_RMW:
         no_embedded = f'the embedded default has {DEFAULT_RMW} alone, and not {under.rmw}'
@@ -333,7 +341,7 @@ def plan(
     if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
             or mode == 'apt' and _builds(facts)):
-        todo = _ros(facts, wheels, workspace)
+        todo = _ros(facts, wheels, chain)
     elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
             and under.rmw == DEFAULT_RMW):
         todo = Preparation('none', _embedded_install(facts, wheels))
@@ -348,7 +356,7 @@ def plan(
             'make room there' if 'are free' in no_embedded else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
-        todo = _apt(facts, wheels, workspace, (*apt_packages(under.rmw), *spec.apt))
+        todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt))
     else:
         reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
         raise PrerequisiteError(
@@ -356,10 +364,10 @@ def plan(
             'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
     install = dataclasses.replace(
         todo.install, facts=facts, robot=robot,
-        environment=_merged(todo.install, under, workspace))
+        environment=_merged(todo.install, under, chain))
     return dataclasses.replace(
-        todo, tools=tools, install=_with_workspace(
-            install, workspace, spec.name, todo.mode == 'apt' or _builds(facts)))
+        todo, tools=tools, install=_with_workspaces(
+            install, chain, spec.name, todo.mode == 'apt' or _builds(facts)))
 
 
 def check_architecture(
@@ -409,29 +417,37 @@ def _builds(facts: HostFacts) -> bool:
     return {'colcon', 'rosdep'} <= facts.programs
 
 
-def _with_workspace(
-    install: RosInstall, workspace: Optional[workspaces.Workspace], name: str, can_build: bool,
+def _with_workspaces(
+    install: RosInstall, chain: Sequence[workspaces.Workspace], name: str, can_build: bool,
 ) -> RosInstall:
-    """Add how the workspace gets there; one that is built there brings its setup script."""
-    if workspace is None:
-        return install
-    way = workspaces.plan(
-        workspace, install.facts, install.robot, ros_setup=install.setup,
-        can_build=install.kind == 'ros' and can_build, name=name)
-    setup = (*install.setup, way.setup) if way.commands else install.setup
-    return dataclasses.replace(install, workspace=way, setup=setup)
+    """
+    Add how the workspaces get there, underlays first.
+
+    One that is built there brings its setup script, and so do all above it: a script puts its
+    packages before what is there.
+    """
+    ways: list[workspaces.WorkspacePlan] = []
+    setup = install.setup
+    for space in reversed(chain):
+        ways.append(workspaces.plan(
+            space, install.facts, install.robot,
+            ros_setup=(*install.setup, *(way.setup for way in ways)),
+            can_build=install.kind == 'ros' and can_build, name=name))
+        if any(way.commands for way in ways):
+            setup = (*setup, ways[-1].setup)
+    return dataclasses.replace(install, workspaces=tuple(ways), setup=setup)
 
 
 def _merged(
-    install: RosInstall, under: Underlay, workspace: Optional[workspaces.Workspace],
+    install: RosInstall, under: Underlay, chain: Sequence[workspaces.Workspace],
 ) -> dict[str, str]:
-    """Return the install's variables after the robot's: plain ones, the workspace's folders."""
+    """Return the install's variables after the robot's: plain ones, the workspaces' folders."""
     merged = {name: under.environment[name] for name in PLAIN_VARIABLES
               if name in under.environment and name not in _ROS_VARIABLES}
-    below = f'{workspace.root}/' if workspace is not None else None
+    below = tuple(f'{space.root}/' for space in chain)
     for name in _PATH_VARIABLES:
         entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
-                   if below and entry.startswith(below)]
+                   if entry.startswith(below)]
         own = install.environment.get(name)
         entries += [own] if own else []
         if entries:
@@ -561,21 +577,21 @@ def _checked(wheels: wheel_cache.Wheels, file: str) -> str:
     return f'echo {shlex.quote(line)} | sha256sum -c >/dev/null\n'
 
 
-def _travelling(workspace: Optional[workspaces.Workspace]) -> tuple[str, ...]:
-    """Return what ``ros2 launch`` takes for our launch file if the workspace brings it along."""
-    if workspace is not None and wheel_cache.OWN in workspace.packages:
+def _travelling(chain: Sequence[workspaces.Workspace]) -> tuple[str, ...]:
+    """Return what ``ros2 launch`` takes for our launch file if a workspace brings it along."""
+    if any(wheel_cache.OWN in space.packages for space in chain):
         return (wheel_cache.OWN, 'cloud.launch.py')
     return ()
 
 
 def _ros(
-    facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+    facts: HostFacts, wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace],
 ) -> Preparation:
     """Return what adds this package to a ROS that is there; plain Python, so it is unpacked."""
     prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
-    if _travelling(workspace):
+    if _travelling(chain):
         return Preparation('none', RosInstall(
-            'ros', (f'{prefix}/bin/ros2', 'launch', *_travelling(workspace)),
+            'ros', (f'{prefix}/bin/ros2', 'launch', *_travelling(chain)),
             (f'{prefix}/setup.sh',)))
     folder = _folder(facts, wheels)
     install = RosInstall(
@@ -602,11 +618,11 @@ def _ros(
 
 
 def _apt(
-    facts: HostFacts, wheels: wheel_cache.Wheels, workspace: Optional[workspaces.Workspace],
+    facts: HostFacts, wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace],
     packages: Sequence[str],
 ) -> Preparation:
     """Return what installs ROS 2's packages and the user's, then adds this one."""
-    ours = _ros(facts, wheels, workspace)
+    ours = _ros(facts, wheels, chain)
     commands = [apt_install(packages, f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
         commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))

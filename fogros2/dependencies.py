@@ -17,7 +17,6 @@ import json
 from pathlib import Path
 import re
 import shlex
-from typing import Optional
 
 from fogros2 import locked, modules, plan
 from fogros2.errors import ConfigurationError
@@ -115,17 +114,19 @@ def check_pip(requirement: str) -> str:
     return requirement
 
 
-def keys(workspace: Optional[Workspace], packages: Iterable[str]) -> tuple[str, ...]:
+def keys(workspaces: Iterable[Workspace], packages: Iterable[str]) -> tuple[str, ...]:
     """
-    Return the rosdep keys of what has to be on a machine beside the workspace, sorted.
+    Return the rosdep keys of what has to be on a machine beside workspaces, sorted.
 
     :param packages: those of the launch's nodes.
     """
-    own = workspace.packages if workspace is not None else {}
+    own: set[str] = set()
     found = set(packages)
-    for name, prefix in (workspace.installed if workspace is not None else {}).items():
-        found |= run_dependencies(prefix / 'share' / name / 'package.xml')
-    return tuple(sorted(found - set(own) - {''}))
+    for workspace in workspaces:
+        own |= set(workspace.packages)
+        for name, prefix in workspace.installed.items():
+            found |= run_dependencies(prefix / 'share' / name / 'package.xml')
+    return tuple(sorted(found - own - {''}))
 
 
 def outside(names: Iterable[str], prefixes: Iterable[str]) -> tuple[str, ...]:

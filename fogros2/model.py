@@ -44,6 +44,7 @@ class MachineSpec:
     :param provider: name of an entry point in the group ``fogros2.provider``.
     :param options: the provider's own settings; JSON types only.
     :param workspace: absolute path of the colcon workspace that travels, or None for none.
+    :param underlays: workspaces below it, which travel too, the nearest first.
     :param on_exit: what becomes of the machine when the launch ends.
     :param lifetime: seconds after which the machine ends by itself, whatever happens.
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
@@ -59,6 +60,7 @@ class MachineSpec:
     provider: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     workspace: Optional[str] = None
+    underlays: tuple[str, ...] = ()
     on_exit: OnExit = 'delete'
     lifetime: float = DEFAULT_LIFETIME
     robot_timeout: float = DEFAULT_ROBOT_TIMEOUT
@@ -71,6 +73,11 @@ class MachineSpec:
     monitor_allow: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
+
+    @property
+    def workspaces(self) -> tuple[str, ...]:
+        """All workspaces that travel, the one whose packages win first."""
+        return (self.workspace, *self.underlays) if self.workspace else ()
 
     @property
     def monitored(self) -> bool:

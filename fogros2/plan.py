@@ -223,19 +223,20 @@ class Underlay:
 
 
 def underlay(
-    environment: Mapping[str, str], workspace: Optional[str], ros2: str,
+    environment: Mapping[str, str], workspaces: Sequence[str], ros2: str,
     prefix: str = sys.prefix,
 ) -> Underlay:
     """
     Return the underlay that ``environment`` describes.
 
+    :param workspaces: those that travel.
     :param ros2: path of the ``ros2`` program that the robot would run.
     :param prefix: the interpreter's own; a virtual environment is part of the underlay.
     """
     ament = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
-    outside = [p for p in ament if not _below(p, [workspace] if workspace else [])]
+    outside = [p for p in ament if not _below(p, workspaces)]
     prefixes = list(dict.fromkeys([*outside, *([prefix] if prefix != '/usr' else [])]))
-    kept = [*prefixes, *([workspace] if workspace else [])]
+    kept = [*prefixes, *workspaces]
     variables = {}
     for name in _PATH_VARIABLES:
         entries = [

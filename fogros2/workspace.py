@@ -15,8 +15,9 @@ import os
 from pathlib import Path
 import re
 import shlex
+import sys
 import threading
-from typing import Optional, Protocol, TypedDict
+from typing import Optional, TypedDict
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import process
@@ -158,17 +159,19 @@ def sourced(path: Optional[str], environment: Mapping[str, str]) -> Mapping[str,
     return dict(line.split('=', 1) for line in lines if '=' in line)
 
 
-def dependencies(path: str | os.PathLike[str]) -> list[str]:
+def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
     """
-    Return what a workspace's packages depend on that isn't in it, as rosdep keys, sorted.
+    Return what workspaces' packages depend on that isn't in them, as rosdep keys, sorted.
 
     :raises WorkspaceError: a manifest can't be read.
     """
-    root = Path(os.path.abspath(os.path.expanduser(path)))
-    sources = dict(_sources(root / 'src' if (root / 'src').is_dir() else root))
-    manifests = {name: folder / 'package.xml' for name, folder in sources.items()}
-    for name, prefix in _installed(root / 'install'):
-        manifests.setdefault(name, prefix / 'share' / name / 'package.xml')
+    manifests: dict[str, Path] = {}
+    for path in paths:
+        root = Path(os.path.abspath(os.path.expanduser(path)))
+        for name, folder in _sources(root / 'src' if (root / 'src').is_dir() else root):
+            manifests.setdefault(name, folder / 'package.xml')
+        for name, prefix in _installed(root / 'install'):
+            manifests.setdefault(name, prefix / 'share' / name / 'package.xml')
     needed: set[str] = set()
     for manifest in manifests.values():
         if manifest.is_file():
@@ -234,35 +237,24 @@ def no_sources(workspace: Workspace, name: str, reason: str) -> WorkspaceError:
         'build', 'keep the sources in the workspace, or use a machine like this one')
 
 
-class Destination(Protocol):
-    """What is known of the machine: how the workspace gets there."""
-
-    @property
-    def workspace(self) -> Optional[WorkspacePlan]:
-        """The plan, None where no workspace travels."""
-
-
 def transfer(
-    shell: Shell, path: Path, destination: Destination, *, timeouts: Timeouts,
+    shell: Shell, ways: Sequence[WorkspacePlan], *, timeouts: Timeouts,
     cancel: Optional[threading.Event] = None,
     on_progress: Optional[Callable[[int, int], None]] = None,
     on_output: Optional[Callable[[str], None]] = None,
     before_build: Callable[[], object] = lambda: None,
 ) -> str:
     """
-    Take a workspace to a machine, the same path there, and build it where it has to be.
+    Take workspaces to a machine, the same paths there, and build those that have to be.
 
-    :param path: the workspace, as ``destination.workspace`` was planned for.
+    :param ways: in the order in which they are sourced.
     :param on_progress: gets bytes sent and bytes in all.
     :param on_output: gets each line that the build prints.
     :param before_build: returns when there is what it is built with.
     :returns: a few words on what was done.
     """
-    way = destination.workspace
-    if way is None or way.source != Path(os.path.abspath(path.expanduser())):
-        raise WorkspaceError(f'{path} is not the workspace that was planned for',
-                             'name the same one when planning and when sending')
-    for target in map(shlex.quote, (way.target, *map(str, way.linked))):
+    linked = dict.fromkeys(folder for way in ways for folder in way.linked)
+    for target in map(shlex.quote, (*(way.target for way in ways), *map(str, linked))):
         # the login user may not write to where the robot's user has their workspace
         shell.run(Command.script(
             f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
@@ -270,17 +262,18 @@ def transfer(
             what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
     reports = [shell.sync(
         way.source, way.target, includes=way.includes, excludes=way.excludes,
-        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)]
+        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress) for way in ways]
     reports += [shell.sync(
         folder, str(folder), excludes=EXCLUDES, timeout=timeouts.sync, cancel=cancel,
-        on_progress=on_progress) for folder in way.linked]
-    if way.commands:
+        on_progress=on_progress) for folder in linked]
+    if any(way.commands for way in ways):
         before_build()
-    for command in way.commands:
+    for command in [command for way in ways for command in way.commands]:
         shell.run(command, timeout=timeouts.build, cancel=cancel, on_output=on_output)
     sent = (f'{sum(report.files for report in reports)} files, '
             f'{_size(sum(report.bytes for report in reports))}')
-    return f'{sent}, built there: {way.reason}' if way.commands else sent
+    return ', '.join([sent, *(
+        f'built there: {way.reason}' for way in ways if way.commands)])
 
 
 def _size(number: float) -> str:
@@ -323,6 +316,8 @@ def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Iterator[Command]:
     below = 'src' if (workspace.root / 'src').is_dir() else '.'
     source = ''.join(f'. {shlex.quote(script)}\n' for script in ros_setup)
     yield Command.script(
+        # keys of underlays' packages have no rule: rosdep looks for these in what is sourced
+        f'{source}'
         '[ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || sudo -n rosdep init\n'
         f'rosdep update --rosdistro {DISTRO}\n'
         f'cd {root}\n'
@@ -506,22 +501,50 @@ def _include(paths: Sequence[Path], root: Path) -> Iterator[str]:
             yield f'/{relative}'
 
 
-def find_workspace(environment: Mapping[str, str]) -> Optional[str]:
+def find_workspaces(environment: Mapping[str, str]) -> list[str]:
     """
-    Return the workspace whose install space comes first in the environment, None without one.
+    Return the workspaces that are sourced, the one that was sourced last first.
 
     An install space is a folder that colcon marked as one, beside a ``src`` folder: an installed
     distribution has the marker too, or none. ROS 2 that was built from source is no workspace of
     the user's, though it looks like one.
     """
+    found: dict[str, None] = {}
     for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
         for entry in environment.get(variable, '').split(os.pathsep):
             # an isolated install space has one prefix a package below it
             for folder in (Path(entry), Path(entry).parent) if entry else ():
                 marked = (folder / '.colcon_install_layout').is_file()
                 if marked and (folder.parent / 'src').is_dir() and not _is_ros(folder):
-                    return str(folder.parent)
-    return None
+                    found[str(folder.parent)] = None
+    return list(found)
+
+
+def underlays(workspace: Optional[str], chain: Sequence[str]) -> tuple[str, ...]:
+    """
+    Return the workspaces that are below one that travels.
+
+    :param chain: those that are sourced; what comes before the workspace is not below it.
+    """
+    if workspace is None:
+        return ()
+    return tuple(chain[chain.index(workspace) + 1:] if workspace in chain else chain)
+
+
+def left_behind(environment: Mapping[str, str], travelling: Sequence[str]) -> list[str]:
+    """Say of each sourced prefix of the user's that does not travel why it stays here."""
+    found: dict[str, str] = {}
+    chain = find_workspaces(environment)
+    for entry in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        above = next((root for root in chain if Path(entry).is_relative_to(root)), None)
+        if above in travelling or not entry:
+            continue
+        if above is not None:
+            found[above] = 'it is above the workspace that the launch names'
+        elif not any(_is_ros(Path(top)) for top in (entry, os.path.dirname(entry))) \
+                and not entry.startswith(('/opt/ros/', '/usr')) and entry != sys.prefix:
+            found[entry] = 'it is no workspace with src and install'
+    return [f'{path} stays here: {why}' for path, why in found.items()]
 
 
 def _is_ros(install: Path) -> bool:

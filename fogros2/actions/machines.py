@@ -24,7 +24,7 @@ from fogros2.model import (
     OnInterrupt,
 )
 from fogros2.store import check_name
-from fogros2.workspace import find_workspace
+from fogros2.workspace import find_workspaces, underlays
 
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType
@@ -260,8 +260,9 @@ class CloudInstance:
                 for key, value in self._values.items()}
             self._check_findable(values['on_exit'])
             workspace = words.resolve(context, self._workspace)
+            chain = find_workspaces(context.environment)
             if workspace is None:
-                workspace = find_workspace(context.environment)
+                workspace = next(iter(chain), None)
             elif workspace:
                 workspace = os.path.abspath(os.path.expanduser(workspace))
             name = words.resolve(context, self._name)
@@ -271,7 +272,7 @@ class CloudInstance:
                 options={
                     key: self._resolved(context, key, value)
                     for key, value in self._options.items()},
-                workspace=workspace or None,
+                workspace=workspace or None, underlays=underlays(workspace or None, chain),
                 environment={
                     key: words.resolve(context, value)
                     for key, value in self._environment.items()},

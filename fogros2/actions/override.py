@@ -53,6 +53,8 @@ class Override:
         said = self.machine(spec.name).spec(context)
         before = spec.options if spec.provider == self.provider else {}
         common = {_FIELDS.get(name, name) for name in self.given if name not in said.options}
+        if 'workspace' in common:
+            common.add('underlays')
         return dataclasses.replace(
             spec, provider=self.provider, options={**before, **said.options},
             **{field: getattr(said, field) for field in common if field is not None})

@@ -177,10 +177,11 @@ class Creation:
         """Return the hash by which an image is found that has what the machine will need."""
         job = self._job
         try:
-            under = job.launch.underlay(job.spec.workspace)
+            under = job.launch.underlay(job.spec.workspaces)
         except PrerequisiteError:
             return ''  # the step that needs it says so
-        return bootstrap.dependencies(job.spec, under)
+        return bootstrap.dependencies(
+            job.spec, under, [package for package, _ in job.launch.programs(job.name)])
 
     def _claim(self, token: str) -> None:
         """Write down that this launch has the machine, before there is anything to lose."""

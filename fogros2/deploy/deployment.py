@@ -12,7 +12,6 @@ from concurrent.futures import (
     wait,
 )
 import json
-from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from fogros2 import bootstrap, workspace
@@ -115,7 +114,7 @@ class Deployment:
         job = self.job
         with job.step('ROS 2') as detail:
             ros, note = bootstrap.ensure(
-                shell, self.launch.underlay(job.spec.workspace), job.spec,
+                shell, self.launch.underlay(job.spec.workspaces), job.spec,
                 timeout=job.timeouts.install, cancel=job.cancel, on_plan=on_plan,
                 elsewhere=True,
                 packages=sorted({package for package, _ in self.launch.programs(job.name)}))
@@ -137,11 +136,12 @@ class Deployment:
             return
         with job.step('workspace') as detail:
             note = workspace.transfer(
-                shell, Path(job.spec.workspace), ros, timeouts=job.timeouts,
+                shell, ros.workspaces, timeouts=job.timeouts,
                 cancel=job.cancel, before_build=installed.result,
                 on_progress=lambda done, total: self.launch.report(
                     Progress(job.name, 'workspace', done, total)))
-            detail.append(note)
+            detail += [note, *workspace.left_behind(
+                self.launch.user_environment, job.spec.workspaces)]
 
     @property
     def configuration(self) -> str:

@@ -227,9 +227,9 @@ class Launch:
             raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
                                      'use 0 to 101') from None
 
-    def underlay(self, workspace_root: Optional[str]) -> plan.Underlay:
+    def underlay(self, workspaces: Sequence[str]) -> plan.Underlay:
         """
-        Return the robot's own ROS 2 as paths, and a workspace that need not be sourced.
+        Return the robot's own ROS 2 as paths, and workspaces; the first need not be sourced.
 
         :raises PrerequisiteError: there is none.
         """
@@ -237,7 +237,8 @@ class Launch:
         if ros2 is None:
             raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
         return plan.underlay(
-            workspace.sourced(workspace_root, self.user_environment), workspace_root, ros2)
+            workspace.sourced(next(iter(workspaces), None), self.user_environment), workspaces,
+            ros2)
 
     def robot_environment(self) -> dict[str, str]:
         """

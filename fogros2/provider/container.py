@@ -182,7 +182,7 @@ class ContainerProvider(Provider):
             # the engine's own layer ends with the run; a machine that is stopped keeps its disk
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
-        for mount in () if base else container_root.environment_mounts(spec.workspace):
+        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
             words += ['-v', f'{mount}:{mount}:ro']
         for mount in options.mounts:
             words += ['-v', container_options.mount_flag(mount)]

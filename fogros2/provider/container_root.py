@@ -291,20 +291,21 @@ def skeleton(user: str, base: str = '') -> bytes:
     return archive.data(last=False)
 
 
-def environment_mounts(workspace: str | None) -> list[str]:
+def environment_mounts(*workspaces: str | None) -> list[str]:
     """
     Return the folders that hold this Python environment and ROS 2's underlays.
 
     That is what a custom image would carry: the environment this process runs in, the packages
     it takes from elsewhere (editable installs), and what AMENT_PREFIX_PATH names, but for
-    ``workspace``, which travels.
+    ``workspaces``, which travel.
     """
     found = [sys.prefix, sys.base_prefix]
     for prefix in {sys.prefix, sys.base_prefix}:
         for site in Path(prefix).glob('lib/python3*/site-packages'):
             found += editable(site)
     for entry in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-        if entry and os.path.isdir(entry) and not _inside(entry, workspace):
+        if entry and os.path.isdir(entry) and not any(
+                _inside(entry, workspace) for workspace in workspaces):
             found.append(entry)
     return outermost(found)
 

@@ -30,20 +30,22 @@ def recipe(
     :raises PrerequisiteError: there is no ROS 2 here to know the needs of.
     """
     environment = os.environ if environment is None else environment
-    root = workspace.find_workspace(environment) if folder is None else folder
+    chain = workspace.find_workspaces(environment)
+    root = next(iter(chain), None) if folder is None else folder
     if root:
         root = os.path.abspath(os.path.expanduser(root))
         workspace.inspect(Path(root))
     ros2 = shutil.which('ros2', path=environment.get('PATH'))
     if ros2 is None:
         raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
-    under = plan.underlay(environment, root or None, ros2)
-    spec = MachineSpec('image', 'kubernetes', workspace=root or None)
+    spec = MachineSpec('image', 'kubernetes', workspace=root or None,
+                       underlays=workspace.underlays(root or None, chain))
+    under = plan.underlay(environment, spec.workspaces, ros2)
     more = {'base': base} if base else {}
     return image.recipe(
         registry, dependencies=bootstrap.dependencies(spec, under),
         packages=(*bootstrap.apt_packages(under.rmw), *PACKAGES),
-        keys=workspace.dependencies(root) if root else (),
+        keys=workspace.dependencies(*spec.workspaces),
         distro=under.environment.get('ROS_DISTRO') or host.DISTRO, **more)
 
 

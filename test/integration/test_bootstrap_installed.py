@@ -58,7 +58,7 @@ def test_the_embedded_default_is_installed_without_a_network(
         pythons=(Python(sys.executable, sys.version_info[:2], True),),
         programs=TOOLS)
     spec = MachineSpec('m', 'ssh', bootstrap='embedded')
-    todo = bootstrap.plan(spec, facts, facts, UNDER, packed, None)
+    todo = bootstrap.plan(spec, facts, facts, UNDER, packed)
     assert todo.mode == 'embedded'
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
@@ -79,12 +79,12 @@ def test_the_embedded_default_is_installed_without_a_network(
                           env=environment).stdout
     # the next launch sees it and has nothing to do
     facts = dataclasses.replace(facts, installed=frozenset({packed.key}))
-    assert bootstrap.plan(spec, facts, facts, UNDER, packed, None).commands == ()
+    assert bootstrap.plan(spec, facts, facts, UNDER, packed).commands == ()
 
 
 def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path: Path) -> None:
     facts = dataclasses.replace(ROS, home=str(tmp_path))
-    todo = bootstrap.plan(MachineSpec('m', 'ssh'), facts, facts, UNDER, packed, None)
+    todo = bootstrap.plan(MachineSpec('m', 'ssh'), facts, facts, UNDER, packed)
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
     subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)

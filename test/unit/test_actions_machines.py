@@ -17,7 +17,7 @@ from fogros2.actions.machines import (
     SSHInstance,
 )
 from fogros2.errors import ConfigurationError
-from fogros2.workspace import find_workspace
+from fogros2.workspace import find_workspaces
 
 
 @pytest.fixture
@@ -174,14 +174,14 @@ def test_the_workspace_is_found(tmp_path, variable, isolated):
     first = install / 'demo' if isolated else install
     environment = {variable: f'{first}{os.pathsep}/opt/ros/jazzy'}
     # an installed distribution may have the marker, but no sources beside it
-    assert find_workspace(environment) is None
+    assert find_workspaces(environment) == []
     (tmp_path / 'ws/src').mkdir()
-    assert find_workspace(environment) == str(tmp_path / 'ws')
-    assert find_workspace({}) is None
+    assert find_workspaces(environment) == [str(tmp_path / 'ws')]
+    assert find_workspaces({}) == []
     # ROS 2 that was built from source is the system, not a workspace
     (first.parent / 'ros_environment' if isolated else install).joinpath(
         'share/ros_environment').mkdir(parents=True)
-    assert find_workspace(environment) is None
+    assert find_workspaces(environment) == []
 
 
 def test_info(context):

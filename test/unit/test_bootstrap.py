@@ -44,7 +44,7 @@ UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
 def plan(facts: HostFacts, mode: Any = 'auto', wheel: Wheels = WHEELS,
          robot: HostFacts = NOBLE) -> bootstrap.Preparation:
     spec = MachineSpec('m', 'ssh', bootstrap=mode)
-    return bootstrap.plan(spec, facts, robot, UNDER, wheel, None)
+    return bootstrap.plan(spec, facts, robot, UNDER, wheel)
 
 
 def scripts(commands: tuple[Command, ...]) -> str:
@@ -168,16 +168,16 @@ def test_a_machine_like_the_robot_needs_nothing() -> None:
     robot = dataclasses.replace(NOBLE, environments={'/robot/.venv': '1-2'})
     machine = dataclasses.replace(robot, cloud_launch='/robot/.venv/x/cloud_launch.py')
     spec = MachineSpec('m', 'container')
-    todo = bootstrap.plan_alike(spec, machine, robot, UNDER, None)
+    todo = bootstrap.plan_alike(spec, machine, robot, UNDER)
     assert todo is not None
     assert (todo.mode, todo.tools, todo.commands, todo.note) == ('none', (), (), 'there already')
     assert todo.install.command == (
         '/robot/.venv/bin/ros2', 'launch', '/robot/.venv/x/cloud_launch.py')
     assert todo.install.environment == UNDER.environment
     other = dataclasses.replace(machine, environments={'/robot/.venv': '9-9'})
-    assert bootstrap.plan_alike(spec, other, robot, UNDER, None) is None
+    assert bootstrap.plan_alike(spec, other, robot, UNDER) is None
     bare = dataclasses.replace(machine, environments={})
-    assert bootstrap.plan_alike(spec, bare, robot, UNDER, None) is None
+    assert bootstrap.plan_alike(spec, bare, robot, UNDER) is None
 
 
 def test_auto_takes_ros_where_it_is() -> None:
@@ -310,7 +310,7 @@ def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
 
     def planned(facts: HostFacts, mode: Bootstrap) -> bootstrap.Preparation:
         return bootstrap.plan(
-            MachineSpec('m', 'ssh', bootstrap=mode), facts, NOBLE, under, WHEELS, None)
+            MachineSpec('m', 'ssh', bootstrap=mode), facts, NOBLE, under, WHEELS)
 
     # what it has is Cyclone's; and the embedded default has no other
     todo = planned(ROS, 'auto')
@@ -385,12 +385,12 @@ def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -
         UNDER, environment={'AMENT_PREFIX_PATH': f'{tmp_path}/install/a:/robot/.venv',
                             'PATH': '/robot/.venv/bin:/usr/bin'})
     todo = bootstrap.plan(
-        MachineSpec('m', 'ssh', workspace=str(tmp_path)), NOBLE, NOBLE, under, WHEELS, space)
+        MachineSpec('m', 'ssh', workspace=str(tmp_path)), NOBLE, NOBLE, under, WHEELS, [space])
     venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
     assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{tmp_path}/install/a:{venv}'
     assert todo.install.environment['PATH'].startswith(f'{venv}/bin:')
     assert '/robot' not in ''.join(todo.install.environment.values())
-    assert todo.install.workspace is not None and todo.install.workspace.commands == ()
+    assert [way.commands for way in todo.install.workspaces] == [()]
 
 
 def test_an_unbuilt_workspace_says_so_where_nothing_builds_it(tmp_path: Path) -> None:
@@ -403,6 +403,52 @@ def test_an_unbuilt_workspace_says_so_where_nothing_builds_it(tmp_path: Path) ->
         programs=TOOLS)
     with pytest.raises(WorkspaceError) as error:
         bootstrap.plan(MachineSpec('m', 'ssh', workspace=str(tmp_path)), there, there, UNDER,
-                       WHEELS, space)
+                       WHEELS, [space])
     assert '(it is not built), which has no colcon' in str(error.value)
     assert error.value.hint == 'run colcon build here first'
+
+
+def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:
+    """Return a workspace and the one below it, which depends on the version of Python."""
+    for name, depends in (('top', 'base_msgs'), ('base', 'eigen')):
+        prefix = tmp_path / name / 'install' / f'{name}_msgs'
+        manifest = (f'<package><name>{name}_msgs</name>'
+                    f'<exec_depend>{depends}</exec_depend></package>')
+        for path, text in (
+                (tmp_path / name / 'src' / f'{name}_msgs/package.xml', manifest),
+                (prefix / 'share' / f'{name}_msgs/package.xml', manifest),
+                (prefix / 'share/ament_index/resource_index/packages' / f'{name}_msgs', '')):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+    module = tmp_path / 'base/install/base_msgs/lib/python3.9/site-packages/base_msgs/__init__.py'
+    module.parent.mkdir(parents=True)
+    module.touch()
+    return [bootstrap.workspaces.inspect(tmp_path / name) for name in ('top', 'base')]
+
+
+def test_an_underlay_that_is_built_there_is_sourced_below_the_rest(tmp_path: Path) -> None:
+    chain = two_workspaces(tmp_path)
+    there = dataclasses.replace(
+        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
+        programs=TOOLS | {'colcon', 'rosdep'})
+    spec = MachineSpec('m', 'ssh', workspace=f'{tmp_path}/top', underlays=(f'{tmp_path}/base',))
+    install = bootstrap.plan(spec, there, there, UNDER, WHEELS, chain).install
+    assert [(way.target, bool(way.commands)) for way in install.workspaces] == [
+        (f'{tmp_path}/base', True), (f'{tmp_path}/top', False)]
+    assert install.setup == ('/opt/ros/jazzy/setup.sh', f'{tmp_path}/base/install/local_setup.sh',
+                             f'{tmp_path}/top/install/local_setup.sh')
+
+
+def test_dependencies_of_underlays_and_of_the_launch_count_for_the_image(tmp_path: Path) -> None:
+    two_workspaces(tmp_path)
+    top = MachineSpec('m', 'aws', workspace=f'{tmp_path}/top')
+    both = dataclasses.replace(top, underlays=(f'{tmp_path}/base',))
+    plain = bootstrap.dependencies(both, UNDER)
+    assert plain != bootstrap.dependencies(top, UNDER)
+    # what travels, and what FogROS2 brings, is not installed
+    assert bootstrap.dependencies(both, UNDER, ['top_msgs', 'base_msgs', 'fogros2_examples']) \
+        == plain
+    assert bootstrap.dependencies(both, UNDER, ['slam_toolbox']) != plain
+    assert bootstrap.needs.keys(map(
+        bootstrap.workspaces.inspect, both.workspaces), ['slam_toolbox']) == (
+            'eigen', 'slam_toolbox')

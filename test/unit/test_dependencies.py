@@ -79,7 +79,7 @@ def test_folder_follows_the_requirements_and_the_interpreters() -> None:
 
 
 def test_packages_count_for_the_image() -> None:
-    under = plan.underlay({}, None, '/usr/bin/ros2')
+    under = plan.underlay({}, (), '/usr/bin/ros2')
     found = {bootstrap.dependencies(MachineSpec('a', 'fake', **more), under) for more in (
         {}, {'apt': ('x',)}, {'pip': ('x',)}, {'apt': ('x', 'y')}, {'apt': ('y', 'x')})}
     assert len(found) == 4
@@ -169,9 +169,9 @@ def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
              '<exec_depend condition="$ROS_VERSION == 1">rospy</exec_depend>')
     manifest(tmp_path, 'other')
     found = workspace.inspect(tmp_path)
-    assert dependencies.keys(found, ['mine', 'slam_toolbox']) == (
+    assert dependencies.keys([found], ['mine', 'slam_toolbox']) == (
         'python3-scipy', 'slam_toolbox', 'tf2_ros')
-    assert dependencies.keys(None, ['slam_toolbox']) == ('slam_toolbox',)
+    assert dependencies.keys([], ['slam_toolbox']) == ('slam_toolbox',)
 
 
 def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None:

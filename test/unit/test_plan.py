@@ -107,7 +107,7 @@ def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():
         'PATH': '/home/me/bin:/opt/ros/jazzy/bin:/usr/bin',
         'ROS_DISTRO': 'jazzy', 'ROS_DOMAIN_ID': '7', 'AWS_SECRET_ACCESS_KEY': 'x',
     }
-    under = plan.underlay(environment, '/home/me/ws', '/opt/ros/jazzy/bin/ros2', prefix='/usr')
+    under = plan.underlay(environment, ['/home/me/ws'], '/opt/ros/jazzy/bin/ros2', prefix='/usr')
     assert under.prefixes == ('/opt/ros/jazzy',)
     assert under.environment == {
         'AMENT_PREFIX_PATH': '/home/me/ws/install/a:/opt/ros/jazzy',
@@ -119,7 +119,7 @@ def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():
 
 
 def test_a_virtual_environment_is_part_of_the_underlay():
-    under = plan.underlay({'PATH': '/usr/bin'}, None, '/p/.venv/bin/ros2', prefix='/p/.venv')
+    under = plan.underlay({'PATH': '/usr/bin'}, (), '/p/.venv/bin/ros2', prefix='/p/.venv')
     assert under.prefixes == ('/p/.venv',)
     assert under.environment['PATH'].startswith('/p/.venv/bin:')
 

@@ -124,7 +124,7 @@ def test_a_workspace_with_this_package_brings_the_launch_file_along(tmp_path):
     under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {
         'AMENT_PREFIX_PATH': f'{root}/install/fogros2:/opt/ros/jazzy'})
     spec = MachineSpec('m', 'ssh', workspace=str(root))
-    alike = bootstrap.plan_alike(spec, robot, robot, under, workspace)
+    alike = bootstrap.plan_alike(spec, robot, robot, under, [workspace])
     assert alike is not None
     assert alike.install.command == (
         '/opt/ros/jazzy/bin/ros2', 'launch', 'fogros2', 'cloud.launch.py')
@@ -132,7 +132,7 @@ def test_a_workspace_with_this_package_brings_the_launch_file_along(tmp_path):
     # a machine with a ROS 2 of its own needs no wheel either
     other = dataclasses.replace(robot, environments={})
     packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', embedded=False)
-    todo = bootstrap.plan(spec, other, robot, under, packed, workspace)
+    todo = bootstrap.plan(spec, other, robot, under, packed, [workspace])
     assert not todo.send_wheels and todo.commands == ()
     assert todo.install.command == alike.install.command
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)

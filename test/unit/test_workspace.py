@@ -238,13 +238,6 @@ def test_a_link_that_leaves_the_workspace_is_refused(root: Path, tmp_path: Path)
         plan(workspace.inspect(root))
 
 
-class Destined:
-    """What is known of a machine: how the workspace gets there."""
-
-    def __init__(self, way: workspace.WorkspacePlan) -> None:
-        self.workspace = way
-
-
 class Elsewhere(FakeShell):
     """A machine whose root is a folder, where commands do nothing."""
 
@@ -283,7 +276,7 @@ def test_a_linked_package_travels_with_its_link(
     way = plan(space, facts)
     assert bool(way.commands) == (machine == 'arm')
     shell = Elsewhere(tmp_path / 'there')
-    workspace.transfer(shell, root, Destined(way), timeouts=Timeouts())
+    workspace.transfer(shell, [way], timeouts=Timeouts())
     def there(path: Path) -> Path:
         return tmp_path / 'there' / str(path).lstrip('/')
 
@@ -317,3 +310,57 @@ def test_a_workspace_is_sourced_unless_it_is_already(root: Path) -> None:
 def test_links_into_ros_itself_may_stay(root: Path) -> None:
     (root / 'install/alpha/share/alpha/x').symlink_to('/opt/ros/jazzy/share/x')
     assert workspace.inspect(root).outside == ()
+
+
+@pytest.fixture
+def chain(tmp_path: Path) -> list[Path]:
+    """Return three workspaces, the one that is sourced last first; the second is merged."""
+    roots = [tmp_path / name for name in ('top', 'middle', 'base')]
+    for root in roots:
+        package(root / 'src' / f'{root.name}_one', f'{root.name}_one')
+        for name in ('one', 'two'):
+            install(root, f'{root.name}_{name}', merged=root.name == 'middle')
+        write(root / 'install/.colcon_install_layout')
+    return roots
+
+
+def environment_of(roots: list[Path]) -> dict[str, str]:
+    """Return what sourcing the workspaces sets, on top of a ROS that was built from source."""
+    ros = roots[0].parent / 'ros'
+    write(ros / 'install/.colcon_install_layout')
+    (ros / 'src').mkdir(exist_ok=True)
+    (ros / 'install/ros_environment/share/ros_environment').mkdir(parents=True, exist_ok=True)
+    prefixes = [*dict.fromkeys(path for root in roots for path in workspace.prefixes(str(root))),
+                f'{ros}/install/ros_environment', '/opt/ros/jazzy']
+    return {'COLCON_PREFIX_PATH': ':'.join(f'{root}/install' for root in (*roots, ros)),
+            'AMENT_PREFIX_PATH': ':'.join(prefixes)}
+
+
+def test_all_sourced_workspaces_travel_but_ros_itself(chain: list[Path]) -> None:
+    environment = environment_of(chain)
+    top, middle, base = map(str, chain)
+    found = workspace.find_workspaces(environment)
+    assert found == [top, middle, base]
+    assert workspace.underlays(top, found) == (middle, base)
+    assert workspace.underlays('/not/sourced', found) == (top, middle, base)
+    assert workspace.underlays(None, found) == ()
+    assert workspace.left_behind(environment, found) == []
+
+
+def test_what_does_not_travel_is_named_with_the_reason(chain: list[Path]) -> None:
+    environment = environment_of(chain)
+    environment['AMENT_PREFIX_PATH'] += ':/srv/acme'
+    top, middle, base = map(str, chain)
+    assert workspace.underlays(middle, workspace.find_workspaces(environment)) == (base,)
+    assert workspace.left_behind(environment, [middle, base]) == [
+        f'{top} stays here: it is above the workspace that the launch names',
+        '/srv/acme stays here: it is no workspace with src and install']
+
+
+def test_underlays_are_sent_first_each_to_its_own_path(chain: list[Path], tmp_path: Path) -> None:
+    ways = [plan(workspace.inspect(root)) for root in reversed(chain)]
+    folder = tmp_path / 'there'
+    workspace.transfer(Elsewhere(folder), ways, timeouts=Timeouts())
+    for root in chain:
+        assert Path(f'{folder}{root}/install/local_setup.sh').is_file()
+        assert not Path(f'{folder}{root}/src').exists()

@@ -244,7 +244,7 @@ def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> 
         if runs.returncode != 0:
             last = runs.stderr.strip().rpartition('\n')[2]
             return f"this computer's ROS 2 can't run in the machine image: {last}"
-    under = plan.underlay(dict(os.environ), None, ros2)
+    under = plan.underlay(dict(os.environ), (), ros2)
     bootstrap.ensure(
         shell, under,  # type: ignore[arg-type]  # nothing there asks for put, open, interactive
         MachineSpec(name='image', provider='', bootstrap='none' if its else 'embedded'),
