@@ -189,7 +189,9 @@ class SSHShell:
                 return channel
             except (paramiko.SSHException, EOFError, OSError) as error:
                 transport = channel.get_transport()
-                if attempt == 2 or transport.is_alive():
+                # of a connection that another thread closed is_alive() may still say yes
+                lost = isinstance(error, (EOFError, OSError)) or not transport.is_alive()
+                if attempt == 2 or not lost:
                     raise ConnectError(f"'{self.name}' can not start a command: {error}") \
                         from error
                 self._drop(transport)

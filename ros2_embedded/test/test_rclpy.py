@@ -477,7 +477,14 @@ def test_clocks(context):
     until = Time(seconds=6, clock_type=ClockType.ROS_TIME)
     threading.Timer(0.05, simulated.set_ros_time_override, [until]).start()
     assert simulated.sleep_until(until, context)
-    threading.Timer(0.05, simulated._set_ros_time_is_active, [False]).start()
+
+    def switch() -> None:
+        deadline = time.monotonic() + 30
+        while not simulated._jumps and time.monotonic() < deadline:  # until somebody sleeps
+            time.sleep(0.001)
+        simulated._set_ros_time_is_active(False)
+
+    threading.Thread(target=switch).start()
     assert not simulated.sleep_for(Duration(seconds=60), context)
 
 

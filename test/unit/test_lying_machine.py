@@ -13,8 +13,9 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 from fogros2.actions.session import Session
 from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError
-from fogros2.model import MachineSpec
+from fogros2.model import Endpoint, MachineSpec
 from fogros2.shell import lines
+from fogros2.shell.ssh import SSHShell
 
 
 class Endless:
@@ -57,6 +58,27 @@ def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
     stream = lines.LineStream(SimpleNamespace(sendall=sendall), 'planner', bytes)
     with pytest.raises(ConnectError, match=f"the connection to 'planner' is gone: {why}"):
         stream.write(b'line')
+
+
+def test_command_starts_anew_after_its_connection_was_closed(monkeypatch):
+    """By another thread, say; is_alive() still says yes then."""
+    transport = SimpleNamespace(is_alive=lambda: True, close=lambda: None)
+    started = []
+
+    def channel(fails):
+        def exec_command(line):
+            if fails:
+                raise EOFError
+            started.append(line)
+        return SimpleNamespace(exec_command=exec_command, get_transport=lambda: transport)
+
+    shell = SSHShell(Endpoint('ssh', '127.0.0.1', 22, 'fog'), name='planner')
+    channels = iter([channel(True), channel(False), channel(True), channel(True)])
+    monkeypatch.setattr(shell, 'channel', lambda *_: next(channels))
+    shell.start('true')
+    assert started == ['true']
+    with pytest.raises(ConnectError, match='can not start a command'):
+        shell.start('true')
 
 
 def test_that_it_is_gone_is_its_provider_s_to_say():
