@@ -26,6 +26,8 @@ What can go wrong, one tree::
 
 from __future__ import annotations
 
+from collections.abc import Collection
+import difflib
 from typing import Optional, TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -143,3 +145,21 @@ class Cancelled(FogError):
 
     def __init__(self, what: str = 'the deployment', hint: Optional[str] = None) -> None:
         super().__init__(f'{what} was cancelled', hint or '')
+
+
+def did_you_mean(
+    name: str, known: Collection[str], otherwise: Optional[str] = None, *,
+    all_too: bool = False, cutoff: float = 0.6,
+) -> str:
+    """
+    Return a hint for an unknown name: the nearest known one.
+
+    :param otherwise: the hint where none is near; None for all known names.
+    :param all_too: whether all known names follow the nearest.
+    :param cutoff: how near a name has to be, from 0 to 1; see ``difflib``.
+    """
+    every = f"there are: {', '.join(known)}" if known else ''
+    near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    if not near:
+        return every if otherwise is None else otherwise
+    return f"did you mean '{near[0]}'?{f' {every}' if all_too else ''}"

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
-import difflib
 import ipaddress
 import os
 from pathlib import Path
@@ -14,7 +13,7 @@ import sys
 from typing import Any, Optional
 
 from fogros2 import workspace
-from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
+from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError, WorkspaceError
 from fogros2.model import Machine, MachineSpec, Peer, VpnInterface
 
 #: Kept free below the machines' addresses: .0 is the network, .1 the robot.
@@ -292,10 +291,7 @@ def check_program(
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.75)
-    if near:
-        return f"did you mean '{near[0]}'?"
-    return f"there are: {', '.join(names[:8])}" if names and len(names) <= 8 else ''
+    return did_you_mean(name, names, None if len(names) <= 8 else '', cutoff=0.75)
 
 
 def ament_prefixes(environment: Mapping[str, str]) -> list[str]:

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 from typing import Any, TYPE_CHECKING
 
-from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.errors import ConfigurationError, did_you_mean, PrerequisiteError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -49,9 +48,8 @@ def load(group: str, name: str) -> Any:
     """
     points = _entry_points(group)
     if name not in points:
-        near = difflib.get_close_matches(name, points, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(sorted(points))}"
-        raise ConfigurationError(f"no {GROUPS.get(group, group)} is called '{name}'", hint)
+        raise ConfigurationError(f"no {GROUPS.get(group, group)} is called '{name}'",
+                                 did_you_mean(name, sorted(points)))
     try:
         return points[name].load()
     except ImportError as error:

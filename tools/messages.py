@@ -94,6 +94,10 @@ def _text(node: ast.expr) -> str:
         choices = [node.body, node.orelse] if isinstance(node, ast.IfExp) else node.values
         said = [text for text in map(_text, choices) if text not in ('', OPEN)]
         return ' / '.join(dict.fromkeys(said)) or OPEN
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) \
+            and node.func.id == 'did_you_mean':
+        others = [_text(node.args[2])] if len(node.args) > 2 else [f'there are: {OPEN}']
+        return ' / '.join([f"did you mean '{OPEN}'?", *others])
     return OPEN
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-import difflib
 import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
@@ -45,7 +44,7 @@ from fogros2.actions.interruption import MachineInterrupted
 from fogros2.actions.keywords import ROBOT
 from fogros2.actions.machines import CloudInstance
 from fogros2.actions.session import Session
-from fogros2.errors import Cancelled, ConfigurationError, FogError
+from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -352,11 +351,11 @@ class Coordinator:
             # a name that was a substitution reads otherwise once it is resolved
             if name in (known, instance.name):
                 return instance
-        near = difflib.get_close_matches(name, self._instances, n=1)
         raise ConfigurationError(
             f"this launch has no machine named '{name}'",
-            f"did you mean '{near[0]}'?" if near else
-            'name one that the launch file describes before, or pass the machine itself')
+            did_you_mean(
+                name, self._instances,
+                'name one that the launch file describes before, or pass the machine itself'))
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()

@@ -8,11 +8,10 @@ without a line of its own here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 import dataclasses
 from decimal import Decimal
-import difflib
 import inspect
 import re
 from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
@@ -20,7 +19,7 @@ from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
 from fogros2 import plugin_system
 from fogros2.actions import words
 from fogros2.actions.machines import CloudInstance
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 
 #: Entry points that name the machines' classes, by provider.
 GROUP = 'fogros2.machine'
@@ -75,7 +74,7 @@ def machine_class(provider: str) -> type[CloudInstance]:
         return Robot
     if provider not in plugin_system.names(GROUP):
         raise ConfigurationError(f"no provider is called '{provider}'",
-                                 near(provider, providers(), all_too=True))
+                                 did_you_mean(provider, providers(), all_too=True))
     found: type[CloudInstance] = plugin_system.load(GROUP, provider)
     return found
 
@@ -242,13 +241,4 @@ def refused(cls: type[Any]) -> Iterator[None]:
 
 def unknown(what: str, name: str, known: Iterable[str]) -> ConfigurationError:
     """Return the error for a name that there isn't, with the nearest that there is."""
-    return ConfigurationError(f"{what} has no '{name}'", near(name, sorted(known)))
-
-
-def near(name: str, known: Sequence[str], *, all_too: bool = False) -> str:
-    """Return a hint: the nearest of the known names, or all of them."""
-    found = difflib.get_close_matches(name, known, n=1)
-    every = f"there are: {', '.join(known)}" if known else ''
-    if not found:
-        return every
-    return f"did you mean '{found[0]}'?{f' {every}' if all_too else ''}"
+    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(known)))

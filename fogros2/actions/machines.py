@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import difflib
 import inspect
 import os
 import re
@@ -14,7 +13,7 @@ from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2 import containers, dependencies
 from fogros2.actions import names, networks, words
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.model import (
     Bootstrap,
     DEFAULT_LIFETIME,
@@ -139,10 +138,8 @@ class CloudInstance:
             parameter for cls in type(self).__mro__[:-1]
             for parameter in inspect.signature(cls).parameters
         } - {'self', 'options', 'unknown', 'common'})
-        near = difflib.get_close_matches(name, known, n=1)
         return ConfigurationError(
-            f"{type(self).__name__} has no attribute '{name}'",
-            f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known)}")
+            f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, known))
 
     @property
     def name(self) -> str:
@@ -429,11 +426,10 @@ def _named(keyword: str) -> Iterator[None]:
 def _choice(kind: Any) -> Any:
     def check(what: str, value: object) -> str:
         if value not in get_args(kind):
-            near = difflib.get_close_matches(str(value), get_args(kind), n=1)
             raise ConfigurationError(
                 f'{what}={value!r} is unknown',
-                f"did you mean '{near[0]}'?" if near else
-                f"use one of {', '.join(get_args(kind))}")
+                did_you_mean(str(value), get_args(kind),
+                             f"use one of {', '.join(get_args(kind))}"))
         return cast(str, value)
     return check
 

@@ -13,7 +13,7 @@ from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
 from fogros2.actions import keywords
 from fogros2.actions.wrapping import wrap
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 
 if TYPE_CHECKING:
     from fogros2.actions.coordinator import SomeMachine
@@ -103,7 +103,7 @@ class Overrides:
             if not any(fnmatch.fnmatchcase(name, override.pattern) for name in names):
                 raise ConfigurationError(
                     f'--machine {override.pattern}=...: this launch has no machine of this name',
-                    keywords.near(override.pattern, names, all_too=True)
+                    did_you_mean(override.pattern, names, all_too=True)
                     or 'it has no machine at all')
 
 

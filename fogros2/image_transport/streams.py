@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import dataclasses
-import difflib
 from typing import Any, Literal, Optional, Union
 
 from fogros2 import plugin_system
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.image_transport import ImageTransport, topics
 from fogros2.image_transport.topics import camera_info_topic, carries_info, check
 from fogros2.model import NodeSpec, Stream
@@ -72,10 +71,9 @@ def stream(entry: Entry, machine: str) -> Stream:
                                  "write ('/camera', 'h264') or StreamTopic(...)")
     known = plugin_system.names(GROUP)
     if entry.transport not in known:
-        near = difflib.get_close_matches(entry.transport, known, n=1)
         raise ConfigurationError(
             f"{entry.topic}: no image transport is called '{entry.transport}'",
-            (f"did you mean '{near[0]}'? " if near else '') + f"there are: {', '.join(known)}")
+            did_you_mean(entry.transport, known, all_too=True))
     if entry.direction not in ('to_cloud', 'to_robot'):
         raise ConfigurationError(f"{entry.topic}: direction '{entry.direction}' is unknown",
                                  "there are 'to_cloud' and 'to_robot'")
@@ -89,11 +87,9 @@ def stream(entry: Entry, machine: str) -> Stream:
     options = _transport(made).options
     for name in entry.parameters:
         if options is not None and name not in options:
-            near = difflib.get_close_matches(name, sorted(options), n=1)
             raise ConfigurationError(
                 f"{entry.topic}: streams by {entry.transport} have no '{name}'",
-                f"did you mean '{near[0]}'?" if near else
-                f"there are: {', '.join(sorted(options))}")
+                did_you_mean(name, sorted(options)))
     if None in (made.source, made.target):
         _transport(made).check()
     return made

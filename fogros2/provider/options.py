@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
-import difflib
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -27,10 +26,8 @@ def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str
     names = list(names)
     for name in given:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
             raise ConfigurationError(
-                f"{what} has no option '{name}'",
-                f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(names)}")
+                f"{what} has no option '{name}'", did_you_mean(name, names))
     return {name: value for name, value in given.items() if value is not None}
 
 

@@ -23,7 +23,7 @@ from fogros2.actions.frontend.entity import (
 from fogros2.actions.frontend.scope import scoped
 from fogros2.actions.nodes import CloudNode, Node
 from fogros2.containers import described
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.image_transport.streams import StreamTopic
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
     provider = attribute(entity, parser, 'provider')
     if not provider:
         raise ConfigurationError('a fog_machine needs a provider',
-                                 keywords.near('', keywords.providers()))
+                                 did_you_mean('', keywords.providers()))
     if isinstance(provider, str):
         known = dict(keywords.keywords(keywords.machine_class(provider)))
     else:
