@@ -32,11 +32,12 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
-from fogros2.provider.aws import AWSProvider, iam, images, instances, user_data
+from fogros2.provider.aws import AWSProvider, images, instances, user_data
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
+from rigs.ec2 import iam
 
 pytestmark = pytest.mark.usefixtures('moto_aws')
 

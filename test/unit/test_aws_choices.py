@@ -17,10 +17,11 @@ from botocore.stub import ANY, Stubber
 import pytest
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError
-from fogros2.provider.aws import choices, iam, prices
+from fogros2.provider.aws import choices, prices
 from fogros2.provider.aws.choices import Wants
 from fogros2.provider.aws.prices import InstanceType, Market
 from fogros2.testing.fakes import FakeClock
+from rigs.ec2 import iam
 
 REGION = 'eu-central-1'
 NOW = 1_800_000_000.0

@@ -26,12 +26,13 @@ import yaml
 
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
-from fogros2.provider.aws import AWSProvider, clients, failures, iam, instances, network
+from fogros2.provider.aws import AWSProvider, clients, failures, instances, network
 from fogros2.provider.aws import user_data as boot
 from fogros2.provider.aws.host_key import one_time
 from fogros2.provider.aws.instances import MachineId, Place
 from fogros2.provider.aws.options import check_spec, Options
 from fogros2.waiting import wait_until
+from rigs.ec2 import iam
 
 ROOT = Path(__file__).resolve().parents[2]
 TOKEN = '5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37'
