@@ -53,16 +53,13 @@ _FAILURES = {
         'AWS does not take these credentials in this region',
         'check them with: aws sts get-caller-identity; is the region enabled in the account?',
         PrerequisiteError),
-    'InvalidClientTokenId': Failure(
+    **dict.fromkeys(('InvalidClientTokenId', 'UnrecognizedClientException'), Failure(
         'AWS does not know this access key', 'check it with: aws configure list',
-        PrerequisiteError),
-    'UnrecognizedClientException': Failure(
-        'AWS does not know this access key', 'check it with: aws configure list',
-        PrerequisiteError),
+        PrerequisiteError)),
     'SignatureDoesNotMatch': Failure(
         '', "is the secret access key right, and this computer's clock?", PrerequisiteError),
-    'ExpiredToken': Failure('the credentials have expired', _LOG_IN, PrerequisiteError),
-    'ExpiredTokenException': Failure('the credentials have expired', _LOG_IN, PrerequisiteError),
+    **dict.fromkeys(('ExpiredToken', 'ExpiredTokenException'), Failure(
+        'the credentials have expired', _LOG_IN, PrerequisiteError)),
     'RequestExpired': Failure(
         "the request's time is not AWS's, or the credentials have expired",
         "set this computer's clock: timedatectl set-ntp true", PrerequisiteError),
@@ -80,7 +77,6 @@ _FAILURES = {
         'the machine that was made under this token has ended', 'start the launch again'),
     'InvalidInstanceType': Failure(
         'the region has no such instance type', 'ros2 fog price shows what it has'),
-    'InvalidParameterCombination': Failure('', ''),
     'Unsupported': Failure(
         '', 'the type may not be offered in this zone: ros2 fog price, or another region='),
     'InvalidAMIID.NotFound': Failure(
@@ -89,22 +85,15 @@ _FAILURES = {
     'InvalidAMIID.Malformed': Failure('that is no id of an image', 'ami_image= takes ami-...'),
     'InvalidAMIID.Unavailable': Failure(
         'the image is not ready, or was deleted', 'ros2 fog image list'),
-    'AuthorizationNotFound': Failure('', ''),
-    'OperationNotPermitted': Failure('', ''),
-    'VPCIdNotSpecified': Failure(
+    **dict.fromkeys(('VPCIdNotSpecified', 'DefaultVpcDoesNotExist'), Failure(
         'the account has no default VPC in this region',
-        'aws ec2 create-default-vpc, or name a subnet='),
-    'DefaultVpcDoesNotExist': Failure(
-        'the account has no default VPC in this region',
-        'aws ec2 create-default-vpc, or name a subnet='),
-    'MissingInput': Failure('', ''),
+        'aws ec2 create-default-vpc, or name a subnet=')),
     'InvalidSubnetID.NotFound': Failure('there is no such subnet in this region',
                                         'check subnet= and region='),
     'InvalidGroup.NotFound': Failure('there is no such security group in this VPC',
                                      'check security_groups= and subnet='),
     'InvalidGroupId.Malformed': Failure('that is no id of a security group',
                                         'security_groups= takes sg-...'),
-    'InvalidParameterValue': Failure('', ''),
     'InvalidKey.Format': Failure('', 'the login key has to be an Ed25519 or RSA key'),
     'IdempotentParameterMismatch': Failure(
         'another machine was asked for under the same token', 'start the launch again'),
@@ -126,18 +115,14 @@ _FAILURES = {
         "the account's quota of security groups is used up", 'ros2 fog gc, or ask for more'),
     'RulesPerSecurityGroupLimitExceeded': Failure('', 'fewer addresses in ssh_from='),
     'IncorrectInstanceState': Failure('', 'ros2 fog list shows its state'),
-    'UnsupportedOperation': Failure('', ''),
-    'OperationNotSupported': Failure('', ''),
     'DependencyViolation': Failure('something uses it still', 'ros2 fog delete again in a minute'),
     'AddressLimitExceeded': Failure('', _QUOTA),
     # AWS itself
-    'RequestLimitExceeded': Failure('AWS asks for fewer requests', 'try again in a minute'),
-    'Throttling': Failure('AWS asks for fewer requests', 'try again in a minute'),
-    'ThrottlingException': Failure('AWS asks for fewer requests', 'try again in a minute'),
-    'InternalError': Failure('', 'try again; https://health.aws.amazon.com has what is known'),
-    'InternalFailure': Failure('', 'try again; https://health.aws.amazon.com has what is known'),
-    'ServiceUnavailable': Failure('', 'try again in a minute'),
-    'Unavailable': Failure('', 'try again in a minute'),
+    **dict.fromkeys(('RequestLimitExceeded', 'Throttling', 'ThrottlingException'), Failure(
+        'AWS asks for fewer requests', 'try again in a minute')),
+    **dict.fromkeys(('InternalError', 'InternalFailure'), Failure(
+        '', 'try again; https://health.aws.amazon.com has what is known')),
+    **dict.fromkeys(('ServiceUnavailable', 'Unavailable'), Failure('', 'try again in a minute')),
     'ParameterNotFound': Failure(
         'AWS names no such image in this region', 'name one with ami_image='),
 }

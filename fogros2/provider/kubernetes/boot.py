@@ -10,8 +10,6 @@ ends such a pod.
 
 from __future__ import annotations
 
-#: Where the core puts agents, one folder each.
-AGENTS = '/run/fogros2'
 #: Written when the cluster is about to take the pod away.
 NOTICE = '/run/fogros2-notice'
 #: The agent's command that ends the machine. SIGTERM is the cluster's word for it, and leaves the
