@@ -14,7 +14,6 @@ import threading
 import time
 from typing import Optional
 
-from fogros2 import process
 from fogros2.errors import (
     Cancelled,
     ConnectError,
@@ -22,7 +21,7 @@ from fogros2.errors import (
     FogError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, kubernetes_terminal, relay, Stream, sync
+from fogros2.shell import command_line, kubernetes_terminal, Stream, sync
 from fogros2.shell.kubernetes_channel import Channel
 from fogros2.shell.kubernetes_link import Link
 from fogros2.shell.lines import LineStream, Output
@@ -201,27 +200,9 @@ class KubernetesShell:
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
         """Make the folder ``target`` there equal ``source`` here; see the protocol."""
-        begin = time.monotonic()
-        process.require(['rsync'])
-        sync.check_source(source)
-        path = command_line.remote_path(target)
-        there = self.run(
-            Command.script(f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync',
-                           what=f'making {target}'), timeout=timeout, cancel=cancel).stdout
-        if 'no-rsync' in there:
-            raise sync.missing_there(f"'{self.name}'")
-        with relay.remote_shell(self.start) as (rsh, failures):
-            result = process.run(
-                sync.rsync(source, f'machine:{sync.remote_folder(target)}', excludes=excludes,
-                           includes=includes, rsh=rsh, progress=on_progress is not None),
-                timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
-                check=False,
-                on_output=None if on_progress is None else sync.Progress(on_progress))
-        if failures:
-            raise failures[0]
-        if result.returncode not in (0, sync.VANISHED):
-            raise sync.explained(result, source, f"'{self.name}'")
-        return sync.report(result.stdout, time.monotonic() - begin)
+        return sync.to_machine(
+            self, source, target, excludes=excludes, includes=includes, timeout=timeout,
+            cancel=cancel, on_progress=on_progress)
 
     def start(self, line: str) -> Channel:
         """

@@ -18,7 +18,7 @@ import re
 import tempfile
 import threading
 import time
-from typing import Optional, Protocol, TYPE_CHECKING
+from typing import Optional, Protocol
 
 from fogros2 import process
 from fogros2.errors import (
@@ -33,9 +33,6 @@ from fogros2.errors import (
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, relay, ssh_connection
 
-if TYPE_CHECKING:
-    import paramiko
-
 #: Bytes from which a connection of OpenSSH's own pays.
 BULK = 64 << 20
 #: Exit status of rsync for source files that vanished meanwhile: editors and compilers do that.
@@ -47,7 +44,7 @@ _NOT_WRITTEN = 11
 
 
 class Connection(Protocol):
-    """What is needed of an SSHShell."""
+    """What is needed of a Shell."""
 
     endpoint: Endpoint
     name: str
@@ -56,7 +53,7 @@ class Connection(Protocol):
             cancel: Optional[threading.Event] = None) -> Result:
         """Run a command there."""
 
-    def start(self, line: str) -> paramiko.Channel:
+    def start(self, line: str) -> relay.Channel:
         """Start a command line there."""
 
 
@@ -80,23 +77,20 @@ def to_machine(
         raise missing_there(where)
     with contextlib.ExitStack() as undo:
         failures: list[FogError] = []
-        bulk = not there and process.which('ssh') is not None and is_large(source, BULK)
+        bulk = not there and shell.endpoint.kind == 'ssh' \
+            and process.which('ssh') is not None and is_large(source, BULK)
         if bulk:
             rsh = undo.enter_context(open_ssh(shell.endpoint))
         else:
             rsh, failures = undo.enter_context(relay.remote_shell(shell.start))
-        left = timeout - (time.monotonic() - begin)
         result = process.run(
-            rsync(source, f'machine:{remote_folder(target)}',
-                  excludes=excludes, includes=includes, rsh=rsh, compress=bulk,
-                  progress=on_progress is not None),
-            timeout=max(0.1, left), cancel=cancel, check=False,
+            rsync(source, f'machine:{remote_folder(target)}', excludes=excludes,
+                  includes=includes, rsh=rsh, compress=bulk, progress=on_progress is not None),
+            timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel, check=False,
             on_output=None if on_progress is None else Progress(on_progress))
     if failures:
         raise failures[0]
-    if result.returncode not in (0, VANISHED):
-        raise explained(result, source, where)
-    return report(result.stdout, time.monotonic() - begin)
+    return _report(result, source, where, begin)
 
 
 def to_folder(
@@ -115,8 +109,12 @@ def to_folder(
               progress=on_progress is not None),
         timeout=timeout, cancel=cancel, check=False,
         on_output=None if on_progress is None else Progress(on_progress))
+    return _report(result, source, process.HERE, begin)
+
+
+def _report(result: Result, source: Path, where: str, begin: float) -> SyncReport:
     if result.returncode not in (0, VANISHED):
-        raise explained(result, source, process.HERE)
+        raise explained(result, source, where)
     return report(result.stdout, time.monotonic() - begin)
 
 
