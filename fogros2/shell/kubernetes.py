@@ -21,7 +21,7 @@ from fogros2.errors import (
     FogError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, kubernetes_terminal, Stream, sync
+from fogros2.shell import command_line, Stream, sync, terminal
 from fogros2.shell.kubernetes_channel import Channel
 from fogros2.shell.kubernetes_link import Link
 from fogros2.shell.lines import LineStream, Output
@@ -222,7 +222,10 @@ class KubernetesShell:
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Give the user's terminal to the login shell there, or to ``command``."""
-        return kubernetes_terminal.attach(self._connected(self._timeout), command)
+        there = terminal.size()
+        channel = self._connected(self._timeout).open(
+            command or Command(()), terminal=there, login=command is None)
+        return terminal.attach(channel, keys=there is not None)
 
 
 def _load() -> None:

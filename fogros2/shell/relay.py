@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The other end of ``rsh.py``: rsync's streams over a channel of a connection that is open."""
+"""Streams of this computer over a channel: rsync's (``rsh.py`` is its end) or a terminal's."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import contextlib
 import os
 from pathlib import Path
 import secrets
+import select
 import socket
 import struct
 import sys
@@ -82,7 +83,7 @@ def _serve(
         line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
         try:
             if len(streams) == 3:
-                link.sendall(bytes([_relay(start(line.decode()), *streams)]))
+                link.sendall(bytes([relay(start(line.decode()), *streams)]))
         except FogError as error:
             failures.append(error)
         except OSError:
@@ -92,31 +93,40 @@ def _serve(
                 os.close(stream)
 
 
-def _relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
+def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
     """Move bytes until the machine's side ends; return its exit status (255: lost)."""
+    ended, end = os.pipe()
 
     def up() -> None:
-        with contextlib.suppress(OSError, EOFError):
-            # more than a packet at once: sendall cuts it, and a read is a system call
-            while data := os.read(stdin, 1 << 18):
+        with contextlib.suppress(OSError, EOFError, FogError):
+            while ended not in select.select([stdin, ended], [], [])[0]:
+                # more than a packet at once: sendall cuts it, and a read is a system call
+                data = os.read(stdin, 1 << 18)
+                if not data:
+                    channel.shutdown_write()
+                    return
                 channel.sendall(data)
-            channel.shutdown_write()
 
     def errors() -> None:
         with contextlib.suppress(OSError):
             while data := channel.recv_stderr(1 << 15):
-                os.write(stderr, data)
+                _write(stderr, data)
 
-    threads = [threading.Thread(target=up, name='fog-rsync-up', daemon=True),
-               threading.Thread(target=errors, name='fog-rsync-errors', daemon=True)]
+    threads = [threading.Thread(target=up, name='fog-relay-up', daemon=True),
+               threading.Thread(target=errors, name='fog-relay-errors', daemon=True)]
     channel.settimeout(None)
-    with contextlib.closing(channel):
-        for thread in threads:
-            thread.start()
-        while data := channel.recv(1 << 18):
-            _write(stdout, data)
-        threads[1].join(5.0)
-        status = int(channel.recv_exit_status())
+    try:
+        with contextlib.closing(channel):
+            for thread in threads:
+                thread.start()
+            while data := channel.recv(1 << 18):
+                _write(stdout, data)
+            threads[1].join(5.0)
+            status = int(channel.recv_exit_status())
+    finally:
+        os.close(end)  # wakes the thread that reads
+        threads[0].join(5.0)
+        os.close(ended)
     return status if 0 <= status < 256 else 255
 
 

@@ -18,7 +18,7 @@ from fogros2.errors import (
     FogError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, ssh_connection, ssh_terminal, Stream, sync
+from fogros2.shell import command_line, ssh_connection, Stream, sync, terminal
 from fogros2.shell.lines import LineStream, Output
 from fogros2.waiting import wait_until
 
@@ -279,8 +279,21 @@ class SSHShell:
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Give the user's terminal to the login shell there, or to ``command``."""
-        line = None if command is None else command_line.remote_line(command, user=self.user)
-        return ssh_terminal.attach(self.channel(), line, self.name)
+        import paramiko
+
+        channel, there = self.channel(), terminal.size()
+        try:
+            if there is not None:
+                rows, columns, kind = there
+                channel.get_pty(kind, columns, rows)
+            if command is None:
+                channel.invoke_shell()
+            else:
+                channel.exec_command(command_line.remote_line(command, user=self.user))
+        except (paramiko.SSHException, OSError) as error:
+            channel.close()
+            raise ConnectError(f"'{self.name}' gives no terminal: {error}") from error
+        return terminal.attach(channel, keys=there is not None)
 
 
 class _Announced(Output):

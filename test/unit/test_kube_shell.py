@@ -18,7 +18,7 @@ from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, ConnectError, ShellError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
-from fogros2.shell import kubernetes_link
+from fogros2.shell import kubernetes_link, relay
 from fogros2.shell.kubernetes import KubernetesShell
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
@@ -310,6 +310,35 @@ def test_a_terminal_has_the_user_s_size_and_follows_it(api, shell):
     assert wait_until(lambda: channel.read(1.0)[2], timeout=10.0, what='its end')
     assert channel.recv_exit_status() == 7
     channel.close()
+
+
+def relayed(shell, script: str, given: bytes | None) -> tuple[int, bytes]:
+    """Relay to a script; None keeps the input open. Return its exit status and output."""
+    streams = [*os.pipe(), *os.pipe()]
+    try:
+        channel = shell._connected(10.0).open(Command(('sh', '-c', script)))
+        if given is not None:
+            os.write(streams[1], given)
+            os.close(streams.pop(1))
+        status = relay.relay(channel, streams[0], streams[-1], streams[-1])
+        os.set_blocking(streams[-2], False)
+        with contextlib.suppress(BlockingIOError):
+            return status, os.read(streams[-2], 1000)
+        return status, b''
+    finally:
+        for stream in streams:
+            os.close(stream)
+
+
+def test_input_and_output_are_relayed_until_the_command_ends(api, shell):
+    assert relayed(shell, 'cat; exit 5', b'keys') == (5, b'keys')
+    assert relayed(shell, 'echo done', None) == (0, b'done\n')
+
+
+def test_relay_ends_with_a_lost_connection(api, shell):
+    shell.run(Command(('true',)), timeout=10.0)
+    threading.Timer(0.2, api.cut).start()
+    assert relayed(shell, 'exec sleep 30', None)[0] == 255
 
 
 @pytest.mark.parametrize('host, told', [
