@@ -40,12 +40,18 @@ done
 for p in rsync ip wg wireguard-go nft apt-get colcon rosdep sudo; do
     command -v $p >/dev/null && echo "program $p"
 done
-for s in /opt/ros/*/setup.sh; do
-    [ -r "$s" ] || continue
-    d=${s%/setup.sh}
-    echo "ros ${d##*/} $d"
+for d in /opt/ros/* "$@"; do
+    [ -r "$d/setup.sh" ] || continue
+    case $d in
+        /opt/ros/*) n=${d##*/} ;;
+        # ROS 2 built from sources may be in any folder
+        *) n=$(sed -n 's/^export ROS_DISTRO=//p' \
+            "$d"/share/ros_environment/environment/*ros_distro.sh 2>/dev/null) ;;
+    esac
+    [ -n "$n" ] || continue
+    echo "ros $n $d"
     for r in "$d"/share/ament_index/resource_index/rmw_typesupport/*; do
-        [ ! -e "$r" ] || echo "rmw ${d##*/} ${r##*/}"
+        [ ! -e "$r" ] || echo "rmw $n ${r##*/}"
     done
 done
 [ ! -d /sys/module/wireguard ] && ! modprobe -nq wireguard 2>/dev/null || echo kernel-wireguard

@@ -127,6 +127,19 @@ def test_the_probe_survives_odd_prefixes(tmp_path: Path) -> None:
     assert facts.cloud_launch == ''
 
 
+def test_ros_built_from_sources_is_found(tmp_path: Path) -> None:
+    for name, text in (
+            ('setup.sh', ''), ('share/ament_index/resource_index/rmw_typesupport/rmw_one', ''),
+            ('share/ros_environment/environment/1.ros_distro.sh', 'export ROS_DISTRO=jazzy\n'),
+            ('overlay/setup.sh', '')):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    prefixes = [str(tmp_path), str(tmp_path / 'overlay')]
+    facts = host.parse_facts(process.run(host.probe(prefixes), timeout=30).stdout)
+    assert facts.ros['jazzy'] == str(tmp_path)
+    assert facts.has_rmw('rmw_one')
+
+
 def test_facts_by_value() -> None:
     facts = host.parse_facts("""\
 Welcome to Ubuntu, said the login script
