@@ -176,8 +176,9 @@ def resolved(output: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def missing(names: Iterable[str]) -> Command:
-    """Return the command that prints which Debian packages a machine lacks."""
-    return Command(('sh', '-c', _MISSING, 'sh', *names), what='look for apt packages')
+    """Return the command that prints which Debian packages a machine lacks, each once."""
+    return Command(('sh', '-c', _MISSING, 'sh', *dict.fromkeys(names)),
+                   what='look for apt packages')
 
 
 @dataclasses.dataclass(frozen=True)

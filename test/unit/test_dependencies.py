@@ -63,7 +63,7 @@ def test_missing_debian_packages_are_found() -> None:
     version = subprocess.run(['dpkg-query', '-W', '-f', '${Version}', 'dpkg'],
                              capture_output=True, text=True, check=True).stdout
     command = dependencies.missing(
-        ['dpkg', 'fogt-none', f'dpkg={version}', 'dpkg=0.1', 'libc6:s390x'])
+        ['dpkg', 'fogt-none', 'fogt-none', f'dpkg={version}', 'dpkg=0.1', 'libc6:s390x'])
     said = subprocess.run(command.argv, capture_output=True, text=True, check=True)
     assert said.stdout.split() == ['fogt-none', 'dpkg=0.1', 'libc6:s390x']
 
