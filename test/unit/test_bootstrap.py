@@ -278,9 +278,9 @@ def test_same_packages_of_another_processor_are_not_alike() -> None:
                                 cloud_launch='/robot/.venv/x/cloud_launch.py')
     arm = dataclasses.replace(robot, architecture='aarch64')
     spec = MachineSpec('m', 'container')
-    assert bootstrap.plan_alike(spec, robot, robot, UNDER, None) is not None
+    assert bootstrap.plan_alike(spec, robot, robot, UNDER, ()) is not None
     # LD_LIBRARY_PATH has folders by the processor's name: the machine's own script sets it
-    assert bootstrap.plan_alike(spec, arm, robot, UNDER, None) is None
+    assert bootstrap.plan_alike(spec, arm, robot, UNDER, ()) is None
 
 
 def test_what_another_processor_lacks_is_named_before_creation(tmp_path: Path) -> None:
