@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What ``ros2 doctor`` says of FogROS2: the checks of ``ros2 fog doctor``.
+Show the checks of ``ros2 fog doctor`` in ``ros2 doctor``.
 
-For ros2doctor alone (``ros2doctor.checks``, ``ros2doctor.report``), which is where ROS 2 is.
+Only ros2doctor of ROS 2 loads this module (``ros2doctor.checks``, ``ros2doctor.report``).
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from ros2doctor.api.format import doctor_error, doctor_warn
 
 from ros2fog_cli.api import doctor
 
-#: Links the check with its report: what ``ros2 doctor`` prints of a check that failed.
+#: Links the check to its report, which ``ros2 doctor`` prints for a failed check.
 CATEGORY = 'fogros2'
 
 
 @functools.lru_cache(maxsize=1)
 def findings() -> tuple[doctor.Check, ...]:
-    """Return the checks, made once: ``ros2 doctor --report-failed`` asks for both below."""
-    # the LAN is ros2doctor's own to look at
+    """Run the checks once; ``ros2 doctor --report-failed`` needs them for both classes below."""
+    # ros2doctor has its own check of the LAN.
     return tuple(doctor.examine(lan_seconds=0))
 
 
@@ -31,14 +31,14 @@ def _text(check: doctor.Check) -> str:
 
 
 class FogCheck(DoctorCheck):  # type: ignore[misc]
-    """Look whether this computer has what a launch with cloud machines needs."""
+    """Check whether this computer has what a launch with cloud machines needs."""
 
     def category(self) -> str:
-        """Return what links it with its report."""
+        """Return the category, which links the check to its report."""
         return CATEGORY
 
     def check(self) -> Result:
-        """Say what isn't right, each thing with its remedy."""
+        """Report failures and warnings, each with its remedy."""
         result = Result()
         for found in findings():
             if found.verdict == 'failed':
@@ -51,14 +51,14 @@ class FogCheck(DoctorCheck):  # type: ignore[misc]
 
 
 class FogReport(DoctorReport):  # type: ignore[misc]
-    """Tell what a launch with cloud machines would find here."""
+    """Report the results of all checks of this computer."""
 
     def category(self) -> str:
-        """Return what links it with its check."""
+        """Return the category, which links the report to its check."""
         return CATEGORY
 
     def report(self) -> Report:
-        """Return each thing that was looked at."""
+        """Return the result of each check."""
         report = Report('FOGROS2')
         for found in findings():
             report.add_to_report(

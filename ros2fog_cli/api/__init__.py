@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the verbs do, without parsing or printing."""
+"""The logic of the verbs, without parsing and printing."""

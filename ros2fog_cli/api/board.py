@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the dashboard shows: the live state, and the graphs of the launches that run."""
+"""The data of the dashboard: the live state of machines, and the graphs of running launches."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ros2fog_cli.api.live import Live
 
 class Board:
     """
-    The dashboard's source; see :class:`fogros2_monitor.dashboard.server.Source`.
+    The dashboard's source of data; see :class:`fogros2_monitor.dashboard.server.Source`.
 
-    :param topics: whether to join launches, for rates of topics and pictures.
+    :param topics: whether to join launches, to measure topic rates and take pictures.
     """
 
     def __init__(
@@ -27,21 +27,21 @@ class Board:
         self._live = Live(store, regions=regions, more=self._look_at_graphs)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start to collect data."""
         self._live.start()
 
     def close(self) -> None:
-        """End all that was begun."""
+        """Stop all threads and programs that this object started."""
         self._live.close()
         if self._graphs is not None:
             self._graphs.close()
 
     def state(self, after: int, timeout: float) -> dict[str, Any]:
-        """Return the state once it is a later one."""
+        """Return the state; wait up to ``timeout`` seconds for one newer than ``after``."""
         return self._live.state(after, timeout)
 
     def log(self, machine: str, after: int) -> list[dict[str, Any]]:
-        """Return a machine's newer log lines."""
+        """Return the lines of a machine's log that follow line number ``after``."""
         return [dataclasses.asdict(line) for line in self._live.lines(machine, after)]
 
     def picture(self, stream: str) -> Optional[bytes]:
@@ -49,7 +49,7 @@ class Board:
         return self._graphs.picture(stream) if self._graphs is not None else None
 
     def delete(self, machine: str, force: bool) -> None:
-        """Begin to end a machine."""
+        """Start to delete a machine."""
         self._live.delete(machine, force=force)
 
     def _look_at_graphs(self, live: Live) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything a launch needs of this computer, looked at before it costs anything."""
+"""Check everything that a launch needs on this computer, before a machine costs anything."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from fogros2.vpn import addresses, helped
 from ros2fog_cli.api import lan, reach
 
 Verdict = Literal['ok', 'warning', 'failed']
-#: What launches import, and Debian's package of each.
+#: Python packages that launches import, and the Debian package of each.
 _PACKAGES = {'paramiko': 'python3-paramiko', 'yaml': 'python3-yaml'}
 _OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
 
@@ -37,9 +37,9 @@ _OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
 @dataclasses.dataclass(frozen=True)
 class Check:
     """
-    What was found of one thing.
+    The result of one check.
 
-    :param remedy: what to do about it, '' where nothing is to be done.
+    :param remedy: what the user should do, '' if nothing.
     """
 
     name: str
@@ -48,18 +48,18 @@ class Check:
     remedy: str = ''
 
 
-#: Providers that other checks look at.
+#: Providers that have checks of their own.
 _LOOKED_AT = ('container', 'ssh')
-#: Seconds that a provider may take to answer.
+#: Time-out of a provider's answer, in seconds.
 PATIENCE = 8.0
 
 
 def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[Check]:
     """
-    Return all checks, in a fixed order.
+    Run all checks, and return the results in a fixed order.
 
-    :param lan_seconds: how long to listen for ROS 2 computers on the networks here, 0 for not.
-    :param providers: those that have to work; others are asked where they are set up.
+    :param lan_seconds: how long to look for ROS 2 on other computers of the LAN; 0: not at all.
+    :param providers: providers that must work. Other providers are checked if they are configured.
     """
     checks: list[Callable[[], Check]] = [
         python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
@@ -73,7 +73,7 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
 
 
 def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> Check:
-    """Look whether a provider's SDK is there, and whether it answers and takes our credentials."""
+    """Check that a provider's SDK is installed, and that the provider accepts our credentials."""
     title = f"provider '{name}'"
     wrong: Verdict = 'failed' if needed else 'warning'
     try:
@@ -92,7 +92,13 @@ def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> 
 
 
 def _in_time(ask: Callable[[], str], patience: float) -> Optional[str]:
-    """Return an answer, None if there is none in time (s); the asking may go on unheard."""
+    """
+    Call ``ask`` and return its answer, or None after ``patience`` seconds.
+
+    After the time-out, ``ask`` continues in its thread, and its answer is ignored.
+
+    :raises FogError: an error that ``ask`` raised.
+    """
     answers: queue.SimpleQueue[Union[str, FogError]] = queue.SimpleQueue()
 
     def run() -> None:
@@ -112,7 +118,7 @@ def _in_time(ask: Callable[[], str], patience: float) -> Optional[str]:
 
 
 def python() -> Check:
-    """Look at the interpreter."""
+    """Check the version of Python."""
     version = '.'.join(str(part) for part in sys.version_info[:3])
     if sys.version_info < (3, 10):
         return Check('Python', 'failed', version, 'Python 3.10 or newer is needed')
@@ -120,7 +126,7 @@ def python() -> Check:
 
 
 def packages() -> Check:
-    """Look for the Python packages that every launch imports."""
+    """Check for the Python packages that every launch imports."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         return Check(
@@ -131,7 +137,7 @@ def packages() -> Check:
 
 
 def programs() -> Check:
-    """Look for the programs that every launch calls."""
+    """Check for the programs that every launch calls."""
     missing = [program for program in deploy.ROBOT_PROGRAMS if not process.which(program)]
     less = [program for program in _OPTIONAL if not process.which(program)]
     packages = sorted({deploy.ROBOT_PROGRAMS[p] for p in missing} | {_OPTIONAL[p] for p in less})
@@ -144,7 +150,7 @@ def programs() -> Check:
 
 
 def root() -> Check:
-    """Look whether commands run as root without a question."""
+    """Check whether commands can run as root without a password."""
     if os.geteuid() == 0:
         return Check('root', 'ok', 'running as root')
     try:
@@ -158,14 +164,14 @@ def root() -> Check:
 
 
 def tun() -> Check:
-    """Look for TUN."""
+    """Check for the TUN device."""
     if Path('/dev/net/tun').exists():
         return Check('TUN', 'ok', '/dev/net/tun')
     return Check('TUN', 'failed', 'no /dev/net/tun', 'sudo modprobe tun')
 
 
 def wireguard() -> Check:
-    """Look for WireGuard in the kernel, or as a program."""
+    """Check for WireGuard in the kernel, or as a program."""
     if Path('/sys/module/wireguard').exists() or _succeeds('modprobe', '-nq', 'wireguard'):
         return Check('WireGuard', 'ok', 'in the kernel')
     if process.which('wireguard-go'):
@@ -175,11 +181,11 @@ def wireguard() -> Check:
 
 
 def engine() -> Check:
-    """Look for a container engine that answers."""
+    """Check for a container engine that works."""
     name = 'container engine'
     try:
         chosen = container_engine.select('auto', None)
-        # the flags may name a runtime or a cgroup manager that doesn't work: ask with them
+        # The flags may name a runtime or a cgroup manager that does not work: call with flags.
         said = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
                            timeout=20.0)
     except FogError as error:
@@ -189,7 +195,7 @@ def engine() -> Check:
 
 
 def overlay() -> Check:
-    """Look whether this computer's own root can serve as an image."""
+    """Check whether the root file system of this computer can serve as an image."""
     try:
         container.check_root()
     except FogError as error:
@@ -199,7 +205,7 @@ def overlay() -> Check:
 
 
 def firewall_program() -> Check:
-    """Look whether nftables takes rules: the robot's side of the VPN is filtered."""
+    """Check whether nftables accepts rules; the launch filters the robot's side of the VPN."""
     try:
         process.run(Command(('nft', 'list', 'tables'), sudo=True, what='ask nftables'),
                     timeout=10.0)
@@ -212,7 +218,7 @@ def firewall_program() -> Check:
 
 
 def ros() -> Check:
-    """Look for ROS 2, or the embedded default."""
+    """Check for ROS 2 Jazzy or the embedded default."""
     name = 'ROS 2'
     if process.which('ros2') is None:
         return Check(name, 'failed', 'ros2 is not on PATH', "source ROS 2's setup.bash")
@@ -229,7 +235,7 @@ def ros() -> Check:
 
 
 def rmw() -> Check:
-    """Look whether the middleware is one that can be led over a VPN, and is installed."""
+    """Check that the middleware is installed and that FogROS2 can configure it for the VPN."""
     try:
         chosen = plan.choose_rmw(os.environ, plugin_system.names('fogros2.dds'))
     except FogError as error:
@@ -244,7 +250,7 @@ def rmw() -> Check:
 
 
 def cyclone_uri() -> Check:
-    """Look whether the user's own Cyclone configuration can be read; ours comes after it."""
+    """Check that the user's Cyclone configuration is readable; FogROS2 appends its own."""
     name, uri = 'CYCLONEDDS_URI', os.environ.get('CYCLONEDDS_URI', '').strip()
     if not uri:
         return Check(name, 'ok', 'not set')
@@ -263,7 +269,7 @@ def cyclone_uri() -> Check:
 
 
 def _fragments(uri: str) -> Iterator[str]:
-    """Yield the comma-separated parts of the variable; XML in it may hold commas itself."""
+    """Yield the comma-separated parts of CYCLONEDDS_URI; XML in it may contain commas."""
     if uri.startswith('<'):
         end = uri.rfind('>') + 1
         yield uri[:end]
@@ -274,7 +280,7 @@ def _fragments(uri: str) -> Iterator[str]:
 
 
 def receive_buffer() -> Check:
-    """Look how large a receive buffer the kernel gives: raw images need one."""
+    """Check the kernel's limit of receive buffers; raw images need a large one."""
     name = 'receive buffer'
     try:
         most = int(Path('/proc/sys/net/core/rmem_max').read_text())
@@ -288,7 +294,7 @@ def receive_buffer() -> Check:
 
 
 def udp_port() -> Check:
-    """Look for a free UDP port."""
+    """Check for a free UDP port."""
     try:
         return Check('UDP port', 'ok', f'{addresses.choose_port()} is free')
     except FogError as error:
@@ -298,7 +304,7 @@ def udp_port() -> Check:
 
 
 def ssh_keys() -> Check:
-    """Look whether an SSHInstance could log in with the user's own keys."""
+    """Check for a key of the user that an SSHInstance could log in with."""
     folder = Path('~/.ssh').expanduser()
     keys = [path.name for path in sorted(folder.glob('id_*')) if not path.name.endswith('.pub')] \
         if folder.is_dir() else []
@@ -310,7 +316,7 @@ def ssh_keys() -> Check:
 
 
 def firewall() -> Check:
-    """Look for a firewall of the user's own that may keep the VPN out."""
+    """Check whether a firewall of the user may block the VPN."""
     try:
         said = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
                            check=False)
@@ -331,7 +337,7 @@ def firewall() -> Check:
 
 
 def state() -> Check:
-    """Look whether the state folder is ours alone."""
+    """Check that the state folder belongs to this user and that no other user can read it."""
     folder = state_home()
     if not folder.exists():
         parent = next(p for p in folder.parents if p.exists())
@@ -350,7 +356,7 @@ def state() -> Check:
 
 
 def clocks() -> Check:
-    """Look whether the clocks of machines under a launch go with this computer's."""
+    """Compare the clocks of machines under a launch with this computer's clock."""
     name, store = 'clocks of machines', Store()
     found = {record.name: offset for record in store.machines()
              if (offset := reach.clock(record, store)) is not None}
@@ -361,7 +367,7 @@ def clocks() -> Check:
 
 
 def lan_peers(seconds: float) -> Check:
-    """Look for ROS 2 on other computers, and whether a launch's nodes would talk to them."""
+    """Find ROS 2 on other computers, and whether a launch's nodes would communicate with it."""
     name = 'ROS 2 on the LAN'
     if seconds <= 0:
         return Check(name, 'ok', 'not looked for')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ending machines, and taking away what dead launches have left on this robot."""
+"""Delete machines, and clean up what dead launches left on this robot."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
-#: Seconds that gc keeps a stopped machine by default.
+#: Seconds for which gc keeps a stopped machine by default.
 KEEP_STOPPED = 7 * 86400.0
-#: Seconds after the end of its lifetime in which a machine may still be ending itself.
+#: Seconds after the end of its lifetime in which a machine may still be deleting itself.
 GRACE = 60.0
-#: Seconds after which a launch's folder without a word on its process counts as left behind.
+#: Age in seconds after which gc deletes a launch's folder that has no process file.
 FOLDER_AGE = 86400.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Leftover:
-    """A launch's folder whose launch is gone, with the interface that may still be there."""
+    """The folder of a launch that is gone; the launch's VPN interface may still exist."""
 
     launch: str
     folder: Path
@@ -53,9 +53,9 @@ class Leftover:
 
 def check_free(entry: Entry, *, force: bool) -> None:
     """
-    Refuse to end a machine under a launch that runs.
+    Refuse to delete a machine that a running launch uses.
 
-    :raises NameTaken: the launch that has it is alive, and ``force`` isn't set.
+    :raises NameTaken: the launch is alive, and ``force`` is False.
     """
     if entry.record is not None and entry.record.launch_alive and not force:
         raise NameTaken(
@@ -65,10 +65,11 @@ def check_free(entry: Entry, *, force: bool) -> None:
 
 def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False) -> None:
     """
-    End a machine, and take away what this robot has for it once it has gone; idempotent.
+    Delete a machine, then the resources that this robot keeps for it; idempotent.
 
-    :param force: also under a launch that runs, and of a computer that can't be reached.
-    :raises FogError: the machine, or something of it, is still there.
+    :param force: also delete a machine that a running launch uses, and forget a machine that
+        cannot be reached.
+    :raises FogError: the machine or one of its resources still exists.
     """
     check_free(entry, force=force)
     with _lock(entry, store, force=force):
@@ -84,13 +85,13 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if record is None:
             return
         if entry.machine is None and entry.asked and record.machine_id is not None:
-            # it ended by itself, which takes nothing along that was made beside it
+            # The machine deleted itself; resources that belong to it may still exist.
             machines.load(record.provider).destroy(record.machine_id)
         if record.damage:
             store.machine(record.name).delete()
             return
         if force and record.launch_alive:
-            # its launch will find the machine gone and take the rest down itself
+            # The launch will notice that the machine is gone, and will clean up itself.
             return
         deploy.cleanup(record, store, report)
 
@@ -98,7 +99,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
 def delete_all(
     entries: Sequence[Entry], store: Store, report: Reporter, *, force: bool = False,
 ) -> Iterator[tuple[Entry, Optional[FogError]]]:
-    """Delete several machines at once; yields each as it is gone, or with why it is not."""
+    """Delete machines in parallel; yield each one when it is done, with its error or None."""
     with ThreadPoolExecutor(min(16, max(1, len(entries))), 'fog-delete') as pool:
         doing = {pool.submit(delete, entry, store, report, force=force): entry
                  for entry in entries}
@@ -111,9 +112,9 @@ def delete_all(
 
 def _destroy(machine: Machine) -> None:
     """
-    End a machine, and look that it is gone.
+    Delete a machine, and check that it is gone.
 
-    :raises ProviderError: it is still there.
+    :raises ProviderError: the machine still exists.
     """
     provider = machines.load(machine.provider)
     provider.destroy(machine.id)
@@ -130,7 +131,7 @@ def _destroy(machine: Machine) -> None:
 
 @contextlib.contextmanager
 def _lock(entry: Entry, store: Store, *, force: bool) -> Iterator[None]:
-    """Hold the machine's name, unless it is another robot's or taken by force."""
+    """Lock the machine's name, unless ``force`` is set or the machine has no record here."""
     if entry.record is None or force:
         yield
         return
@@ -139,14 +140,14 @@ def _lock(entry: Entry, store: Store, *, force: bool) -> Iterator[None]:
 
 
 def _leave(record: Record, *, force: bool) -> None:
-    """Take our agent, its nodes and the VPN off a computer that stays."""
+    """Remove the agent, its nodes and the VPN from a computer that FogROS2 does not own."""
     if record.shell is None:
         return
     timeouts = Timeouts()
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
         if record.agent and record.agent_program and shell.run(
-                # an agent that left took its program along, and to ask it would take seconds
+                # An agent that ended deleted its program; a request would wait for seconds.
                 Command(('test', '-e', record.agent_program), what='look for the agent'),
                 timeout=timeouts.command, check=False).returncode == 0:
             client = AgentClient(shell, record.agent, agent_path=record.agent_program,
@@ -154,10 +155,10 @@ def _leave(record: Record, *, force: bool) -> None:
             try:
                 launch = client.request('status')['launch']
                 if launch not in ('', record.launch, record.last):
-                    return  # ours is gone, and another robot has the computer since
+                    return  # our agent is gone, and another robot uses the computer now
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
             except AgentError:
-                pass  # it left by itself
+                pass  # the agent ended by itself
             finally:
                 client.close()
         if record.vpn is not None:
@@ -178,9 +179,10 @@ def why_end(
     entry: Entry, now: float, keep_stopped: float, stopped_at: Optional[float] = None,
 ) -> str:
     """
-    Say why gc should end a machine, '' if it should live.
+    Return why gc should delete a machine, '' if gc should keep it.
 
-    :param stopped_at: when it was stopped, in seconds since the epoch; None where unknown.
+    :param keep_stopped: seconds for which gc keeps a stopped machine.
+    :param stopped_at: when the machine was stopped, in seconds since the epoch; None: unknown.
     """
     record = entry.record
     if record is not None and (record.launch_alive or record.damage and entry.machine is None):
@@ -205,7 +207,7 @@ def why_end(
 def stopped_at(
     machine: Optional[Machine], record: Optional[Record], store: Store,
 ) -> Optional[float]:
-    """Return when a machine was stopped: the provider's word, else when its record was written."""
+    """Return when a machine was stopped: from the provider, else when its record was written."""
     if machine is not None and machine.stopped is not None:
         return machine.stopped
     if record is None:
@@ -218,9 +220,9 @@ def stopped_at(
 
 def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Iterator[str]:
     """
-    Have all providers delete what machines that ended by themselves left there.
+    Let all providers delete the leftovers of machines that deleted themselves.
 
-    Yields words for people; a provider that can't be asked is a warning.
+    Yield a line of text for each deleted resource; warn about a provider that does not answer.
     """
     names = [name for name in plugin_system.names('fogros2.provider')
              if machines.wanted(name, regions)]
@@ -239,9 +241,9 @@ def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Ite
 
 def let_go(record: Record, store: Store) -> None:
     """
-    Take away what a dead launch left for a machine that is kept; the machine stays.
+    Clean up after a dead launch whose machine is kept; the machine stays.
 
-    :raises FogError: something could not be taken away.
+    :raises FogError: a resource could not be cleaned up.
     """
     folder = store.root / 'launches' / record.launch
     with store.machine(record.name).lock():
@@ -254,7 +256,7 @@ def let_go(record: Record, store: Store) -> None:
 
 
 def leftovers(store: Store, now: Optional[float] = None) -> list[Leftover]:
-    """Return the folders of launches that are dead and that no machine's record names."""
+    """Return the folders of dead launches that no machine's record names."""
     now = time.time() if now is None else now
     named = {record.launch for record in store.machines() if record.launch}
     folder = store.root / 'launches'
@@ -267,7 +269,7 @@ def leftovers(store: Store, now: Optional[float] = None) -> list[Leftover]:
 
 
 def _dead(folder: Path, now: float) -> bool:
-    """Return whether the launch of a folder is gone, by its process or else by its age."""
+    """Return whether a folder belongs to a dead launch: no process, or an old folder."""
     try:
         data = json.loads((folder / 'process.json').read_text())
         return not process_alive(int(data['pid']), int(data['pid_start']),
@@ -281,9 +283,9 @@ def _dead(folder: Path, now: float) -> bool:
 
 def clear(leftover: Leftover) -> None:
     """
-    Take away a dead launch's interface, filter, key and folder.
+    Delete the VPN interface, firewall rules, key and folder of a dead launch.
 
-    :raises FogError: something could not be taken away.
+    :raises FogError: a resource could not be deleted.
     """
     name = f'fog{leftover.launch}'
     interface = VpnInterface(

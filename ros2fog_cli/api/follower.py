@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One machine, followed: its agent over a connection that is kept, its VPN, its log's end."""
+"""Follow one machine: the state of its agent over one connection, its VPN, the end of its log."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.log import describe
 from ros2fog_cli.api.machines import Entry
 
-#: Lines of the log that are kept, and characters of one.
+#: Number of log lines to keep, and longest line in characters.
 LINES, WIDTH = 500, 2000
-#: Seconds from one attempt to connect to the next, growing.
+#: Shortest and longest pause between two attempts to connect, in seconds.
 RETRY, LONGEST_RETRY = 2.0, 15.0
-#: Seconds from one look at the VPN to the next: where sudo is needed, it logs each of them.
+#: Seconds between two looks at the VPN. sudo, where it is needed, logs each look.
 VPN_INTERVAL = 2.0
-#: Bytes of a process's command line that are looked at.
+#: Bytes to read of a process's command line.
 _WORDS = 32_768
 
 Changed = Callable[[], None]
@@ -35,7 +35,7 @@ Changed = Callable[[], None]
 
 @dataclasses.dataclass(frozen=True)
 class LogLine:
-    """A line of a machine's log; ``number`` counts from 1, ``time`` is since the epoch."""
+    """A line of a machine's log; ``number`` counts from 1, ``time`` is seconds since the epoch."""
 
     number: int
     time: float
@@ -46,11 +46,11 @@ class LogLine:
 
 class Follower:
     """
-    Asks a machine's agent and the VPN each ``interval`` seconds, in a thread of its own.
+    Poll a machine's agent and VPN in a thread, every ``interval`` seconds.
 
-    What it knows is to be read at any time; ``changed`` is called after each change.
+    The results can be read at any time; the thread calls ``changed`` after each change.
 
-    :param entry: the machine; :meth:`know` brings newer ones.
+    :param entry: the machine; :meth:`know` replaces it.
     """
 
     def __init__(self, entry: Entry, changed: Changed, interval: float = 1.0) -> None:
@@ -67,7 +67,7 @@ class Follower:
         self.vpn: Optional[dict[str, Any]] = None
         self.agent: Optional[dict[str, Any]] = None
         self.problems: dict[str, str] = {}
-        #: Names that the machine's nodes go by in the graph.
+        #: Names of the machine's nodes in the ROS graph.
         self.names: tuple[str, ...] = ()
         self._stopped, self._watched = threading.Event(), threading.Event()
         self._watched.set()
@@ -76,7 +76,7 @@ class Follower:
         self._thread.start()
 
     def know(self, entry: Entry, *, watched: bool = True) -> None:
-        """Take what is known of the machine now, and whether anybody looks."""
+        """Update the machine's entry; pause while nobody watches (``watched`` is False)."""
         if entry.record is not None:
             self._entry, self._record = entry, entry.record
         if watched:
@@ -85,21 +85,21 @@ class Follower:
             self._watched.clear()
 
     def stop(self) -> None:
-        """End it; the connection closes soon after."""
+        """Stop the thread; it closes the connection soon after."""
         self._stopped.set()
         self._watched.set()
 
     def join(self, timeout: float) -> None:
-        """Wait for the connection to close, so many seconds."""
+        """Wait up to ``timeout`` seconds until the connection is closed."""
         self._thread.join(timeout)
 
     @property
     def last(self) -> int:
-        """The number of the newest line of the log."""
+        """The number of the newest log line."""
         return self._number
 
     def lines(self, after: int) -> list[LogLine]:
-        """Return the lines of the log that came after the one of that number."""
+        """Return the log lines with a number above ``after``."""
         with self._lock:
             return [line for line in self._lines if line.number > after]
 
@@ -127,7 +127,7 @@ class Follower:
         entry = self._entry
         to = reach.endpoint(entry)
         if machines.load(entry.provider).firewall:
-            # nothing is opened for somebody who only looks
+            # Reading the state must not open a port.
             inside = reach.through_vpn(entry, to)
             if inside is None:
                 raise ConnectError(f"'{entry.name}' isn't in reach through the VPN")
@@ -138,7 +138,7 @@ class Follower:
         undo.callback(client.close)
         reply = client.request('status', timeout=15.0)
         if int(reply['next']) <= self._seq:
-            self._seq = 0  # an agent with a new log
+            self._seq = 0  # a new agent, which numbers its log from 1 again
         client.subscribe(self._take, since=max(self._seq + 1, int(reply['next']) - LINES))
         return client, shell
 
@@ -185,10 +185,10 @@ class Follower:
 
 def agent_state(reply: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return what an agent says of itself and its nodes, held to the types that it should have.
+    Validate an agent's status reply, and return its state with the expected types.
 
-    ``since`` in seconds since the epoch, ``rss`` in bytes, ``heartbeat_age`` in seconds, each None
-    where unknown; ``nodes`` with name, state and error as text, pid, returncode and restarts.
+    ``since`` is in seconds since the epoch, ``rss`` in bytes, ``heartbeat_age`` in seconds; each
+    is None if unknown. ``nodes`` has name, state and error as text, pid, returncode and restarts.
     """
     rss, nodes = _number(reply.get('rss_kb')), reply.get('nodes')
     return {
@@ -205,17 +205,17 @@ def agent_state(reply: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _number(value: Any) -> Optional[float]:
-    """Return a number that is one, None for anything else."""
+    """Return a finite number as it is, None for any other value."""
     usable = isinstance(value, (int, float)) and not isinstance(value, bool) \
-        and abs(value) < 1e15  # and so neither infinite nor none at all
+        and abs(value) < 1e15  # excludes infinity and NaN
     return value if usable else None
 
 
 def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dict[str, Any]:
     """
-    Return ``at``, and bytes per second ``receiving`` and ``sending`` since the look before.
+    Return ``at``, and the bytes per second ``receiving`` and ``sending`` since the previous look.
 
-    They are None at the first look, and where the counters have begun anew.
+    The rates are None at the first look, and after the counters restarted.
     """
     if before is None:
         return {'at': now, 'receiving': None, 'sending': None}
@@ -231,9 +231,9 @@ def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dic
 
 def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
     """
-    Return the names by which processes on a machine are known in the graph.
+    Return the names of processes on a machine in the ROS graph.
 
-    By their ``__node`` remapping, else a program's own name: what most programs call their node.
+    The name is the ``__node`` remapping, else the program's name, which most nodes use.
     """
     if not pids:
         return ()
@@ -250,7 +250,7 @@ def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def node_name(words: list[str]) -> str:
-    """Return the name of the node that a command line begins, '' where it says nothing."""
+    """Return the name of the node that a command line starts, '' if unknown."""
     told = [word.partition('__node:=')[2] for word in words if word.startswith('__node:=')]
     if told:
         return told[0]

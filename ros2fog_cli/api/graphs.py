@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program beside each launch that somebody looks at: rates of topics, and pictures."""
+"""Start a program for each launch on the dashboard; it measures topic rates and takes pictures."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from fogros2_monitor import GRAPH
 from ros2fog_cli.api import reach
 from ros2fog_cli.api.live import Live
 
-#: Seconds after which one that ended is started anew, and that one may take to end.
+#: Seconds before an ended program is restarted, and time-out of a program's end in seconds.
 AGAIN, PATIENCE = 10.0, 5.0
 
 
 class Graph:
     """
-    A program that looks at one launch's graph.
+    A program that observes the ROS graph of one launch.
 
-    :param environment: its variables.
+    :param environment: the environment variables of the program.
     """
 
     def __init__(self, environment: dict[str, str]) -> None:
@@ -37,11 +37,11 @@ class Graph:
         self._notes: dict[str, str] = {}
         self._said: deque[str] = deque(maxlen=5)
         self._told = ''
-        # a process of its own, as a launch has a DDS configuration of its own
+        # A launch has its own DDS configuration, so its graph needs its own process.
         self._process = subprocess.Popen(
             GRAPH, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, errors='replace', env=environment,
-            # a Ctrl-C is for us, who close its standard input then
+            # Ctrl-C must reach only this process, which then closes the program's standard input.
             start_new_session=True)
         self._readers = [threading.Thread(target=read, daemon=True, name='fog-graph')
                          for read in (self._read, self._read_errors)]
@@ -50,16 +50,16 @@ class Graph:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the program runs."""
         return self._process.poll() is None
 
     @property
     def trouble(self) -> str:
-        """The last thing that it said before it ended."""
+        """The last line of the program's standard error, or its exit status."""
         return self._said[-1] if self._said else f'exit status {self._process.returncode}'
 
     def know(self, machines: dict[str, tuple[str, ...]], *, pictures: bool = True) -> None:
-        """Tell it what runs where, and whether pictures are wanted."""
+        """Send the program the nodes of each machine, and whether to take pictures."""
         line = json.dumps({'machines': machines, 'pictures': pictures})
         if line != self._told and self._process.stdin is not None:
             self._told = line
@@ -68,7 +68,7 @@ class Graph:
                 self._process.stdin.flush()
 
     def close(self) -> None:
-        """End it."""
+        """Stop the program."""
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
@@ -84,7 +84,7 @@ class Graph:
                 pipe.close()
 
     def state(self) -> list[dict[str, Any]]:
-        """Return the streams with the numbers of their last pictures."""
+        """Return the streams, each with the number of its last picture."""
         return [{**one, 'picture': self.pictures.get(one['topic'], (0, b''))[0],
                  'note': one['note'] or self._notes.get(one['topic'], '')}
                 for one in self.streams]
@@ -95,7 +95,7 @@ class Graph:
             with contextlib.suppress(ValueError, KeyError, TypeError):
                 told = json.loads(line)
                 if not isinstance(told, dict):
-                    continue  # what a library prints
+                    continue  # a library printed this line
                 if 'streams' in told:
                     self.streams, self.topics = told['streams'], told['topics']
                 elif 'data' in told:
@@ -113,9 +113,9 @@ class Graph:
 
 class Graphs:
     """
-    The programs of all launches that run.
+    The graph programs of all running launches.
 
-    :param pictures: whether they take pictures.
+    :param pictures: whether the programs take pictures.
     """
 
     def __init__(self, store: Store, *, pictures: bool = True) -> None:
@@ -124,17 +124,17 @@ class Graphs:
         self._refused: dict[str, tuple[float, str]] = {}
 
     def look(self, live: Live) -> dict[str, Any]:
-        """Return what belongs to a live state: nothing, and no program, while nobody looks."""
+        """Return the graphs' part of the live state; while nobody watches, stop the programs."""
         return self.update(live.running() if live.watched else [], live.names())
 
     def update(
         self, records: list[Record], machines: dict[str, tuple[str, ...]],
     ) -> dict[str, Any]:
         """
-        Have a program for each launch of these machines, and return what they tell.
+        Run one program for each launch of these machines, and return the collected data.
 
-        :param records: of machines that are up.
-        :param machines: by name, the names of the nodes there.
+        :param records: records of machines that are up.
+        :param machines: node names by machine name.
         """
         launches: dict[str, list[Record]] = {}
         for record in records:
@@ -156,13 +156,13 @@ class Graphs:
             'graph_trouble': trouble}
 
     def picture(self, name: str) -> Optional[bytes]:
-        """Return the last picture of a stream, by its id."""
+        """Return the last picture of a stream, by the stream's id."""
         launch, _, topic = name.partition(' ')
         graph = self._graphs.get(launch)
         return graph.pictures.get(topic, (0, None))[1] if graph is not None else None
 
     def close(self) -> None:
-        """End all of them."""
+        """Stop all programs."""
         while self._graphs:
             self._graphs.popitem()[1].close()
 
@@ -183,6 +183,6 @@ class Graphs:
             self._refused[launch] = now, f'topics are not looked at: {error}'
             return None
         if environment is None:
-            return None  # just over
+            return None  # the launch has just ended
         self._graphs[launch] = Graph({**os.environ, **environment})
         return self._graphs[launch]

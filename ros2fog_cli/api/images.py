@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of machines: made, waited for, listed, deleted, over all providers that keep some."""
+"""Create, await, list and delete images of machines, for all providers that have images."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from fogros2.waiting import wait_until
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
 
-#: Seconds that an image of a large disk may take.
+#: Time-out of an image's creation in seconds; a large disk takes long.
 PATIENCE = 3600.0
-#: Seconds between two looks, at the most: each asks all regions.
+#: Longest poll interval in seconds; each poll asks all regions.
 LOOK = 10.0
 READY, FAILED = 'available', ('failed', 'error', 'invalid')
 
 
 @dataclasses.dataclass(frozen=True)
 class Baking:
-    """An image that is being made; ``dependencies`` '' where no launch will find it by itself."""
+    """An image in creation; ``dependencies`` is '' if launches will not find it automatically."""
 
     id: str
     name: str
@@ -35,7 +35,7 @@ class Baking:
 
 
 def flush(entry: Entry, warn: Warn) -> None:
-    """Have a machine write what is in its memory to its disk, as an image is made of the disk."""
+    """Flush a machine's file system buffers, because an image contains only the disk."""
     if entry.machine is None or entry.machine.state is not MachineState.RUNNING:
         return
     try:
@@ -47,10 +47,11 @@ def flush(entry: Entry, warn: Warn) -> None:
 
 def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:
     """
-    Ask for an image of a machine, and return at once.
+    Start to create an image of a machine, and return at once.
 
-    :param name: '' for one made of the machine's name and the time: names can't be used twice.
-    :raises FogError: the machine doesn't run, or its provider keeps no images.
+    :param name: name of the image; '': the machine's name and the time, because names are unique.
+    :param now: the time in seconds since the epoch; None: the current time.
+    :raises FogError: the machine is neither running nor stopped, or its provider has no images.
     """
     if entry.machine is None or entry.machine.state not in (
             MachineState.RUNNING, MachineState.STOPPED):
@@ -69,11 +70,11 @@ def wait(
     look: Callable[[str, float], None] = lambda state, seconds: None,
 ) -> Image:
     """
-    Wait until an image is ready, and return it.
+    Wait until an image is available, and return it.
 
-    :param look: called with its state and the seconds since the beginning.
-    :raises ProviderError: it failed, or vanished.
-    :raises DeadlineExceeded: after ``timeout`` seconds.
+    :param look: callback with the image's state and the seconds since the call.
+    :raises ProviderError: the creation failed, or the image disappeared.
+    :raises DeadlineExceeded: the image is not available after ``timeout`` seconds.
     """
     provider = machines.load(baking.provider)
     begin = time.monotonic()
@@ -85,7 +86,7 @@ def wait(
         if image is None:
             if seen:
                 raise ProviderError(f"the image '{baking.name}' was deleted while it was made")
-            return None  # what has just been made isn't listed everywhere yet
+            return None  # a new image may be missing from the list at first
         seen = True
         look(image.state, time.monotonic() - begin)
         if image.state in FAILED:
@@ -99,7 +100,7 @@ def wait(
 
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:
-    """Return the images of all providers that keep some; one that can't be asked is a warning."""
+    """Return the images of all providers; warn about a provider that does not answer."""
     names = [name for name in plugin_system.names('fogros2.provider')
              if machines.wanted(name, regions)]
 
@@ -119,9 +120,9 @@ def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image
 
 def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:
     """
-    Return the images that have one of ``words`` as their id or name.
+    Return the images whose id or name is one of ``words``.
 
-    :raises ConfigurationError: one fits none.
+    :raises ConfigurationError: a word matches no image.
     """
     found = [image for image in images if image.id in words or image.name in words]
     missing = [word for word in words
@@ -134,9 +135,9 @@ def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:
 
 def delete(image: Image) -> None:
     """
-    Delete an image with the copies of disks behind it, and look that it is gone.
+    Delete an image and its disk snapshots, and check that the image is gone.
 
-    :raises FogError: it is still there.
+    :raises FogError: the image still exists.
     """
     provider = machines.load(image.provider)
     provider.delete_image(image.id)
@@ -145,5 +146,5 @@ def delete(image: Image) -> None:
 
 
 def to_json(image: Image) -> dict[str, Any]:
-    """Return an image as JSON: times in seconds since the epoch, size in GB."""
+    """Return an image as JSON data: times in seconds since the epoch, size in GB."""
     return {field.name: getattr(image, field.name) for field in dataclasses.fields(image)}

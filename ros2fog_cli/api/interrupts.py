@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C while several threads ask: each has to hear of it, or the first to come waits for all."""
+"""Let Ctrl-C reach several waiting threads, so that the program need not wait for them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Optional
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """Yield an event that a Ctrl-C in the block sets, just before it is raised as ever."""
+    """Yield an event that Ctrl-C sets in the block, just before it raises KeyboardInterrupt."""
     event = threading.Event()
 
     def interrupted(number: int, frame: Optional[FrameType]) -> None:

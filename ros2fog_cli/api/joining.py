@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Terminals on this computer that join the launch of a machine."""
+"""Join the launch of a machine from a terminal of this computer."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from fogros2.errors import ConfigurationError
 from fogros2.store import Record, Store
 from ros2fog_cli.api import reach
 
-#: Seconds that a command may take to end after each signal.
+#: Seconds to wait for a command's end after each signal.
 PATIENCE = 3.0
 
 
 def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
     """
-    Return the record of a machine, and the variables of its launch.
+    Return the record of a machine, and the environment variables of its launch.
 
-    :raises ConfigurationError: no launch is running with it.
+    :raises ConfigurationError: no running launch uses the machine.
     """
     record = store.machine(name).load()
     variables = reach.robot_environment(record, store)
@@ -39,15 +39,15 @@ def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
 
 
 def has_daemon() -> bool:
-    """Return whether ``ros2`` here starts a daemon; that of the embedded default does not."""
+    """Return whether ``ros2`` here starts a daemon; the embedded default has none."""
     return importlib.util.find_spec('ros2cli.daemon') is not None
 
 
 def exports(variables: Mapping[str, str], programs: Optional[Path]) -> list[str]:
     """
-    Return lines for a POSIX shell.
+    Return lines for a POSIX shell that export the variables.
 
-    :param programs: folder to put first into PATH, None for none.
+    :param programs: folder to put first into PATH, or None.
     """
     lines = [f'export {name}={shlex.quote(value)}' for name, value in sorted(variables.items())]
     if programs is not None:
@@ -57,11 +57,11 @@ def exports(variables: Mapping[str, str], programs: Optional[Path]) -> list[str]
 
 def run(name: str, words: Sequence[str] = ()) -> int:
     """
-    Run a command, or the user's shell, in this terminal and in the launch; return its status.
+    Run a command or the user's shell in the environment of a launch; return the exit status.
 
-    Its daemon ends with it.
+    A ROS 2 daemon that the command started ends with the command.
 
-    :raises ConfigurationError: no launch is running with the machine.
+    :raises ConfigurationError: no running launch uses the machine.
     """
     _, variables = launch_of(name, Store())
     with tempfile.TemporaryDirectory(prefix='fogros2-shell-') as folder:
@@ -81,7 +81,7 @@ def _shell(name: str, folder: Path, lines: Sequence[str]) -> list[str]:
     shell = os.environ.get('SHELL') or '/bin/sh'
     if Path(shell).name != 'bash':
         return [shell]
-    # what .bashrc sets of the same variables comes before ours
+    # .bashrc may set the same variables, so the exports come after it.
     start = folder / 'bashrc'
     start.write_text('\n'.join(
         ['[ ! -f ~/.bashrc ] || . ~/.bashrc', *lines, f'PS1="({shlex.quote(name)}) $PS1"', '']))
@@ -89,13 +89,13 @@ def _shell(name: str, folder: Path, lines: Sequence[str]) -> list[str]:
 
 
 def _wait(words: list[str], environment: Mapping[str, str]) -> int:
-    """Run a command to its end; Ctrl-C is for the command, a closed terminal for both."""
+    """Run a command to its end. Ctrl-C reaches only the command; SIGHUP and SIGTERM end both."""
     child: Optional[subprocess.Popen[bytes]] = None
     signals: list[int] = []
 
     def leave(number: int, frame: object) -> None:
         signals.append(number)
-        # an exception within Popen would lose the command that it started
+        # An exception inside Popen would lose the process that it started.
         if child is not None and len(signals) == 1:
             raise SystemExit(128 + number)
 
@@ -103,7 +103,7 @@ def _wait(words: list[str], environment: Mapping[str, str]) -> int:
               for number in (signal.SIGHUP, signal.SIGTERM)}
     try:
         child = subprocess.Popen(words, env=dict(environment))
-        # now, as the command would inherit that it is ignored
+        # Only after Popen: the command would inherit the ignored SIGINT.
         before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)
         if signals:
             raise SystemExit(128 + signals[0])
@@ -122,7 +122,7 @@ def _wait(words: list[str], environment: Mapping[str, str]) -> int:
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End a command; an interactive bash ignores SIGTERM and ends at SIGHUP."""
+    """End a command. An interactive bash ignores SIGTERM, but ends at SIGHUP."""
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL):
         child.send_signal(number)
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Finds DDS participants on the networks of this computer, without joining DDS.
+Find DDS participants on the networks of this computer, without joining DDS.
 
-The robot announces a participant that has no endpoints, as the RTPS specification's SPDP has it
-(OMG RTPS 2.5, 8.5.3 and 9.6.2): each participant answers with its own announcement, at once and
-to the address the announcement names. It withdraws by a lease of two seconds.
+The functions announce a participant without endpoints by the RTPS specification's SPDP
+(OMG RTPS 2.5, 8.5.3 and 9.6.2). Each participant answers at once with its own announcement, to
+the address in ours. Our announcement expires by its lease of two seconds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fogros2.model import Command
 
 GROUP = '239.255.0.1'
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250
-#: Vendor id that the specification leaves for 'unknown'.
+#: Vendor id of the specification for an unknown vendor.
 _VENDOR = b'\x00\x00'
 _PARTICIPANT = b'\x00\x00\x01\xc1'
 _SPDP_WRITER, _SPDP_READER = b'\x00\x01\x00\xc2', b'\x00\x01\x00\xc7'
@@ -28,8 +28,9 @@ _SPDP_WRITER, _SPDP_READER = b'\x00\x01\x00\xc2', b'\x00\x01\x00\xc7'
 
 def participants(domain: int, seconds: float) -> dict[str, int]:
     """
-    Return how many DDS participants of a domain are at which other address.
+    Return the number of DDS participants of a domain at each other address.
 
+    :param domain: ROS domain id.
     :param seconds: how long to wait for answers.
     :raises OSError: no socket can be opened.
     """
@@ -51,20 +52,20 @@ def participants(domain: int, seconds: float) -> dict[str, int]:
                 data, (host, _) = link.recvfrom(65536)
             except TimeoutError:
                 continue
-            # header: RTPS, version, vendor, then the sender's guid prefix
+            # The header is RTPS, version, vendor, then the sender's GUID prefix.
             if data[:4] == b'RTPS' and len(data) >= 20 and host not in own:
                 found.setdefault(host, set()).add(data[8:20])
     return {host: len(prefixes) for host, prefixes in found.items()}
 
 
 def addresses() -> list[str]:
-    """Return this computer's IPv4 addresses on networks that others may be in."""
+    """Return this computer's IPv4 addresses on networks with possible other computers."""
     said = process.run(Command(('ip', '-4', '-o', 'addr', 'show', 'up')), timeout=5.0,
                        check=False).stdout
     found = []
     for line in said.splitlines():
         match = re.search(r'^\d+: (\S+)\s+inet ([0-9.]+)', line)
-        # point-to-point links and our own VPNs carry no multicast
+        # Point-to-point links and our own VPNs carry no multicast.
         if match and match[1] != 'lo' and not re.match(r'fog[0-9a-f]{6}|wg|tun', match[1]):
             found.append(match[2])
     return found
@@ -79,7 +80,7 @@ def _announce(
         link.sendto(announcement(prefix, address, port, domain),
                     (GROUP, PORT_BASE + PORTS_PER_DOMAIN * domain))
     except OSError:
-        pass  # an interface without multicast has nobody to find
+        pass  # an interface without multicast finds no participants
 
 
 def announcement(prefix: bytes, address: str, port: int, domain: int) -> bytes:
@@ -87,7 +88,7 @@ def announcement(prefix: bytes, address: str, port: int, domain: int) -> bytes:
     Return the RTPS message that announces a participant without endpoints.
 
     :param prefix: 12 bytes of its GUID.
-    :param address: where answers should go, with ``port``.
+    :param address: where participants should send their answers, with ``port``.
     """
     locator = struct.pack('<iI', 1, port) + bytes(12) + socket.inet_aton(address)
     parameters = [

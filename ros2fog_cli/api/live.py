@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What goes on, kept up to date: this robot's launches, their machines, steps, nodes and links.
+Keep a live state of this robot's launches, machines, steps, nodes and VPN links.
 
-``ros2 fog status --watch`` prints it, ``ros2 fog dashboard`` serves it. Nothing is asked while
-nobody looks.
+``ros2 fog status --watch`` prints the state, ``ros2 fog dashboard`` serves it. While nobody
+watches, no provider and no agent is polled.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from ros2fog_cli.api.follower import Follower, LogLine
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.shown import as_json, machine_json, phase, process_of, Shown, ShownLaunch
 
-#: Seconds between two looks at the store, and two questions to the providers: with machines there
-#: and with none; and for how long somebody who looked counts as looking.
+#: Seconds between two reads of the store (LOOK), between two polls of the providers with machines
+#: (ASK) and without (ASK_SELDOM), and for which a reader of the state counts as present (PRESENT).
 LOOK, ASK, ASK_SELDOM, PRESENT = 0.25, 15.0, 60.0, 20.0
-#: Seconds for which a machine that has gone, and a launch that is over, are still shown.
+#: Seconds for which machines that are gone and launches that ended are still shown.
 KEPT = 900.0
 
 
 class Live:
     """
-    The state, kept by threads; :meth:`start` begins, :meth:`close` ends them.
+    The live state, updated by threads that :meth:`start` starts and :meth:`close` ends.
 
-    :param name: of the one machine to look at, None for all.
-    :param regions: places to ask where a provider has some.
-    :param more: what else belongs to the state, asked at each look.
+    :param name: name of the one machine to watch; None: all machines.
+    :param regions: regions to ask, for providers with regions.
+    :param interval: poll interval of agents in seconds.
+    :param more: callback at each update, which returns further parts of the state.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class Live:
     ) -> None:
         self.store = store or Store()
         self._name, self._regions, self._interval, self._more = name, regions, interval, more
-        #: By their keys, see :meth:`_key`.
+        #: Machines by their keys, see :meth:`_key`.
         self._shown: dict[str, Shown] = {}
         self._launches: dict[str, ShownLaunch] = {}
         self._warnings: list[str] = []
@@ -64,13 +65,13 @@ class Live:
             threading.Thread(target=self._keep_asking, name='fog-live-ask', daemon=True)]
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the threads."""
         self.present()
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
-        """End it, and the connections; what is being deleted is, before that."""
+        """Wait for deletions in progress, then end the threads and the connections."""
         for thread in self._deleting:
             thread.join()
         self._stopped.set()
@@ -86,10 +87,10 @@ class Live:
         for launch in self._launches.values():
             launch.close()
 
-    # -- what others ask ------------------------------------------------------------------------
+    # -- for readers of the state ---------------------------------------------------------------
 
     def present(self) -> None:
-        """Say that somebody looks."""
+        """Record that somebody watches; resume the polling if nobody did."""
         away = not self.watched
         self._looked = time.monotonic()
         if away:
@@ -97,14 +98,14 @@ class Live:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody has looked of late."""
+        """Whether somebody has read the state in the last ``PRESENT`` seconds."""
         return time.monotonic() - self._looked < PRESENT
 
     def state(self, after: int = -1, timeout: float = 0.0) -> dict[str, Any]:
         """
-        Return the state as JSON values, once it is a later one than ``after``.
+        Return the state as JSON values; wait for one that is newer than ``after``.
 
-        :param timeout: seconds after which the same is returned.
+        :param timeout: seconds after which the unchanged state is returned.
         """
         self.present()
         with self._news:
@@ -113,16 +114,16 @@ class Live:
             return {**self._state, 'now': time.time()}
 
     def lines(self, key: str, after: int) -> list[LogLine]:
-        """Return the newer lines of a machine's log."""
+        """Return the lines of a machine's log that follow line number ``after``."""
         with self._lock:
             shown = self._shown.get(key)
         return shown.follower.lines(after) if shown and shown.follower else []
 
     def delete(self, key: str, *, force: bool = False) -> None:
         """
-        Begin to end a machine; what comes of it is in the state.
+        Start to delete a machine; the state shows the result.
 
-        :raises FogError: there is none of that key, or a launch has it and ``force`` isn't set.
+        :raises FogError: no machine has that key, or a launch uses it and ``force`` is False.
         """
         with self._lock:
             shown = self._shown.get(key)
@@ -139,7 +140,7 @@ class Live:
 
     def _delete(self, shown: Shown, force: bool) -> None:
         try:
-            # as its provider knows it now
+            # Ask the provider again: the shown entry may be out of date.
             for entry in machines.survey(lambda text: None, name=shown.entry.name,
                                          regions=self._regions, store=self.store):
                 if entry.own and shown.is_of(entry):
@@ -152,13 +153,13 @@ class Live:
             self._wake.set()
 
     def names(self) -> dict[str, tuple[str, ...]]:
-        """Return the names that nodes of the machines that run have in the graph."""
+        """Return the names of the running machines' nodes in the ROS graph, by machine."""
         with self._lock:
             return {shown.entry.name: shown.follower.names for shown in self._shown.values()
                     if shown.follower is not None}
 
     def running(self) -> list[Record]:
-        """Return the records of machines that are up under a launch that runs."""
+        """Return the records of machines that are up under a running launch."""
         with self._lock:
             return [shown.entry.record for shown in self._shown.values()
                     if shown.follower is not None and shown.entry.record is not None]
@@ -172,7 +173,7 @@ class Live:
             if self.watched:
                 self._wake.wait(LOOK)
                 continue
-            # the look before has told those who measure for us; present() wakes us
+            # The update above has already stopped the measurements; present() wakes this thread.
             self._wake.wait()
 
     def _keep_asking(self) -> None:
@@ -189,7 +190,7 @@ class Live:
                 self._wake.set()
 
     def _look(self) -> None:
-        """Read the store, and tell those who wait if anything is new."""
+        """Update the state from the store, and wake the readers if the state changed."""
         records = {record.name: record for record in self.store.machines()
                    if self._name in (None, record.name)}
         known = frozenset((record.name, record.machine_id) for record in records.values())
@@ -218,22 +219,22 @@ class Live:
                 self._news.notify_all()
 
     def _entry(self, record: Record) -> Entry:
-        """Return a record with what its provider said of it last."""
+        """Return a record's entry, with the last answer of its provider."""
         for entry in self._entries:
             if entry.name == record.name and entry.own and (
                     entry.machine is None or entry.machine.id == record.machine_id):
-                # one that the provider didn't know yet is asked for again
+                # A machine that the provider did not know yet has to be asked for again.
                 asked = entry.asked and (entry.machine is not None or entry.record is not None
                                          and entry.record.machine_id == record.machine_id)
                 return dataclasses.replace(entry, record=record, asked=asked)
         return Entry(record.name, record.provider or '?', None, record, False)
 
     def _without_record(self, records: Mapping[str, Record]) -> list[Entry]:
-        """Return the machines of this robot that it has no record of."""
+        """Return the machines of this robot that have no record here."""
         found = []
         for entry in self._entries:
             record = records.get(entry.name)
-            # a record that has no id yet, or has got it since, may be this machine's
+            # A record without an id, or with an id since the last answer, may be this machine's.
             known = record is not None and record.machine_id in (None, entry.machine_id)
             if entry.own and entry.record is None and not known:
                 found.append(entry)
@@ -241,9 +242,9 @@ class Live:
 
     def _key(self, entry: Entry) -> str:
         """
-        Return what a machine is known by as long as it is shown: its name.
+        Return the key of a machine for as long as it is shown: its name.
 
-        Of several of one name, as in several regions, those that come later have their id besides.
+        If several machines have one name (in several regions), later keys also contain the id.
         """
         first = self._shown.get(entry.name)
         for key, shown in self._shown.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An agent's events in words."""
+"""Describe an agent's events in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Optional
 
 
 def describe(event: dict[str, Any]) -> Optional[str]:
-    """Return an event as text, None for those that people needn't see."""
+    """Return an event as text, None for an event that is not for users."""
     kind = event.get('event')
     if kind == 'output':
         return str(event.get('text', ''))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which machines there are: the providers' word first, the store's where a provider has none."""
+"""List machines: from the providers, or from the store where a provider cannot list them."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ class HasRegions(Protocol):
     """A provider whose machines are in regions."""
 
     def set_regions(self, regions: Sequence[str]) -> None:
-        """Ask these regions from now on; ``['all']`` stands for every one."""
+        """Search these regions from now on; ``['all']`` stands for every region."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
     """
-    A machine as the provider and this robot know it.
+    A machine as its provider and this robot know it.
 
-    :param machine: None where the provider doesn't know it (any more), or can't be asked.
-    :param record: None where this robot knows nothing of it: an orphan, or another robot's.
-    :param asked: whether the provider's answer is in ``machine``.
+    :param machine: None if the provider does not know the machine or could not be asked.
+    :param record: None if this robot has no record: an orphan, or another robot's machine.
+    :param asked: whether ``machine`` is the provider's answer.
     """
 
     name: str
@@ -54,13 +54,13 @@ class Entry:
 
     @property
     def gone(self) -> bool:
-        """Whether only this robot's record is left of it."""
+        """Whether the provider no longer knows the machine, or reports it as deleted."""
         return self.asked and (self.machine is None
                                or self.machine.state is MachineState.DELETED)
 
     @property
     def state(self) -> str:
-        """The state in words for people."""
+        """The state as text for users."""
         if self.record is not None and self.record.damage:
             state = self.machine.state if self.machine is not None else 'unknown'
             return f'{state} (record damaged)'
@@ -79,33 +79,33 @@ class Entry:
 
     @property
     def robot(self) -> str:
-        """The robot that asked for it, '' where nobody knows."""
+        """The robot that created the machine, '' if unknown."""
         if self.machine is not None and TAG_ROBOT in self.machine.tags:
             return self.machine.tags[TAG_ROBOT]
         return robot_name() if self.record is not None else ''
 
     @property
     def own(self) -> bool:
-        """Whether it is this robot's."""
+        """Whether the machine belongs to this robot."""
         return self.robot in ('', robot_name())
 
     @property
     def created(self) -> Optional[float]:
-        """When it was made, in seconds since the epoch."""
+        """When the machine was created, in seconds since the epoch."""
         if self.machine is not None and self.machine.created:
             return self.machine.created
         return self.record.created or None if self.record is not None else None
 
     @property
     def expires(self) -> Optional[float]:
-        """When its lifetime is over, in seconds since the epoch; a stopped one's begins anew."""
+        """When the lifetime ends, in seconds since the epoch; None for a stopped machine."""
         if self.machine is not None and self.machine.state is MachineState.STOPPED:
             return None
         tag = self.machine.tags.get(TAG_EXPIRES, '') if self.machine is not None else ''
         known = [float(tag)] if tag.isdigit() else []
         record = self.record
         if record is not None and record.armed:
-            # later than the tag, which was set at the creation, where a launch reused it
+            # If a launch reused the machine, this is later than the tag of the creation.
             known.append(record.armed + record.spec.lifetime)
         elif record is not None and record.created and not known:
             known.append(record.created + record.spec.lifetime)
@@ -113,14 +113,14 @@ class Entry:
 
     @property
     def address(self) -> str:
-        """Where its shell is, '' while there is none."""
+        """The host of the machine's shell, '' if there is none."""
         if self.machine is not None and self.machine.shell is not None:
             return self.machine.shell.host
         return self.record.shell.host if self.record is not None and self.record.shell else ''
 
     @property
     def monitor(self) -> str:
-        """Where this robot sees its topics, with a token; '' while it serves none."""
+        """The address of the Foxglove bridge for this robot, with its token; '' if none runs."""
         record = self.record
         if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
             return ''
@@ -128,21 +128,21 @@ class Entry:
 
     @property
     def launch(self) -> str:
-        """The launch that has it, or had it last."""
+        """The launch that uses the machine, or used it last."""
         if self.record is not None and self.record.launch:
             return self.record.launch
         return self.machine.tags.get(TAG_LAUNCH, '') if self.machine is not None else ''
 
     @property
     def cost(self) -> Optional[Decimal]:
-        """US dollars an hour while it runs; nothing once it has ended; None where unknown."""
+        """US dollars per hour; None if the machine does not run or its price is unknown."""
         if self.machine is None or self.machine.state not in (
                 MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING):
             return None
         return self.machine.cost_per_hour
 
     def spent(self, now: float) -> Optional[Decimal]:
-        """Return the US dollars since its creation at today's price, None where unknown."""
+        """Return the US dollars since the creation at today's price, None if unknown."""
         rate = self.cost
         if rate is None or self.created is None:
             return None
@@ -150,23 +150,23 @@ class Entry:
 
     @property
     def place(self) -> str:
-        """Region, context, engine: '' where the provider names none."""
+        """Region, context or engine; '' if the provider names none."""
         return self.machine.place if self.machine is not None else ''
 
     @property
     def kind(self) -> str:
-        """What it is, such as an instance type; '' where the provider names none."""
+        """The kind of machine, such as an instance type; '' if the provider names none."""
         return self.machine.kind if self.machine is not None else ''
 
     @property
     def machine_id(self) -> Optional[str]:
-        """The provider's id."""
+        """The id of the machine at its provider."""
         if self.machine is not None:
             return self.machine.id
         return self.record.machine_id if self.record is not None else None
 
     def to_json(self, now: Optional[float] = None) -> dict[str, Any]:
-        """Return it as JSON: times in seconds, money in US dollars as a string."""
+        """Return the entry as JSON values: times in seconds, money in US dollars as a string."""
         now = time.time() if now is None else now
         return {
             'name': self.name, 'provider': self.provider, 'state': self.state,
@@ -194,14 +194,14 @@ def survey(
     store: Optional[Store] = None, cancel: Optional[threading.Event] = None,
 ) -> list[Entry]:
     """
-    Return all machines, or those called ``name``, asking all providers at once.
+    Return all machines, or those named ``name``; ask all providers in parallel.
 
-    A provider that can't be asked (no SDK, no credentials, no engine) costs a warning; what the
-    store knows of its machines is returned all the same. One that nobody has set up here, and
-    that no record names, is left out: its SDK takes longer to load than all others to answer.
+    If a provider cannot be asked (no SDK, no credentials, no engine), warn, and return the
+    machines that the store knows. Skip a provider that is not configured here and that no record
+    names: loading its SDK takes longer than the answers of all others.
 
-    :param regions: places to ask; a provider that has places is asked then in any case.
-    :param cancel: set to give up; by a Ctrl-C where it is left out.
+    :param regions: regions to search; providers with regions are then always asked.
+    :param cancel: event that ends the search; None: Ctrl-C ends it.
     """
     records = {record.name: record for record in (store or Store()).machines()}
     if name is not None:
@@ -230,19 +230,19 @@ def survey(
 
 
 def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
-    """Return whether to ask a provider of whose machines this robot has no record."""
+    """Return whether to ask a provider that no record of this robot names."""
     if not regions and name in plugin_system.names('fogros2.configured'):
-        # what says so without loading the provider, which takes as long as all the others' answers
+        # This entry point answers without loading the provider, which takes long.
         return bool(plugin_system.load('fogros2.configured', name)())
     try:
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
     except FogError:
-        return True  # reported with its name, as any other failure
+        return True  # the caller loads it again, and reports the error with the provider's name
     return kind.configured() or bool(regions) and issubclass(kind, HasRegions)
 
 
 def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
-    """Return this robot's record of a machine; another robot's of the same name is not it."""
+    """Return this robot's record of a machine, None for another robot's machine of that name."""
     record = records.get(machine.name or machine.tags.get(TAG_NAME, ''))
     if record is None:
         return None
@@ -255,7 +255,7 @@ def _ask(
     name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
     records: Iterable[Record], warn: Warn, cancel: threading.Event,
 ) -> Optional[list[Machine]]:
-    """Return a provider's machines, None if it can't be asked."""
+    """Return a provider's machines, None if the provider cannot be asked."""
     try:
         if not any(record.provider == name for record in records) and not wanted(name, regions):
             return []
@@ -266,14 +266,14 @@ def _ask(
         except Unsupported:
             return _described(provider, [r for r in records if r.provider == name])
     except Cancelled:
-        return None  # by a Ctrl-C, which ends everything
+        return None  # Ctrl-C ends the whole program
     except FogError as error:
         warn(f'{name}: {error}')
         return None
 
 
 def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
-    """Return the machines that the store knows, of a provider that keeps no tags."""
+    """Return the machines that the store knows, for a provider that has no tags."""
     machines = []
     for record in records:
         if record.machine_id is not None:
@@ -286,10 +286,10 @@ def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
 
 def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
     """
-    Return a provider.
+    Load a provider.
 
-    :param regions: asked where the provider has any, ``['all']`` or ``['*']`` for every one.
-    :raises FogError: there is none, or what it needs isn't installed.
+    :param regions: regions to search if the provider has regions; ``['all']`` or ``['*']``: all.
+    :raises FogError: no provider has that name, or a library of the provider is not installed.
     """
     provider: Provider = plugin_system.load('fogros2.provider', name)()
     if regions and isinstance(provider, HasRegions):
@@ -298,7 +298,7 @@ def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
 
 
 def total(entries: Sequence[Entry], now: float) -> Optional[tuple[Decimal, Decimal]]:
-    """Return US dollars an hour and so far, of the machines whose price is known, or None."""
+    """Return the US dollars per hour and so far of all machines with a known price, or None."""
     rates = [entry.cost for entry in entries if entry.cost is not None]
     if not rates:
         return None
@@ -310,7 +310,7 @@ def one(entries: Sequence[Entry], name: str) -> Entry:
     """
     Return the one machine of that name.
 
-    :raises ConfigurationError: there is none, or several robots have one.
+    :raises ConfigurationError: no machine, or several machines have that name.
     """
     own = [entry for entry in entries if entry.own] or list(entries)
     if not own:

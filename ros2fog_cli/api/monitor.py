@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's bridge to Foxglove, as the command line reaches it."""
+"""Connect the command line to the Foxglove bridge of a machine."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from fogros2_monitor.tunnel import Tunnel
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
-#: Seconds in which the machine's gate has to answer.
+#: Time-out of the answer of the machine's gate, in seconds.
 _PATIENCE = 15.0
-#: Seconds within which a browser that we start has to come.
+#: Seconds within which a started browser must open the ticket's address.
 _VALID = 60.0
 
 
 @contextlib.contextmanager
 def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
-    """Have a tunnel take connections, in threads; yield an event that is set when it doesn't."""
+    """Serve a tunnel in a thread; yield an event that is set when the tunnel ends."""
     ended = threading.Event()
 
     def carry() -> None:
@@ -52,24 +52,24 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
 
 class Ticket:
     """
-    An address of the loopback that leads a browser to a page, once and within a minute.
+    A loopback URL that redirects a browser to a page, once and within a minute.
 
-    A page's own address has the token, and other users of this computer see the command line of a
-    browser that is started with it.
+    The page's own URL contains the token. Other users of this computer could read that URL in
+    the command line of the started browser.
 
-    :param page: the address that it leads to.
+    :param page: URL of the page.
     """
 
     def __init__(self, page: str) -> None:
         target = f'/{secrets.token_urlsafe(24)}'
         until = time.monotonic() + _VALID
-        #: Set when a browser was led there.
+        #: Set when a browser was redirected.
         self.used = used = threading.Event()
         once = threading.Lock()
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                # the lock is never given back
+                # The lock is never released, so only one request gets the page.
                 valid = (self.path == target and time.monotonic() < until
                          and once.acquire(blocking=False))
                 self.send_response(303 if valid else 404)
@@ -81,9 +81,9 @@ class Ticket:
                 self.end_headers()
 
             def log_message(self, format: str, *args: object) -> None:
-                """Say nothing: the terminal shows the pages."""
+                """Log nothing: the terminal shows the pages."""
 
-        # browsers open connections ahead, and send nothing there
+        # Threads, because browsers open connections in advance that send no request.
         self._server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
         self.url = f'http://127.0.0.1:{self._server.server_port}{target}'
         self._thread = threading.Thread(
@@ -91,7 +91,7 @@ class Ticket:
         self._thread.start()
 
     def close(self) -> None:
-        """Lead nobody there any more."""
+        """Stop the server."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -100,11 +100,11 @@ class Ticket:
 @contextlib.contextmanager
 def browser_at(page: str, *, start: bool) -> Iterator[threading.Event]:
     """
-    Start a browser that shows a page, without the page's address on its command line.
+    Start a browser that shows a page, without the page's URL on its command line.
 
-    Yields an event that is set when it came, or there is none to wait for.
+    Yield an event that is set when the browser came, or when no browser was started.
 
-    :param start: False for none.
+    :param start: False: start no browser.
     """
     import webbrowser
     with contextlib.closing(Ticket(page)) as ticket:
@@ -114,20 +114,20 @@ def browser_at(page: str, *, start: bool) -> Iterator[threading.Event]:
 
 
 def has_application(port: int, token: str) -> bool:
-    """Return whether the gate at a port of the loopback has the web application behind it."""
+    """Return whether the gate at a loopback port serves the web application."""
     connection = http.client.HTTPConnection('localhost', port, timeout=_PATIENCE)
     with contextlib.closing(connection):
         try:
             connection.request('GET', f'/?{urllib.parse.urlencode({"token": token})}')
             answer = connection.getresponse()
         except (OSError, http.client.HTTPException):
-            return False  # the tunnel says what is wrong
-        # to the application, without the token in its address
+            return False  # the tunnel reports the error
+        # The gate redirects to the application, to remove the token from the URL.
         return answer.status == 303
 
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:
-    """Return port and token of the bridge of a machine that is this computer, None without."""
+    """Return port and token of the bridge of a machine replaced by this robot, or None."""
     folder = monitor_addresses.on_robot(Store(), name)
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])
@@ -141,7 +141,7 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
     """
     Return the token of the bridge at a machine's port.
 
-    :raises AgentError: no bridge has made one.
+    :raises AgentError: no bridge has created a token.
     """
     record = entry.record
     folder = (record.agent if record is not None else '') \
@@ -152,10 +152,10 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
 
 def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
     """
-    Return where others reach the bridge (``host:port``), the token, the certificate's SHA-256.
+    Return the open address of the bridge (``host:port``), its token, its certificate's SHA-256.
 
-    :raises ConfigurationError: nobody else is let in.
-    :raises AgentError: this robot's launch isn't the one that lets them in.
+    :raises ConfigurationError: the bridge is not open to other computers.
+    :raises AgentError: no running launch of this robot serves the bridge, or it has no token yet.
     """
     record = entry.record
     if record is None or not record.monitor or not record.launch_alive or not record.agent:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image that saves pods their installing: what goes in is what a launch here would install."""
+"""Build the image that saves pods the installation: it contains what a launch would install."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fogros2.errors import PrerequisiteError
 from fogros2.model import MachineSpec
 from fogros2.provider.kubernetes import image
 
-#: What a pod takes besides, where the node has no module for the VPN.
+#: Packages that a pod needs if its Kubernetes node has no kernel module for the VPN.
 PACKAGES = ('wireguard-go', 'nftables')
 
 
@@ -23,11 +23,11 @@ def recipe(
     environment: Optional[Mapping[str, str]] = None,
 ) -> image.Recipe:
     """
-    Return how to build the image for launches from this terminal.
+    Return the recipe of the image for launches from this terminal.
 
-    :param base: image to begin with; '' for the default one of pods.
-    :param folder: the workspace; None for the one that is sourced, '' for none.
-    :raises PrerequisiteError: there is no ROS 2 here to know the needs of.
+    :param base: base image; '': the default image of pods.
+    :param folder: the workspace; None: the sourced workspace, '': none.
+    :raises PrerequisiteError: no ROS 2 is sourced here, so its dependencies are unknown.
     """
     environment = os.environ if environment is None else environment
     chain = workspace.find_workspaces(environment)
@@ -55,7 +55,7 @@ def build(
     """
     Write the recipe to ``folder``, build the image and push it; return its reference.
 
-    :raises FogError: what failed, with the engine's last words.
+    :raises FogError: a step failed; the error has the last output of the engine.
     """
     return image.build(
         what, folder, program=image.engine(engine), push=push, on_output=say)

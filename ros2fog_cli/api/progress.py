@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes on, shown by a verb: steps that fail, and a line that tells how far a wait is."""
+"""Show progress in the terminal: failed steps, and one line for a wait."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fogros2.report import Event, Reporter, StepFailed
 
 @contextlib.contextmanager
 def shown() -> Iterator[Reporter]:
-    """Yield a Reporter that prints the steps that fail on the standard error."""
+    """Yield a Reporter that prints failed steps to standard error."""
     def report(event: Event) -> None:
         if isinstance(event, StepFailed):
             where = f'{event.machine}: ' if event.machine else ''
@@ -23,7 +23,7 @@ def shown() -> Iterator[Reporter]:
 
 @contextlib.contextmanager
 def line() -> Iterator[Callable[[str], None]]:
-    """Yield what shows a text on a line of the terminal, in place of the one before."""
+    """Yield a function that shows a text on one terminal line and replaces the previous text."""
     shown_now = ''
 
     def show(text: str) -> None:
@@ -32,7 +32,7 @@ def line() -> Iterator[Callable[[str], None]]:
             print(f'\r\x1b[K{text}', end='', file=sys.stderr, flush=True)
             shown_now = text
         elif text.split(',')[0] != shown_now:
-            # into a file: once for each state, not for each second
+            # Not a terminal: print each state once, not every second.
             shown_now = text.split(',')[0]
             print(shown_now, file=sys.stderr, flush=True)
 

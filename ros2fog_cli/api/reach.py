@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reaching a machine by its name: its shell, its agent, its VPN."""
+"""Reach a machine by its name: its shell, its agent and its VPN."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def find(
     name: str, warn: Callable[[str], None], *, regions: Optional[list[str]] = None,
 ) -> Entry:
     """
-    Return the machine of that name; asks one provider where this robot knows which.
+    Return the machine of that name; ask only its provider if this robot has a record.
 
-    :raises ConfigurationError: there is none, or several.
+    :raises ConfigurationError: no machine, or several machines have that name.
     """
     folder = Store().machine(name)
     if folder.exists() and not regions:
@@ -50,14 +50,14 @@ def find(
 
 def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
     """
-    Return where the machine's shell is, with this robot's key if it has one.
+    Return the endpoint of the machine's shell, with this robot's key if there is one.
 
-    :raises ConnectError: it has none, as it doesn't run.
+    :raises ConnectError: the machine has no shell, because it does not run.
     """
     found = entry.machine.shell if entry.machine is not None else None
     if entry.record is not None and entry.record.shell is not None:
         known = entry.record.shell
-        # the provider knows where it is now, the record which key it takes
+        # The provider knows the current address, the record knows the key.
         found = dataclasses.replace(
             found, key_file=known.key_file, user=known.user,
             host_key=known.host_key or found.host_key) if found is not None else known
@@ -71,13 +71,13 @@ def session(
     entry: Entry, user: Optional[str] = None, timeout: float = 15.0,
 ) -> Iterator[Shell]:
     """
-    Yield the machine's shell, which connects when first used; closed after the block.
+    Yield the machine's shell, which connects at the first use, and close it after the block.
 
-    Behind a firewall that the launch has closed, it goes through the VPN while the robot has one
-    to it; else this robot is let in for as long as the block takes. Another robot's machine isn't
-    opened: that would lock its own robot out, which may be on its way in.
+    If the provider has a firewall, connect through the VPN while the robot has one to the machine.
+    Otherwise open the firewall for this robot until the block ends. Never open the firewall of
+    another robot's machine: that would lock out its own robot.
 
-    :raises FogError: it can't be reached.
+    :raises FogError: the machine cannot be reached.
     """
     to = endpoint(entry, user)
     with contextlib.ExitStack() as undo:
@@ -93,14 +93,14 @@ def session(
 
 
 def firewalled(entry: Entry) -> bool:
-    """Return whether the machine's provider decides who reaches it."""
+    """Return whether the machine's provider has a firewall."""
     return entry.machine is not None and machines.load(entry.provider).firewall
 
 
 def through_vpn(
     entry: Entry, to: Endpoint, patience: float = 1.5,
 ) -> Optional[Endpoint]:
-    """Return an endpoint within the VPN, None where nothing answers there in time (s)."""
+    """Return an endpoint in the VPN, None if it does not answer within ``patience`` seconds."""
     record = entry.record
     if record is None or record.vpn is None or not record.launch_alive:
         return None
@@ -112,13 +112,13 @@ def through_vpn(
 
 
 def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
-    """Let this robot in until ``undo`` runs; under a launch, until that closes it again."""
+    """Open a TCP port to this robot until ``undo`` runs or a launch closes the port."""
     assert entry.machine is not None
     provider, machine_id = machines.load(entry.provider), entry.machine.id
     provider.allow(machine_id, port, [provider.robot_address()])
 
     def close() -> None:
-        # a launch may have begun meanwhile, and be on its way in
+        # A launch may have started meanwhile, and may be connecting through this port.
         record = entry.record
         if record is not None:
             with contextlib.suppress(FogError):
@@ -127,7 +127,7 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
             try:
                 provider.allow(machine_id, port, [])
             except MachineNotFound:
-                pass  # gone, and its firewall with it
+                pass  # the machine is gone, with its firewall
             except FogError as error:
                 print(f'{entry.name}: its TCP port {port} is still open to this computer, as '
                       f'closing it failed: {error}', file=sys.stderr)
@@ -137,9 +137,9 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
 
 def let_go(entry: Entry) -> bool:
     """
-    Return whether a machine is kept for a launch to come, and has no agent until then.
+    Return whether a machine is kept for a later launch and has no agent until then.
 
-    Where the agent comes with a launch (a pod), it leaves with it.
+    An agent that comes with the launch (as in a pod) ends with it.
     """
     return entry.record is not None and not entry.record.launch \
         and not machines.load(entry.provider).agent_directory
@@ -147,9 +147,9 @@ def let_go(entry: Entry) -> bool:
 
 def agent(entry: Entry, to: Shell) -> AgentClient:
     """
-    Return a connection to the machine's agent.
+    Return a client of the machine's agent.
 
-    :raises AgentError: this robot doesn't know where it is, or there is none.
+    :raises AgentError: the machine has no agent, or this robot does not know its location.
     """
     record = entry.record
     if let_go(entry):
@@ -164,11 +164,11 @@ def agent(entry: Entry, to: Shell) -> AgentClient:
 @dataclasses.dataclass(frozen=True)
 class Link:
     """
-    The VPN to a machine, seen from the robot.
+    The VPN link to a machine, seen from the robot.
 
-    :param handshake_age: seconds since the last handshake, None before the first.
-    :param received: bytes from the machine, ``sent`` bytes to it.
-    :param latency: median round trip of a ping in milliseconds, None where none came back.
+    :param handshake_age: seconds since the last handshake, None before the first one.
+    :param received: bytes received from the machine; ``sent`` bytes were sent to it.
+    :param latency: median round trip of a ping in milliseconds, None if no ping was answered.
     """
 
     address: str
@@ -181,10 +181,10 @@ class Link:
 
 def link(record: Record, *, pings: int = 5) -> Optional[Link]:
     """
-    Return how the VPN to a machine does, None while the robot has none to it.
+    Measure the VPN link to a machine; return None if the robot has no VPN to it.
 
-    :param pings: how many the round trip is measured by, a fifth of a second each.
-    :raises FogError: the interface can't be asked.
+    :param pings: number of pings for the round trip, one every 0.2 s.
+    :raises FogError: the status of the interface cannot be read.
     """
     if record.vpn is None or record.robot_vpn is None:
         return None
@@ -199,7 +199,7 @@ def link(record: Record, *, pings: int = 5) -> Optional[Link]:
 
 
 def ping(address: str, count: int = 5) -> Optional[float]:
-    """Return the median round trip in milliseconds, None where nothing comes back."""
+    """Return the median round trip of pings in milliseconds, None if no ping was answered."""
     try:
         result = process.run(
             Command(('ping', '-n', '-c', str(count), '-i', '0.2', '-W', '1', address)),
@@ -211,7 +211,7 @@ def ping(address: str, count: int = 5) -> Optional[float]:
 
 
 def clock(record: Record, store: Store) -> Optional[ClockOffset]:
-    """Return the offset that the launch measured last, None without a launch or measurement."""
+    """Return the clock offset that the launch measured last, None if there is none."""
     if not record.launch or not record.launch_alive:
         return None
     return journal.read_clocks(store.root / 'launches' / record.launch).get(record.name)
@@ -221,11 +221,12 @@ def follow(
     client: AgentClient, show: Callable[[dict[str, Any]], None], *, forever: bool,
 ) -> bool:
     """
-    Hand the agent's events to ``show`` from the first on, until the last or for ever.
+    Pass the agent's events to ``show``, from the first one to the last, or until Ctrl-C.
 
-    Returns False if the agent vanished meanwhile; a Ctrl-C is the way out of for ever.
+    Return False if the agent disappeared, or sent no event for 30 s without ``forever``.
 
-    :raises BrokenPipeError: nobody reads what is shown any more.
+    :param forever: also pass future events.
+    :raises BrokenPipeError: the reader of the output is gone.
     """
     last = int(client.request('status')['next']) - 1
     over, absent, unheard = threading.Event(), threading.Event(), threading.Event()
@@ -239,7 +240,7 @@ def follow(
         try:
             show(event)
         except BrokenPipeError:
-            unheard.set()  # as behind `| head`
+            unheard.set()  # as with `| head`
             over.set()
         if not forever and int(event.get('seq', 0)) >= last:
             over.set()
@@ -256,7 +257,7 @@ def follow(
 
 
 def hush() -> None:
-    """Let what is still to be printed go nowhere: the interpreter's end would complain again."""
+    """Redirect stdout and stderr to /dev/null, so that the interpreter's exit reports no error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for target in (1, 2):
         os.dup2(nowhere, target)
@@ -265,9 +266,9 @@ def hush() -> None:
 
 def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
     """
-    Return the variables with which another terminal's nodes join a launch, None if it is over.
+    Return the environment variables that let another terminal join a launch, None if it is over.
 
-    :raises FogError: the user's RMW_IMPLEMENTATION is one that can't join.
+    :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's.
     """
     chosen = store.root / 'launches' / record.launch / 'rmw'
     if not record.launch or not record.launch_alive or not chosen.exists():

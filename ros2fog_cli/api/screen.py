@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's state as a screenful of text that is drawn anew, or as lines where nobody draws."""
+"""Draw a machine's state in the terminal, or print it as lines where no terminal is."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, TextIO
 from ros2fog_cli.api.follower import LogLine
 from ros2fog_cli.api.table import cost, duration, size, table
 
-#: Into the alternate screen and out of it; meanwhile the cursor is hidden, and what is too long
-#: (characters may be two columns wide) is cut.
+#: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
+#: as the number of characters is no limit (a character may be two columns wide).
 _ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l\x1b[?7l', '\x1b[?7h\x1b[?25h\x1b[?1049l'
 _HOME, _REST, _LINE = '\x1b[H', '\x1b[J', '\x1b[K'
-#: Select graphic rendition: bold, dim, and what states are shown in.
+#: SGR codes: bold, dim, and the colours of states.
 _STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'bad': '31'}
 _OF_STATE = {
     'running': 'good', 'done': 'good', 'coming': 'busy', 'starting': 'busy', 'ending': 'busy',
@@ -27,7 +27,7 @@ Paint = Callable[[str, str], str]
 
 
 def painter(stream: TextIO) -> Paint:
-    """Return what gives a text a style, where the stream shows any and nobody objects."""
+    """Return a function that adds a style to a text, if the stream and the user allow colours."""
     if not stream.isatty() or os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb':
         return plain
 
@@ -38,12 +38,12 @@ def painter(stream: TextIO) -> Paint:
 
 
 def plain(text: str, style: str) -> str:
-    """Return the text as it is."""
+    """Return the text without a style."""
     return text
 
 
 def clean(text: str) -> str:
-    """Return a text of others without what a terminal would obey."""
+    """Replace control characters in text that came from elsewhere."""
     return ''.join(c if c.isprintable() else ' ' if c == '\t' else '\N{REPLACEMENT CHARACTER}'
                    for c in text)
 
@@ -53,12 +53,12 @@ def frame(
     rows: int = 24, paint: Paint = plain,
 ) -> list[str]:
     """
-    Return a screenful: no more lines than ``rows``, none longer than ``columns``.
+    Return at most ``rows`` lines of at most ``columns`` characters.
 
-    :param machine: as :func:`ros2fog_cli.api.shown.machine_json` has it, with ``streams`` and
-        ``topics`` of its launch where they are known.
-    :param lines: of its log, of which the last ones are shown.
-    :param now: in seconds since the epoch.
+    :param machine: data of :func:`ros2fog_cli.api.shown.machine_json`, and ``streams`` and
+        ``topics`` of its launch if they are known.
+    :param lines: the machine's log, of which the last lines are shown.
+    :param now: the time in seconds since the epoch.
     """
     parts: list[tuple[str, str]] = [
         (f"{machine['name']} ({machine['provider']} {(machine['id'] or '-')[:20]})  "
@@ -86,7 +86,7 @@ def frame(
         parts.append(('', ''))
         parts += [(f'[{line.node}] {line.text}' if line.node else line.text, 'dim')
                   for line in lines[-room:]]
-    # without what a terminal would obey, and cut before it is painted, as colours take no room
+    # Clean and cut the text before it is painted: escape sequences take no columns.
     return [paint(clean(text)[:columns], style) for text, style in parts[:rows]]
 
 
@@ -175,7 +175,7 @@ def _table(
 
 
 def summary(machine: dict[str, Any]) -> str:
-    """Return what changes seldom, in a line: for a file or a pipe."""
+    """Return a line with the rarely changing parts of the state, for a file or a pipe."""
     parts = [_word(machine['phase'])]
     parts += [f"{step['step']} {step['state']}"
               + (f" after {step['seconds']:.2f} s" if step['seconds'] is not None else '')
@@ -188,7 +188,7 @@ def summary(machine: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def alternate(stream: TextIO) -> Iterator[Callable[[Sequence[str]], None]]:
-    """Yield what draws a screenful in the terminal's other screen; it is left in any case."""
+    """Yield a function that draws lines in the alternate screen; leave that screen at the end."""
     stream.write(_ENTER)
 
     def draw(lines: Sequence[str]) -> None:

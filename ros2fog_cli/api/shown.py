@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of machines and launches that are shown, and the same as JSON values."""
+"""Machines and launches as the live state shows them, and their JSON values."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from fogros2.store import process_alive
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.machines import Entry
 
-#: Steps after which a machine is up, and steps of its way down.
+#: The step after which a machine is up, and the steps that end it.
 UP, DOWN = 'agent', ('delete', 'stop', 'keep', 'let go')
 
 
 @dataclasses.dataclass
 class Shown:
-    """A machine, and all that is known of it; what it was when it has gone."""
+    """A machine with its collected data, which stay after the machine is gone."""
 
     entry: Entry
     follower: Optional[Follower] = None
@@ -36,9 +36,9 @@ class Shown:
 
     def is_of(self, entry: Entry) -> bool:
         """
-        Return whether an entry of that name is of this machine.
+        Return whether an entry of the same name is this machine.
 
-        A robot has one record of a name. One without an id yet may be of a machine that is known.
+        A robot has one record per name. An entry without an id may be a machine that is known.
         """
         recorded = [one for one in (self.entry, entry) if one.record is not None]
         return (len(recorded) == 2 or any(one.machine_id is None for one in recorded)
@@ -51,7 +51,7 @@ class ShownLaunch:
 
     pid: int = 0
     alive: bool = True
-    #: Open, as it goes with the launch's folder, and its last lines with it.
+    #: The open journal: the launch deletes its folder, and the last lines must still be readable.
     file: Optional[TextIO] = None
     size: int = 0
     steps: tuple[journal.Step, ...] = ()
@@ -59,7 +59,7 @@ class ShownLaunch:
     ended: float = 0.0
 
     def read(self, folder: Path) -> None:
-        """Read what the journal has by now."""
+        """Read the journal again if it has grown."""
         try:
             if self.file is None:
                 self.file = open(folder / journal.FILE, errors='replace')
@@ -70,10 +70,10 @@ class ShownLaunch:
                 lines = self.file.read().splitlines()
                 self.steps, self.clocks = tuple(journal.steps(lines)), journal.clocks(lines)
         except OSError:
-            return  # there is none yet
+            return  # there is no journal yet
 
     def close(self) -> None:
-        """Read no more."""
+        """Close the journal."""
         if self.file is not None:
             self.file.close()
             self.file = None
@@ -83,7 +83,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
     """
     Return a machine as JSON values: times in seconds since the epoch, money in US dollars.
 
-    :param key: tells it from others of its name.
+    :param key: identifies the machine among others of the same name.
     """
     entry, follower, record = shown.entry, shown.follower, shown.entry.record
     agent = follower.agent if follower is not None else None
@@ -126,14 +126,14 @@ def as_json(step: journal.Step, *, ended: bool = False) -> dict[str, Any]:
     """
     Return a step as JSON values.
 
-    :param ended: the launch is over, and nothing runs any more.
+    :param ended: whether the launch is over; a running step then counts as done.
     """
     state = 'done' if ended and step.state == 'running' else step.state
     return {**dataclasses.asdict(step), 'state': state}
 
 
 def phase(steps: tuple[journal.Step, ...]) -> str:
-    """Return where a machine is on its way, by its steps: 'coming', 'running', 'ending'."""
+    """Return the phase of a machine by its steps: 'coming', 'running' or 'ending'."""
     found = 'coming'
     for step in steps:
         if step.step in DOWN:
@@ -157,10 +157,10 @@ def _phase(shown: Shown) -> str:
 
 
 def process_of(folder: Path) -> tuple[int, bool]:
-    """Return a launch's process and whether it lives, by what it has written."""
+    """Return a launch's process id and whether it runs, from the file in its folder."""
     try:
         data = json.loads((folder / 'process.json').read_text())
         pid = int(data['pid'])
         return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
     except (OSError, ValueError, KeyError, TypeError):
-        return 0, True  # it has just been made
+        return 0, True  # the launch has just started

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: tables, durations, bytes."""
+"""Format text for users: tables, durations, sizes in bytes, costs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 import sys
 from typing import Optional
 
-#: What stands for nothing.
+#: Shown for a missing value.
 NONE = '-'
 
 
@@ -18,11 +18,11 @@ def table(
     optional: Sequence[str] = (),
 ) -> str:
     """
-    Return rows in columns as wide as their longest word, two spaces apart.
+    Return rows as text, in columns as wide as their longest word, two spaces apart.
 
-    :param width: characters in a line, 0 for as many as it takes.
-    :param optional: columns that are left out, the first one first, until a line is no longer
-        than ``width``; and in any case where no row has anything in them.
+    :param width: maximum characters of a line; 0: no maximum.
+    :param optional: columns that may be omitted. They are omitted in this order until a line fits
+        into ``width``. A column without any value is always omitted.
     """
     empty = {name for column, name in enumerate(header) if name in optional
              and all(row[column] in ('', NONE) for row in rows)}
@@ -36,7 +36,7 @@ def table(
 
 
 def terminal_width() -> int:
-    """Return how many characters a line of the terminal has, 0 where nobody looks at one."""
+    """Return the characters in a line of the terminal, 0 if stdout is no terminal."""
     return shutil.get_terminal_size((0, 0)).columns if sys.stdout.isatty() else 0
 
 
@@ -47,7 +47,7 @@ def _columns(lines: Sequence[Sequence[str]]) -> list[str]:
 
 
 def duration(seconds: Optional[float]) -> str:
-    """Return seconds in at most two units, ``-`` for None."""
+    """Return seconds as text with at most two units, ``-`` for None."""
     if seconds is None:
         return NONE
     if seconds < 0:
@@ -63,7 +63,7 @@ def duration(seconds: Optional[float]) -> str:
 
 
 def size(number: float) -> str:
-    """Return bytes with a decimal unit."""
+    """Return bytes as text with a decimal unit."""
     for unit in ('B', 'kB', 'MB', 'GB'):
         if number < 1000:
             return f'{number:.0f} {unit}' if unit == 'B' else f'{number:.1f} {unit}'
@@ -72,5 +72,5 @@ def size(number: float) -> str:
 
 
 def cost(dollars: Optional[Decimal], places: int = 4) -> str:
-    """Return US dollars with so many decimal places, ``-`` where unknown."""
+    """Return US dollars with ``places`` decimal places, ``-`` for None."""
     return NONE if dollars is None else f'${dollars.quantize(Decimal(1).scaleb(-places))}'

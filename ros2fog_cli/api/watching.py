@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 fog status --watch``: a machine's state until Ctrl-C, over one connection."""
+"""Show a machine's state until Ctrl-C, for ``ros2 fog status --watch``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ros2fog_cli.api import reach, screen
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.live import Live, PRESENT
 
-#: Seconds that the rates of streams may take.
+#: Time-out of the measurement of stream rates, in seconds.
 PATIENCE = 10.0
 _WAITING = 'no such machine yet'
 
@@ -29,11 +29,11 @@ def watch(
     as_json: bool = False, topics: bool = False,
 ) -> int:
     """
-    Show a machine's state each ``interval`` seconds; of a pipe or a file, what changes.
+    Show a machine's state every ``interval`` seconds; print only changes to a pipe or a file.
 
-    :param as_json: a line of JSON for each change instead.
-    :param topics: whether a node joins the launch, for rates of topics.
-    :raises ConfigurationError: no machine can be called so.
+    :param as_json: print a line of JSON for each change instead.
+    :param topics: whether a node joins the launch to measure the rates of topics.
+    :raises ConfigurationError: ``name`` is no valid machine name.
     """
     check_name(name)
     graphs = Graphs(Store(), pictures=False) if topics else None
@@ -46,7 +46,7 @@ def watch(
         else:
             _screen(live, name, interval)
     except KeyboardInterrupt:
-        pass  # the way out
+        pass  # the user ends the watch
     except BrokenPipeError:
         reach.hush()
     finally:
@@ -58,9 +58,9 @@ def watch(
 
 def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str, Any]]:
     """
-    Return the streams to and from a machine, as the dashboard's state has them.
+    Return the streams to and from a machine, with the data of the dashboard.
 
-    A node joins the launch for a few seconds, which measures the rates.
+    A node joins the launch for a few seconds to measure the rates.
     """
     graphs = Graphs(Store(), pictures=False)
     live = Live(name=name, regions=regions, interval=0.5, more=graphs.look)
@@ -70,7 +70,7 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
     def measured() -> bool:
         found[:] = [one for one in live.state().get('streams', [])
                     if name in (one['source'], one['target'])]
-        # what seems to have no subscriber may have one that isn't known yet
+        # Discovery takes time: a stream without subscribers may have one that is not known yet.
         settled = time.monotonic() - begin > PATIENCE / 2
         return bool(found) and all(
             one['rate'] is not None or settled and one['note'] for one in found)
@@ -86,7 +86,7 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
 
 
 def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
-    # of several of that name, the one that a launch has
+    # Of several machines of one name, prefer the one that a launch uses.
     found = max((one for one in state.get('machines', []) if one['name'] == name),
                 key=lambda one: bool(one['launch_alive']), default=None)
     return None if found is None else {
@@ -98,7 +98,7 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
     said: Optional[str] = None
     version = -1
     while True:
-        # often enough to count as somebody who looks
+        # Often enough to count as present.
         state = live.state(version, PRESENT / 20)
         version = state['version']
         machine = _machine(state, name)
@@ -115,7 +115,7 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
 
 
 def _unheard() -> bool:
-    """Return whether the reader of a pipe has gone: what changes seldom is written seldom."""
+    """Return whether the reader of the pipe is gone; without changes, no write would notice it."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return any(events & select.POLLERR for _, events in poll.poll(0))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command extension."""
+"""The command extension of ros2cli."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of other commands of ros2."""
+"""Options for other ros2 commands."""

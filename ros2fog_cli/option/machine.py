@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 launch ... --machine planner=container``."""
+"""Add the option of ``ros2 launch ... --machine planner=container``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 class MachineOption:
     """
-    Runs machines elsewhere than the launch file says; entry point group ``ros2launch.option``.
+    Run machines elsewhere than the launch file says; entry point group ``ros2launch.option``.
 
-    It isn't derived from ros2launch's OptionExtension, which the embedded default doesn't have;
-    ``ros2 launch`` asks for the methods alone.
+    The class does not derive from ros2launch's OptionExtension, which the embedded default lacks;
+    ``ros2 launch`` needs only the methods.
     """
 
     NAME: Optional[str] = None
@@ -37,9 +37,9 @@ class MachineOption:
 
     def prestart(self, args: argparse.Namespace) -> None:
         """
-        Read the arguments.
+        Parse the arguments before the launch starts.
 
-        :raises ConfigurationError: one is wrong; nothing has begun then.
+        :raises ConfigurationError: an argument is invalid.
         """
         self._overrides = None
         if args.machine:
@@ -49,7 +49,7 @@ class MachineOption:
     def prelaunch(
         self, launch_description: LaunchDescription, args: argparse.Namespace,
     ) -> tuple[LaunchDescription]:
-        """Return the launch, its machines elsewhere."""
+        """Return the launch description, wrapped so that the overrides apply to its machines."""
         if self._overrides is None:
             return (launch_description,)
         from launch import LaunchDescription
@@ -63,10 +63,10 @@ class MachineOption:
 
 def complete(prefix: str, **_: object) -> list[str]:
     """
-    Return what an argument that begins so may go on as.
+    Return the completions of an argument that begins with ``prefix``.
 
-    A machine's name as far as this computer knows any, then a provider, then its keywords; no
-    launch file is read for it.
+    First come the names of machines that this computer knows, then providers, then the keywords
+    of the provider. The completion reads no launch file.
     """
     name, equals, rest = prefix.partition('=')
     if not equals:

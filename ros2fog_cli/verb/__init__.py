@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The extension point for verbs of ``ros2 fog``, and what several of them share."""
+"""The extension point for verbs of ``ros2 fog``, and functions that verbs share."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class VerbExtension(abc.ABC):
     """
     A verb of ``ros2 fog``.
 
-    ``NAME`` is set to the entry point's name. ``main`` returns an exit status; a FogError that it
-    raises becomes one line and the exit status 1.
+    ros2cli sets ``NAME`` to the entry point's name. ``main`` returns an exit status. A FogError
+    of ``main`` becomes one line on the terminal and the exit status 1.
     """
 
     NAME: Optional[str] = None
@@ -35,7 +35,7 @@ class VerbExtension(abc.ABC):
 
 
 def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") -> None:
-    """Add the argument ``name``, completed from the machines that are known here."""
+    """Add the argument ``name``, with completion from the machines that this robot knows."""
     argument = parser.add_argument('name', help=text)
     argument.completer = complete_names  # type: ignore[attr-defined]
 
@@ -43,7 +43,7 @@ def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") 
 def complete_names(
     prefix: str, parsed_args: Optional[argparse.Namespace] = None, **_: object,
 ) -> list[str]:
-    """Return the names of machines that begin with ``prefix``; asks no provider."""
+    """Return the names of machines that begin with ``prefix``, without asking providers."""
     from fogros2.store import Store
     return [record.name for record in Store().machines() if record.name.startswith(prefix)]
 
@@ -57,13 +57,13 @@ def add_region(parser: argparse.ArgumentParser) -> None:
 
 
 def complete_regions(prefix: str, **_: object) -> list[str]:
-    """Return the AWS regions that begin with ``prefix``, and 'all'; asks nobody."""
+    """Return the AWS regions that begin with ``prefix``, and 'all', without asking AWS."""
     from fogros2.provider.aws.regions import REGIONS
     return [name for name in (*REGIONS, 'all') if name.startswith(prefix)]
 
 
 def complete_providers(prefix: str, **_: object) -> list[str]:
-    """Return the providers that begin with ``prefix``; loads none."""
+    """Return the providers that begin with ``prefix``, without loading them."""
     from fogros2 import plugin_system
     return [name for name in plugin_system.names('fogros2.provider') if name.startswith(prefix)]
 
@@ -74,12 +74,12 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def warn(text: str) -> None:
-    """Print a line that is no result."""
+    """Print a line to standard error."""
     print(text, file=sys.stderr)
 
 
 def agreed(one: str, several: str, number: int) -> bool:
-    """Ask whether to delete so many; where nobody can be asked the answer is no."""
+    """Ask the user whether to delete ``number`` things; without a terminal, the answer is no."""
     if not sys.stdin.isatty():
         warn('not deleted: nobody is here to ask (--yes answers)')
         return False

@@ -19,12 +19,12 @@ class ConnectVerb(VerbExtension):
                             help='-- and a command, instead of a login shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Hand the terminal over; the exit status is that of the session."""
+        """Connect the terminal to the session; return the exit status of the session."""
         from fogros2.model import Command
         from ros2fog_cli.api import reach
         words = args.command
         if words and words[0].startswith('-') and words[0] != '--':
-            # options after the name: argparse takes them for the command's
+            # argparse takes options after the name for a part of the command.
             end = words.index('--') if '--' in words else len(words)
             late = argparse.ArgumentParser(prog='ros2 fog connect NAME', add_help=False)
             _add_options(late)

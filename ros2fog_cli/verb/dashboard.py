@@ -9,7 +9,7 @@ from ros2fog_cli.verb import add_region, VerbExtension
 
 
 class DashboardVerb(VerbExtension):
-    """Show machines, nodes, links, streams and logs as they are, in a page on this computer."""
+    """Show machines, nodes, links, streams and logs live, in a web page on this computer."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -22,7 +22,7 @@ class DashboardVerb(VerbExtension):
                             help='join no launch: no rates of topics and no pictures')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Serve until interrupted."""
+        """Serve the page until Ctrl-C."""
         from fogros2.errors import ConfigurationError
         from fogros2_monitor.dashboard.server import Dashboard
         from ros2fog_cli.api.board import Board

@@ -9,7 +9,7 @@ from ros2fog_cli.verb import add_region, agreed, complete_names, VerbExtension, 
 
 
 class DeleteVerb(VerbExtension):
-    """End machines and everything made for them."""
+    """Delete machines and everything that was created for them."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -27,14 +27,14 @@ class DeleteVerb(VerbExtension):
                             help="also other robots' machines of that name, or with 'all'")
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Delete, and return 1 if something is still there."""
+        """Delete the machines; return 1 if something still exists."""
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
         store = Store()
         name = None if args.name == 'all' else args.name
         entries = machines.survey(warn, name=name, regions=args.region, store=store)
         others = [entry for entry in entries if not entry.own]
-        # by its name, a machine can be ended from any computer, but one's own is meant first
+        # Another robot's machine can be deleted by name, unless this robot has one of that name.
         if not args.any_robot and (name is None or len(others) < len(entries)):
             entries = [entry for entry in entries if entry.own]
             if others:

@@ -15,7 +15,7 @@ _COLOURS = {'ok': '32', 'warning': '33', 'failed': '31'}
 
 
 class DoctorVerb(VerbExtension):
-    """Look whether this computer has what a launch needs."""
+    """Check whether this computer has what a launch needs."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -28,7 +28,7 @@ class DoctorVerb(VerbExtension):
                             help='how long to look for ROS 2 on the LAN (0: not at all)')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Print each check, failures with their remedy; 1 if one failed."""
+        """Print each check, with a remedy unless it passed; return 1 if a check failed."""
         from ros2fog_cli.api import doctor
         checks = doctor.examine(lan_seconds=args.lan_seconds, providers=args.provider)
         if args.json:

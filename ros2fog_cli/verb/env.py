@@ -30,7 +30,7 @@ class EnvVerb(VerbExtension):
             return 0
         programs = None
         if joining.has_daemon():
-            # the launch stops its daemon at its end
+            # The end of the launch also stops this daemon.
             programs = ros2_daemon.install(store.launch(record.launch), sys.executable)
         print(*joining.exports(variables, programs), sep='\n')
         return 0

@@ -12,7 +12,7 @@ from ros2fog_cli.verb import add_json, add_region, VerbExtension, warn
 
 
 class GcVerb(VerbExtension):
-    """End what is past its time, and clear up after launches that died."""
+    """Delete machines past their lifetime, and clean up after launches that died."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -23,7 +23,7 @@ class GcVerb(VerbExtension):
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Clear up, and return 1 if something is still there that should have gone."""
+        """Clean up; return 1 if something still exists that should be deleted."""
         from fogros2.errors import FogError
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress

@@ -25,7 +25,7 @@ ros2 fog image [OPTIONS] NAME [NAME ...]
 
 
 class ImageVerb(VerbExtension):
-    """Make images of machines that are set up, list and delete them."""
+    """Create images of machines, list and delete images."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -43,7 +43,7 @@ class ImageVerb(VerbExtension):
                             help='more of them; options may come anywhere')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Do what the first word says."""
+        """Run the action that the first argument names."""
         from fogros2.errors import ConfigurationError
         if args.first == 'create':
             return _create(args)
@@ -76,7 +76,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _among(args: argparse.Namespace) -> list[str]:
-    """Take the options among the words after the first, and return the others."""
+    """Parse the options among the arguments after the first, and return the other arguments."""
     late = argparse.ArgumentParser(prog='ros2 fog image', usage=_USAGE)
     _add_options(late)
     late.add_argument('words', nargs='*')

@@ -19,7 +19,7 @@ class ListVerb(VerbExtension):
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Print the table."""
+        """Print the table, or JSON."""
         from ros2fog_cli.api import machines, table
         entries = machines.survey(warn, regions=args.region)
         now = time.time()

@@ -11,7 +11,7 @@ from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
 
 
 class LogsVerb(VerbExtension):
-    """Print what a machine's nodes have printed."""
+    """Print the output of a machine's nodes."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""

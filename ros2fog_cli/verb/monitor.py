@@ -11,12 +11,12 @@ from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
 if TYPE_CHECKING:
     from ros2fog_cli.api.machines import Entry
 
-#: Seconds in which a browser has to come for the page of this computer's own bridge.
+#: Seconds to wait for a browser that opens the page of this computer's own bridge.
 PATIENCE = 60.0
 
 
 class MonitorVerb(VerbExtension):
-    """See a machine's topics in a browser, through a tunnel to its Foxglove bridge."""
+    """Show a machine's topics in a browser, through a tunnel to its Foxglove bridge."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -31,7 +31,7 @@ class MonitorVerb(VerbExtension):
                                  'token, and end')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Serve until interrupted."""
+        """Serve the tunnel until Ctrl-C."""
         from ros2fog_cli.api import monitor, reach
         here = monitor.on_robot(args.name)
         if here is not None and not args.share:
@@ -41,7 +41,7 @@ class MonitorVerb(VerbExtension):
 
 
 def serve(entry: Entry, port: int, browser: bool) -> int:
-    """Carry a port of this computer to the machine's bridge until interrupted."""
+    """Forward a port of this computer to the machine's bridge until Ctrl-C."""
     from fogros2 import monitor_addresses as addresses
     from fogros2.errors import ConfigurationError
     from fogros2_monitor.tunnel import Tunnel
@@ -68,7 +68,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
 
 
 def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
-    """Say where the bridge of this computer is, with its token, and lead a browser there."""
+    """Print the address of this computer's own bridge with its token, and open a browser."""
     from fogros2 import monitor_addresses as addresses
     from ros2fog_cli.api import monitor
     page = say(f'{name} is at {{}}; in a browser:', addresses.place('localhost', port), token)
@@ -78,7 +78,7 @@ def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
 
 
 def say(what: str, where: str, token: str, *, application: bool = False) -> str:
-    """Print a bridge's address, in place of the braces, and its pages; return the first one."""
+    """Print a bridge's address (at ``{}``) and its pages; return the first page."""
     from fogros2_monitor import urls
     address = urls.with_token(where, token)
     pages = [urls.served(where, token)] if application else \
@@ -88,7 +88,7 @@ def say(what: str, where: str, token: str, *, application: bool = False) -> str:
 
 
 def share(entry: Entry) -> int:
-    """Print the addresses that others take, with the token, which is the machine's to tell."""
+    """Print the open addresses of a machine's bridge, with the machine's token."""
     from fogros2_monitor import urls
     from ros2fog_cli.api import monitor, reach
     with reach.session(entry) as shell:

@@ -10,7 +10,7 @@ from ros2fog_cli.verb import add_json, complete_regions, VerbExtension, warn
 
 
 class PriceVerb(VerbExtension):
-    """List the EC2 types that fit, the cheapest first: what 'cheapest' chooses from."""
+    """List the matching EC2 instance types, cheapest first; 'cheapest' takes the first one."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -35,7 +35,7 @@ class PriceVerb(VerbExtension):
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Print the table; the first row is what a launch would take."""
+        """Print the table; a launch would use the first row."""
         from fogros2.provider.aws import choices
         from fogros2.provider.aws.clients import usual
         from fogros2.provider.aws.prices import Market

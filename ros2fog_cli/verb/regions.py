@@ -10,7 +10,7 @@ from ros2fog_cli.verb import add_json, complete_regions, VerbExtension
 
 
 class RegionsVerb(VerbExtension):
-    """List the AWS regions by how long a connection from here takes."""
+    """List the AWS regions by the time of a connection from here."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""

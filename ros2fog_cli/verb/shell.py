@@ -18,7 +18,7 @@ class ShellVerb(VerbExtension):
                             help='-- and a command, instead of a shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Run the shell; the exit status is its own."""
+        """Run the shell, and return its exit status."""
         from ros2fog_cli.api import joining
         words = args.command[1:] if args.command[:1] == ['--'] else args.command
         return joining.run(args.name, words)

@@ -29,7 +29,7 @@ class StatusVerb(VerbExtension):
                             help='of --watch, from one look to the next (1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Print it; 1 if the machine doesn't run, or an agent that it should have is silent."""
+        """Print the status; return 1 if there are problems or no expected agent answers."""
         from fogros2.errors import ConfigurationError, FogError
         from fogros2.store import Store
         from ros2fog_cli.api import reach
@@ -49,7 +49,7 @@ class StatusVerb(VerbExtension):
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
-            # told by its tags: the one that made it
+            # The tag names the launch that created the machine.
             status['launch'] = ''
         elif entry.record is not None:
             try:
@@ -88,9 +88,9 @@ class StatusVerb(VerbExtension):
 
 def show(status: dict[str, Any], *, idle: bool = False) -> None:
     """
-    Print a status for people.
+    Print a status for users.
 
-    :param idle: it is kept, and nothing of a launch runs on it.
+    :param idle: the machine is kept, and no launch uses it.
     """
     from decimal import Decimal
 
