@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Watching a deployment from a browser: the bridge to Foxglove, its gate, and the dashboard.
+Watch a deployment in a browser: the Foxglove bridge, its gate, and the dashboard.
 
-:mod:`~fogros2_monitor.serve` starts the bridge on a machine, :mod:`~fogros2_monitor.gate` lets in
-who has the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_monitor.page`,
-:mod:`~fogros2_monitor.credentials`), :mod:`~fogros2_monitor.bridge` speaks Foxglove's WebSocket
-protocol with :mod:`~fogros2_monitor.definitions` of messages,
-:mod:`~fogros2_monitor.application` runs the web application in a container, and
-:mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open it on the robot.
+:mod:`~fogros2_monitor.serve` starts the bridge on a machine. :mod:`~fogros2_monitor.gate` admits
+requests that have the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_monitor.page`,
+:mod:`~fogros2_monitor.credentials`). :mod:`~fogros2_monitor.bridge` implements Foxglove's
+WebSocket protocol, with the message definitions of :mod:`~fogros2_monitor.definitions`.
+:mod:`~fogros2_monitor.application` runs the web application in a container.
+:mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open the bridge on the robot.
 :mod:`~fogros2_monitor.dashboard` is the page of ``ros2 fog dashboard``.
 
 ``fogros2`` does not import this package. It finds the two programs below by the entry-point group

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs the web application as a container beside the bridge, for as long as its input is open.
+Run the web application as a container beside the bridge, until standard input is closed.
 
-Only where the machine has an engine, and the image or a way to get it: what doesn't work is said,
-and the gate's page leads to the applications that others host.
+The machine needs a container engine, and the image or access to its registry. If the application
+cannot start, this program reports why, and the gate's page links to hosted applications instead.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from fogros2.model import Command
 from fogros2.provider import container_engine
 from fogros2.waiting import wait_until
 
-#: Port on which the image serves.
+#: Port of the application inside the container.
 INSIDE = 8080
-#: Seconds in which an image has to come, and those that the engine may take for anything else.
+#: Time-outs of an image download and of any other call of the engine, in seconds.
 PULL, CALL = 900.0, 60.0
-#: Seconds in which what was started has to listen.
+#: Time-out of the container's start, until it listens, in seconds.
 READY = 30.0
 ENGINES = ('podman', 'docker')
 
 
 class Application:
     """
-    One container.
+    One container of the web application.
 
-    :param port: of the loopback.
-    :param ended: set when it is to end.
+    :param port: loopback port of the application.
+    :param ended: event that cancels the start.
     """
 
     def __init__(self, image: str, port: int, ended: threading.Event) -> None:
         self._image = image
         self._port = port
         self._ended = ended
-        # one that a crash of the computer has left is replaced
+        # A fixed name, so that a container that survived a crash is replaced.
         self._name = f'fogros2-application-{port}'
         self._engine = next((name for name in ENGINES if process.which(name)), '')
 
     def start(self) -> None:
         """
-        Start it, its image downloaded first if it isn't there.
+        Start the container; download its image first if necessary.
 
-        :raises FogError: that doesn't work.
+        :raises FogError: the container cannot start.
         """
         if not self._engine:
             raise PrerequisiteError(
@@ -63,7 +63,7 @@ class Application:
             say(f'getting {self._image}')
             self._call('pull', '-q', self._image, timeout=PULL)
         self.stop()
-        # Lichtblick's server is a file with this one capability: without, it doesn't start
+        # Lichtblick's server has this file capability, and does not start without it.
         self._call('run', '-d', '--name', self._name, '--stop-timeout', '0',
                    '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
                    '--security-opt', 'no-new-privileges', *container_engine.limits(),
@@ -77,7 +77,7 @@ class Application:
             process.run(self._command('rm', '-f', self._name), timeout=CALL, check=False)
 
     def _command(self, *words: str) -> Command:
-        # as root: the login user may not be in docker's group
+        # As root, because the login user may not be in docker's group.
         return Command((self._engine, *words), sudo=True, what='run the web application')
 
     def _call(self, *words: str, timeout: float = CALL) -> None:
@@ -91,7 +91,7 @@ class Application:
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
-    """Run until the input ends, or interrupted."""
+    """Run until standard input is closed, or until a signal."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--image', required=True)
     parser.add_argument('--port', type=int, required=True, help='of the loopback')
@@ -110,14 +110,14 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
 
 
 def _start(application: Application, name: str) -> None:
-    """Start it and say how people find it, or why there is none: the bridge goes on without."""
+    """Start the application, and report how to open it or why there is none."""
     try:
         application.start()
         say(f'the web application is there: ros2 fog monitor {name}')
     except Cancelled:
         pass
     except CommandError as error:
-        # the engine's own last words say it best
+        # The last line of the engine's error output has the cause.
         said = error.result.stderr.strip().splitlines() or [str(error)]
         say(f'no web application here: {said[-1]}')
     except FogError as error:
@@ -125,12 +125,12 @@ def _start(application: Application, name: str) -> None:
 
 
 def say(text: str) -> None:
-    """Tell people; a launch shows what is said on the standard output in its log file alone."""
+    """Print to standard error: a launch shows standard output only in its log file."""
     print(text, file=sys.stderr, flush=True)
 
 
 def _until_eof(ended: threading.Event) -> None:
-    sys.stdin.buffer.read()  # nothing is ever written there
+    sys.stdin.buffer.read()  # the parent never writes, so this returns when the parent ends
     ended.set()
 
 

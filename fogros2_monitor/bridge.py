@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The node that serves a machine's topics to Foxglove, and takes what is published there.
+Serve a machine's topics to Foxglove, and publish the messages of viewers.
 
-A topic is subscribed to while a viewer looks at it, and its bytes are handed on as they came. A
-viewer that reads slowly loses messages, the oldest first, and nobody else does. An H.264 stream
-of ``image_transport_h264`` goes out as ``foxglove.CompressedVideo`` and is not decoded.
+The node subscribes to a topic only while a viewer shows it, and forwards messages without
+decoding them. A slow viewer loses its oldest messages, without effect on other viewers. An H.264
+stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
-Parameters: ``address``, ``port`` (0: any; the port taken is logged), ``topics`` (patterns of the
-topics shown), ``client_publish`` (whether viewers may publish) and ``backlog`` (messages kept for
-a viewer that reads slowly).
+Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
+topics to show), ``client_publish`` (whether viewers may publish) and ``backlog`` (number of
+messages to keep for a slow viewer).
 
-Protocol: https://github.com/foxglove/ws-protocol, by way of ``foxglove-sdk``.
+Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from std_msgs.msg import Empty
 
 from fogros2_monitor.definitions import definition, message_class
 
-#: Seconds between two looks at which topics there are.
+#: Poll interval of the topics in the graph, in seconds.
 LOOK = 0.5
-#: Messages held back for a viewer that doesn't keep up.
+#: Number of messages to keep for a slow viewer.
 BACKLOG = 64
 _COMPRESSED = 'sensor_msgs/msg/CompressedImage'
-#: The topic beside an H.264 stream on which a picture that needs no other is asked for.
+#: Suffix of the topic that requests a keyframe of an H.264 stream.
 _KEYFRAME = '/keyframe'
 
 
 class _Topic:
-    """A topic as viewers see it, and our subscription while any of them looks at it."""
+    """A topic as viewers see it, with a subscription while a viewer shows it."""
 
     def __init__(self, node: BridgeNode, name: str, kind: str, video: bool) -> None:
         self.kind = kind
@@ -67,11 +67,11 @@ class _Topic:
 
     @property
     def id(self) -> int:
-        """Return the id by which viewers know it."""
+        """Return the id of the topic's channel."""
         return self._channel.id()
 
     def look(self, viewer: int) -> None:
-        """Have a viewer see it from now on, with what was said before where that is kept."""
+        """Send the topic to a viewer from now on, latched messages included."""
         self.viewers.add(viewer)
         if self._requests is not None:
             self._requests.publish(Empty())
@@ -83,13 +83,13 @@ class _Topic:
             self._subscribe()
 
     def look_away(self, viewer: int) -> None:
-        """Unsubscribe with the last viewer."""
+        """Stop sending to a viewer; unsubscribe with the last viewer."""
         self.viewers.discard(viewer)
         if not self.viewers:
             self._unsubscribe()
 
     def refit(self) -> None:
-        """Subscribe anew where publishers came that want it: a latched one tells all again."""
+        """Subscribe again if new publishers need another QoS profile."""
         if self._subscription is not None and self._node.get_publishers_info_by_topic(self._name):
             qos = fitting(self._node, self._name)
             if (qos.durability, qos.reliability) != self._fits:
@@ -97,7 +97,7 @@ class _Topic:
                 self._subscribe()
 
     def close(self) -> None:
-        """Take it out of the viewers' lists."""
+        """Remove the topic from the viewers' lists."""
         self._unsubscribe()
         if self._requests is not None:
             self._node.destroy_publisher(self._requests)
@@ -128,9 +128,9 @@ class _Topic:
 
 class BridgeNode(Node):
     """
-    Serves what the graph has.
+    The node that serves the topics of the graph.
 
-    :param executor: where the work is done that viewers ask for, in the SDK's own threads.
+    :param executor: runs the requests of viewers, which arrive in threads of the SDK.
     """
 
     def __init__(self, executor: SingleThreadedExecutor) -> None:
@@ -154,28 +154,28 @@ class BridgeNode(Node):
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
 
     def do(self, action: Callable[..., None], *words: Any) -> None:
-        """Have something done in the executor's thread; from any thread."""
+        """Run ``action`` in the executor's thread; callable from any thread."""
         self._work.create_task(functools.partial(action, *words))
 
     def destroy_node(self) -> None:
-        """Send the viewers away, then end."""
+        """Disconnect the viewers, then destroy the node."""
         self._server.stop()
         super().destroy_node()
 
     def look(self, channel: int, viewer: int) -> None:
-        """Show a topic to a viewer."""
+        """Start to send a topic to a viewer."""
         topic = self._topic(channel)
         if topic is not None:
             topic.look(viewer)
 
     def look_away(self, channel: int, viewer: int) -> None:
-        """Show a topic to a viewer no longer."""
+        """Stop sending a topic to a viewer."""
         topic = self._topic(channel)
         if topic is not None:
             topic.look_away(viewer)
 
     def advertise(self, viewer: int, channel: int, topic: str, encoding: str, kind: str) -> None:
-        """Get ready to publish for a viewer; what can't be is said to all of them."""
+        """Create a publisher for a viewer; report to all viewers if that is impossible."""
         if encoding != 'cdr':
             self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
@@ -187,13 +187,13 @@ class BridgeNode(Node):
         self._published[viewer, channel] = publisher
 
     def unadvertise(self, viewer: int, channel: int) -> None:
-        """Publish for a viewer no longer."""
+        """Destroy a viewer's publisher."""
         publisher = self._published.pop((viewer, channel), None)
         if publisher is not None:
             self.destroy_publisher(publisher)
 
     def publish(self, viewer: int, channel: int, data: bytes) -> None:
-        """Publish what a viewer sent."""
+        """Publish a viewer's message."""
         publisher = self._published.get((viewer, channel))
         if publisher is not None:
             publisher.publish(data)
@@ -206,9 +206,9 @@ class BridgeNode(Node):
         return next((topic for topic in self._topics.values() if topic.id == channel), None)
 
     def _look(self) -> None:
-        """Tell viewers which topics came and went."""
+        """Add new topics and remove topics that are gone."""
         found = {name: kinds[0] for name, kinds in self.get_topic_names_and_types()
-                 if '/_' not in name  # hidden, by ROS 2's rule
+                 if '/_' not in name  # hidden by ROS 2's naming convention
                  and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
         for name in self._topics.keys() - found.keys():
             self._topics.pop(name).close()
@@ -230,7 +230,7 @@ class BridgeNode(Node):
 
 
 class _Listener(ServerListener):
-    """What viewers want, handed over from the SDK's threads to the executor's."""
+    """Pass the viewers' requests from the SDK's threads to the executor's thread."""
 
     def __init__(self, node: BridgeNode) -> None:
         self._node = node
@@ -253,7 +253,7 @@ class _Listener(ServerListener):
 
 
 def fitting(node: Node, topic: str) -> QoSProfile:
-    """Return the best profile that all present publishers of a topic can be heard with."""
+    """Return the strictest QoS profile that is compatible with all publishers of a topic."""
     offered = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
     reliable = bool(offered) and all(
         qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
@@ -267,7 +267,7 @@ def fitting(node: Node, topic: str) -> QoSProfile:
 
 
 def main() -> None:
-    """Run until interrupted."""
+    """Run the bridge until a signal."""
     rclpy.init()
     executor = SingleThreadedExecutor()
     node = BridgeNode(executor)

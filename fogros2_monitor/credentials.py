@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What lets viewers in, made on the machine: the token, and for others than the robot a certificate.
+Create the token that admits viewers, and the TLS certificate for viewers other than the robot.
 
-Neither key nor certificate nor token is ever sent there. The robot reads the token and the
-certificate over its Shell when somebody asks for them (``ros2 fog monitor``).
+The machine creates the token, the key and the certificate, so nobody sends them to the machine.
+``ros2 fog monitor`` reads the token and the certificate over the machine's Shell.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ from fogros2 import process
 from fogros2.model import Command
 from fogros2.monitor_addresses import CREDENTIALS
 
-#: Days for which a certificate is valid; longer than machines live.
+#: Validity of a certificate in days; longer than the lifetime of any machine.
 DAYS = 365
 _SECONDS = 60.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Credentials:
-    """Paths of PEM files, and of one that holds the token."""
+    """Paths of the certificate, its key and the token."""
 
     folder: Path
 
     @property
     def certificate(self) -> Path:
-        """The certificate's path."""
+        """Path of the certificate (PEM)."""
         return self.folder / 'certificate.pem'
 
     @property
     def key(self) -> Path:
-        """The private key's path."""
+        """Path of the private key (PEM)."""
         return self.folder / 'key.pem'
 
     @property
     def token(self) -> Path:
-        """The token's path."""
+        """Path of the token."""
         return self.folder / 'token'
 
 
 def make_token(folder: Path) -> Credentials:
     """
-    Make the token unless it is there; remove earlier launches' beside it.
+    Create the token unless it exists; delete the credentials of earlier launches.
 
-    :param folder: the launch's own, see ``monitor_addresses.folder_of``; made with what is above,
-        0700.
-    :raises OSError: it can't be written.
+    :param folder: folder of this launch, see ``monitor_addresses.folder_of``. The function creates
+        the folder and its parents with mode 0700.
+    :raises OSError: the folder is not writable.
     """
     found = Credentials(folder)
     if not found.token.exists():
@@ -69,11 +69,11 @@ def make_token(folder: Path) -> Credentials:
 
 def make(folder: Path, name: str) -> Credentials:
     """
-    Make the token, the key and the certificate, each unless it is there.
+    Create the token, the key and the certificate, unless they exist.
 
     :param folder: see :func:`make_token`.
-    :param name: the machine's.
-    :raises FogError: there is no ``openssl``, or it fails.
+    :param name: name of the machine.
+    :raises FogError: ``openssl`` is not installed, or it fails.
     """
     found = make_token(folder)
     if found.certificate.exists():
@@ -85,16 +85,16 @@ def make(folder: Path, name: str) -> Credentials:
         '-out', str(unfinished), '-subj', f'/CN={name}',
         '-addext', f'subjectAltName=DNS:{name}'), what='make a certificate'), timeout=_SECONDS)
     found.key.chmod(0o600)
-    # last: where it is, all is
+    # The rename is the last step: if the certificate exists, so does the key.
     unfinished.rename(found.certificate)
     return found
 
 
 def fingerprint(certificate: str) -> str:
     """
-    Return a certificate's SHA-256, as browsers show it.
+    Return a certificate's SHA-256 fingerprint in the form that browsers show.
 
-    :param certificate: PEM.
+    :param certificate: the certificate as PEM text.
     """
     digest = hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate)).hexdigest().upper()
     return ':'.join(digest[at:at + 2] for at in range(0, len(digest), 2))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Message definitions as text, in the form that ROS 2 bags and Foxglove call ``ros2msg``.
+Generate message definitions as text, in the format ``ros2msg`` of ROS 2 bags and Foxglove.
 
-Made from what the message classes themselves tell, so they are right for whichever interfaces
-are installed, and need no ``.msg`` file.
+The definitions come from the installed message classes, so they are right for any version of the
+interfaces and need no ``.msg`` file.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import re
 from typing import Any
 
 _RULE = '=' * 80
-#: IDL's words, as message classes have them, in those of message files.
+#: Types of IDL in message classes, and the same types in message files.
 _BASIC = {
     'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64',
     **{name: name for name in (
@@ -29,8 +29,8 @@ def message_class(name: str) -> Any:
     """
     Import a message class.
 
-    :param name: such as ``std_msgs/msg/String`` or ``std_msgs/String``.
-    :raises LookupError: it isn't installed here, or isn't a message.
+    :param name: type name, such as ``std_msgs/msg/String`` or ``std_msgs/String``.
+    :raises LookupError: the type is not installed here, or is no message.
     """
     parts = name.split('/')
     package, kind = parts[0], parts[-1]
@@ -44,13 +44,13 @@ def message_class(name: str) -> Any:
 
 def definition(name: str) -> str:
     """
-    Return a message's fields, followed by those of all messages in it.
+    Return a message's fields, followed by the fields of all nested messages.
 
-    Sections are as ``ros2msg`` wants them: each after the first begins with a line of 80 equals
-    signs and ``MSG: package/Name``.
+    Each section after the first begins with a line of 80 equals signs and
+    ``MSG: package/Name``, as ``ros2msg`` requires.
 
-    :param name: such as ``std_msgs/msg/String``.
-    :raises LookupError: it, or a message in it, isn't installed here.
+    :param name: type name, such as ``std_msgs/msg/String``.
+    :raises LookupError: the message or a nested message is not installed here.
     """
     waiting = [name]
     seen: dict[str, str] = {}
@@ -75,7 +75,7 @@ def _short(name: str) -> str:
 
 
 def _written(kind: str) -> tuple[str, str]:
-    """Return a field's type as message files write it, and the type of its items."""
+    """Return a field's type as message files write it, and its item type."""
     for pattern, brackets in ((_SEQUENCE, '[<={bound}]'), (_ARRAY, '[{size}]')):
         found = pattern.match(kind)
         if found:

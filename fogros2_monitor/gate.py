@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What stands before the bridge: it listens where the bridge doesn't, and lets in who may.
+Guard the bridge: listen on the network, and admit only requests that have the token.
 
-The bridge itself asks nobody who he is, and a browser connects to it for any page that it shows.
-So each door of the gate hands on requests alone that carry the token
-(``ws://ADDRESS:PORT/?token=TOKEN``) and that no other site's page makes: on the loopback, on the
-VPN's address, and where others than the robot were allowed in, on a port of its own, from the
-networks that were named alone, over TLS. All else is turned away, and logged once per address and
-cause, so that nobody fills the disk by knocking.
+The bridge itself has no authentication, and any web page can make the user's browser connect to
+it. So the gate forwards only requests that carry the token (``ws://ADDRESS:PORT/?token=TOKEN``)
+and that no page of another site made. It listens on the loopback interface and on the machine's
+VPN address. On request it also opens a port of its own to other computers, over TLS and only from
+the given networks. The gate refuses all other requests. It logs a refusal once per address and
+reason, so that refused clients cannot fill the disk.
 
-A request for a page goes to the web application where the machine has one, else the gate's own
-page leads to those that others host.
+The gate forwards a request for a page to the web application if the machine has one. Otherwise
+its own page links to hosted applications.
 
-Standard library only: it also stands before ROS 2's own ``foxglove_bridge``, on machines that have
-nothing else of this package.
+The gate uses only the standard library: it also guards ROS 2's own ``foxglove_bridge``, on
+machines that have nothing else of this package.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from typing import Optional, Union
 from fogros2_monitor import page
 from fogros2_monitor.request import check, check_site, parse, Refused, Request
 
-#: Variable of all nodes on a machine: its address in the VPN.
+#: Environment variable of all nodes on a machine: its VPN address.
 VPN_ADDRESS = 'FOGROS2_VPN_ADDRESS'
-#: Bytes and seconds that a request may take until its empty line.
+#: Largest header of a request in bytes, and its time-out in seconds.
 HEAD, HEAD_TIME = 16384, 10.0
-#: Seconds for the handshake of TLS.
+#: Time-out of the TLS handshake in seconds.
 HANDSHAKE = 10.0
-#: Connections at once by one door, so that nobody outside takes those of the robot; a browser that
-#: watches has one.
+#: Maximum connections of each listening socket, so that outside clients cannot use up those of
+#: the robot. A viewer in a browser uses one.
 CONNECTIONS = 100
-#: Addresses and causes remembered as logged.
+#: Number of different refusals to log.
 LOGGED = 1000
-#: Bytes handed on at once at the most: an image takes few turns.
+#: Bytes to copy at once; large, so that an image takes few iterations.
 _BLOCK = 1 << 18
 
 Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
@@ -54,28 +54,28 @@ Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
 @dataclasses.dataclass(frozen=True)
 class Guard:
     """
-    What a door that is open to others than the robot takes beside the token.
+    TLS and allowed networks of a port that is open to other computers than the robot.
 
-    :param allowed: the networks that may knock; all if there are none.
+    :param allowed: networks that may connect; empty: all networks.
     """
 
     tls: ssl.SSLContext
     allowed: tuple[Network, ...] = ()
 
     def lets_knock(self, peer: str) -> bool:
-        """Return whether an address is among the networks."""
+        """Return whether an address is in an allowed network."""
         address = ipaddress.ip_address(peer)
         return not self.allowed or any(address in network for network in self.allowed)
 
 
 class Gate:
     """
-    Hands connections on.
+    Forward admitted connections.
 
     :param to: address and port of the bridge.
-    :param token: what requests have to carry.
-    :param application: those of the web application, None where there is to be none.
-    :param name: of the machine.
+    :param token: the required token.
+    :param application: address and port of the web application, None if there is none.
+    :param name: name of the machine.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class Gate:
 
     async def serve(self, listener: socket.socket, guard: Optional[Guard] = None) -> None:
         """
-        Take connections until cancelled.
+        Accept connections until cancelled.
 
-        :param listener: a socket that listens, and doesn't block.
-        :param guard: of the door for others than the robot.
+        :param listener: a listening, non-blocking socket.
+        :param guard: for a port that is open to other computers than the robot.
         """
         loop = asyncio.get_running_loop()
         connections: set[asyncio.Task[None]] = set()
@@ -125,7 +125,7 @@ class Gate:
             transport, _ = await loop.connect_accepted_socket(
                 lambda: protocol, connection, ssl=guard.tls if guard else None,
                 ssl_handshake_timeout=HANDSHAKE if guard else None)
-        except OSError as error:  # of TLS, too
+        except OSError as error:  # includes errors of TLS
             self._turn_away(peer, f'no TLS: {getattr(error, "reason", "") or error}')
             connection.close()
             return
@@ -139,7 +139,7 @@ class Gate:
             self._turn_away(peer, str(refused))
             writer.write(page.refusal(refused.status, self._name))
         except (OSError, asyncio.IncompleteReadError):
-            pass  # gone before it said what it wants
+            pass  # the client disconnected before it sent a request
         finally:
             await _closed(writer)
 
@@ -147,7 +147,7 @@ class Gate:
         self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
         *, encrypted: bool,
     ) -> None:
-        """Hand a request on to whom it is for, or answer it."""
+        """Forward a request to the bridge or the web application, or answer it."""
         if request.websocket:
             try:
                 inner = await asyncio.open_connection(*self._to, limit=_BLOCK)
@@ -161,7 +161,7 @@ class Gate:
                 raise ConnectionRefusedError
             inner = await asyncio.open_connection(*self._application)
         except OSError:
-            # the one name that browsers ask for by themselves isn't a page
+            # Browsers request the icon by themselves; it gets no page.
             writer.write(page.answer('404 Not Found') if request.target == '/favicon.ico'
                          else page.links(request, self._name, self._token,
                                          encrypted=encrypted))
@@ -170,7 +170,7 @@ class Gate:
             writer.write(page.redirect(request, self._token, encrypted=encrypted))
             await _closed(inner[1])
             return
-        # one request each: the next may be for the bridge
+        # One request per connection, because the next one may be for the bridge.
         await _pass(request.handed_on(closing=True), reader, writer, *inner)
 
     def _turn_away(self, who: str, why: str) -> None:
@@ -180,7 +180,7 @@ class Gate:
 
 
 def plain_address(address: str) -> str:
-    """Return a peer's address; one of IPv4 that came by a socket for both as itself."""
+    """Return a peer's address; map an IPv4 address of a dual-stack socket back to IPv4."""
     found = ipaddress.ip_address(address.partition('%')[0])
     mapped = getattr(found, 'ipv4_mapped', None)
     return str(mapped or found)
@@ -190,7 +190,7 @@ async def _pass(
     head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
     inner_reader: asyncio.StreamReader, inner_writer: asyncio.StreamWriter,
 ) -> None:
-    """Carry bytes both ways until either side ends."""
+    """Copy bytes in both directions until one side closes the connection."""
     inner_writer.write(head)
     ways = {asyncio.ensure_future(_carry(reader, inner_writer)),
             asyncio.ensure_future(_carry(inner_reader, writer))}
@@ -207,7 +207,7 @@ async def _head(reader: asyncio.StreamReader) -> bytes:
     try:
         first = await asyncio.wait_for(reader.read(1), HEAD_TIME)
     except asyncio.TimeoutError:
-        # browsers open connections that they may need later
+        # Browsers open connections in advance.
         raise ConnectionAbortedError from None
     try:
         return first + await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), HEAD_TIME)
@@ -218,7 +218,7 @@ async def _head(reader: asyncio.StreamReader) -> bytes:
 
 
 async def _carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    # drain() waits for a slow viewer: then the bridge's own queue for it fills, and drops
+    # drain() waits for a slow viewer, so the bridge's queue for it fills, and drops messages.
     with contextlib.suppress(OSError):
         while block := await reader.read(_BLOCK):
             writer.write(block)
@@ -233,9 +233,9 @@ async def _closed(writer: asyncio.StreamWriter) -> None:
 
 def endpoint(text: str) -> tuple[str, int]:
     """
-    Return address and port of ``ADDRESS:PORT``; an IPv6 address stands in brackets.
+    Return address and port of ``ADDRESS:PORT``; an IPv6 address is in brackets.
 
-    :raises argparse.ArgumentTypeError: it isn't of this form.
+    :raises argparse.ArgumentTypeError: the text has another form.
     """
     host, separator, port = text.rpartition(':')
     if not separator or not port.isdigit() or int(port) > 65535:
@@ -245,9 +245,9 @@ def endpoint(text: str) -> tuple[str, int]:
 
 def network(text: str) -> Network:
     """
-    Return a network of the form ``198.51.100.0/28``.
+    Return a network in the form ``198.51.100.0/28``.
 
-    :raises argparse.ArgumentTypeError: it isn't of this form.
+    :raises argparse.ArgumentTypeError: the text has another form.
     """
     try:
         return ipaddress.ip_network(text)
@@ -257,7 +257,7 @@ def network(text: str) -> Network:
 
 def _listen(address: tuple[str, int]) -> socket.socket:
     host, port = address
-    if host == '':  # every address of the machine
+    if host == '':  # all addresses of the machine
         both = socket.has_dualstack_ipv6()
         listener = socket.create_server(
             ('', port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both)
@@ -275,7 +275,7 @@ async def _run(options: argparse.Namespace) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.cancel)
     if options.until_eof:
-        loop.add_reader(0, ended.cancel)  # nothing is ever written there
+        loop.add_reader(0, ended.cancel)  # the parent never writes: readable means closed
     gate = Gate(options.to, _token(options.token_file), options.application, options.name)
     serving = [asyncio.ensure_future(gate.serve(_listen(address))) for address in options.listen]
     if options.guarded:
@@ -284,7 +284,7 @@ async def _run(options: argparse.Namespace) -> None:
     await asyncio.wait({ended, *serving}, return_when=asyncio.FIRST_COMPLETED)
     for task in serving:
         if task.done():
-            task.result()  # listening ends with an error alone
+            task.result()  # a task ends only with an error
 
 
 def _token(path: str) -> str:
@@ -303,7 +303,7 @@ def _guard(options: argparse.Namespace) -> Guard:
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
-    """Run until interrupted."""
+    """Run the gate until a signal."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--to', type=endpoint, required=True, help='where the bridge listens')
     parser.add_argument('--listen', type=endpoint, action='append', default=[],

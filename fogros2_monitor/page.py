@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the gate answers by itself: a page that leads to the applications, and short refusals; pure.
+Build the gate's own answers: a page with links to the applications, and short refusals; pure.
 
-The page has a second use. A browser opens no ``wss://`` to a certificate that it doesn't know, and
-asks nobody; who opens this page is asked.
+The page has a second use. A browser refuses ``wss://`` with an unknown certificate without asking
+the user. If the user opens this page over ``https://``, the browser asks.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import html
 from fogros2_monitor import urls
 from fogros2_monitor.request import cookie, is_loopback, Request
 
-#: Says of an answer that it is the gate's own, not the application's.
+#: Header that marks an answer as the gate's own, not the application's.
 MARK = 'X-FogROS2-Gate'
 
 _PAGE = """\
@@ -35,7 +35,7 @@ code {{ overflow-wrap: anywhere }}
 
 
 def answer(status: str, body: str = '', *headers: str) -> bytes:
-    """Return an answer after which the connection ends; ``body`` is HTML."""
+    """Return an HTTP answer that closes the connection; ``body`` is HTML."""
     data = body.encode()
     head = [
         f'HTTP/1.1 {status}', f'{MARK}: 1', 'Connection: close', f'Content-Length: {len(data)}',
@@ -47,9 +47,9 @@ def answer(status: str, body: str = '', *headers: str) -> bytes:
 
 def refusal(status: str, name: str) -> bytes:
     """
-    Return the answer to a request that isn't let in.
+    Return the answer to a refused request.
 
-    :param name: of the machine.
+    :param name: name of the machine.
     """
     return answer(status, _PAGE.format(name=html.escape(name), text=(
         '<p>The address with its token is printed by</p>'
@@ -58,7 +58,7 @@ def refusal(status: str, name: str) -> bytes:
 
 
 def redirect(request: Request, token: str, *, encrypted: bool) -> bytes:
-    """Return the way to the same page without the token; a cookie gets what the page loads."""
+    """Return a redirect to the same page without the token; a cookie admits its resources."""
     return answer(
         '303 See Other', '', f'Location: {request.target}',
         f'Set-Cookie: {"=".join(cookie(token))}; Path=/; HttpOnly; SameSite=Lax'
@@ -67,12 +67,12 @@ def redirect(request: Request, token: str, *, encrypted: bool) -> bytes:
 
 def links(request: Request, name: str, token: str, *, encrypted: bool) -> bytes:
     """
-    Return the page that leads to the web applications.
+    Return the page with links to the web applications.
 
-    :param name: of the machine.
-    :param encrypted: it was asked for over TLS.
+    :param name: name of the machine.
+    :param encrypted: whether the request came over TLS.
     """
-    # what was asked for is the one address that is known to get here from there
+    # The requested host is the one address that is known to work from the browser.
     where = request.host
     address = urls.with_token(where, token, 'wss' if encrypted else 'ws')
     parts = [f'<p>The topics of this machine are at<br><code>{html.escape(address)}</code></p>']

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first request on a connection: what it asks for, and whether it may; pure."""
+"""Parse the first request of a connection, and decide whether to admit it; pure."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import urllib.parse
 
 from fogros2_monitor import urls
 
-#: What desktop applications say in ``Origin``, where they say anything.
+#: Values of ``Origin`` that desktop applications send.
 _DESKTOP = ('null', 'file://')
 
 
 class Refused(Exception):
-    """A request that isn't let in: the status to answer, and why, for the log."""
+    """A refused request: the HTTP status, and the reason for the log."""
 
     def __init__(self, status: str, why: str) -> None:
         super().__init__(why)
@@ -28,14 +28,15 @@ class Refused(Exception):
 @dataclasses.dataclass(frozen=True)
 class Request:
     """
-    A GET.
+    A GET request.
 
     :param target: path and query, without the token.
     :param given: the tokens in the query.
-    :param host: whom it is for, in the words of who asks.
-    :param origins: the sites whose pages ask, in a browser's words.
-    :param websocket: whether it asks for a WebSocket.
-    :param lines: the header, line by line.
+    :param host: header ``Host``.
+    :param origins: headers ``Origin``: the sites whose pages sent the request.
+    :param websocket: whether the request opens a WebSocket.
+    :param version: HTTP version.
+    :param lines: the lines of the header.
     """
 
     target: str
@@ -48,10 +49,10 @@ class Request:
 
     def handed_on(self, *, closing: bool = False) -> bytes:
         """
-        Return the request's head without the token.
+        Return the header of the request without the token, to forward it.
 
-        :param closing: have the connection end with the answer, and leave the query out: it tells
-            the application's page, in the browser, of the bridge and its token.
+        :param closing: close the connection after the answer, and remove the query. The query
+            tells the application's page in the browser the bridge's address and token.
         """
         target = self.target.partition('?')[0] if closing else self.target
         left = [line for line in self.lines if not line.lower().startswith('cookie:')]
@@ -64,10 +65,10 @@ class Request:
 
 def parse(head: bytes) -> Request:
     """
-    Return what a request asks for.
+    Parse a request.
 
-    :param head: up to and with the empty line.
-    :raises Refused: it isn't a GET of HTTP/1, or is for several hosts.
+    :param head: the header, including its empty line.
+    :raises Refused: the request is no GET of HTTP/1, or names several hosts.
     """
     line, *lines = head.decode('latin-1').split('\r\n')[:-2]
     words = line.split(' ')
@@ -85,7 +86,7 @@ def parse(head: bytes) -> Request:
     path = url.path if url.path.startswith('/') else '/'
     left = urllib.parse.urlencode([item for item in query if item[0] != 'token']) \
         if given else url.query
-    # one slash alone: '//x' would lead elsewhere where it is redirected to
+    # Only one slash: a redirect to '//x' would lead to the host x.
     return Request(
         '/' + path.lstrip('/\\') + (f'?{left}' if left else ''), given,
         ''.join(hosts), tuple(_values(lines, 'origin')),
@@ -94,14 +95,15 @@ def parse(head: bytes) -> Request:
 
 def check_site(request: Request, name: str, *, encrypted: bool) -> None:
     """
-    Look at the site whose page asks: a browser that may come in asks for any page it shows.
+    Check the site of a request, because any web page can make a browser send requests.
 
-    ``Host`` has to be an address, or a name that nobody else can lead here (DNS rebinding); over
-    TLS the certificate stands for the name. ``Origin`` is missing, as desktop applications have
-    it, or the gate's own page, one of the applications that we lead to, or of this computer's.
+    Without TLS, ``Host`` must be an IP address, 'localhost' or the machine's name, which no
+    attacker can point here (DNS rebinding). With TLS, the certificate protects the name.
+    ``Origin`` may be missing or a desktop application's. Otherwise it must be the gate's own page,
+    one of the linked applications, or a page of this computer.
 
-    :param name: the machine's.
-    :raises Refused: it is another site's.
+    :param name: name of the machine.
+    :raises Refused: the request comes from another site.
     """
     alone = _without_port(request.host)
     if not encrypted and not _is_address(alone) and alone not in ('localhost', name.lower()):
@@ -114,7 +116,7 @@ def check_site(request: Request, name: str, *, encrypted: bool) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a Host header's value names the loopback."""
+    """Return whether the value of a Host header names the loopback interface."""
     alone = _without_port(host)
     return alone == 'localhost' or _is_address(alone) and ipaddress.ip_address(alone).is_loopback
 
@@ -134,10 +136,10 @@ def _is_address(text: str) -> bool:
 
 def cookie(token: str) -> tuple[str, str]:
     """
-    Return name and value of the cookie that gets pages, after the query had the token.
+    Return name and value of the cookie that admits requests for pages.
 
-    The value isn't the token: a browser shows it to all ports of a host, so on the loopback to
-    whatever listens there. Each gate has a name of its own, for the same reason.
+    The value is not the token, because a browser sends a cookie to all ports of a host, on the
+    loopback interface to any local server. For the same reason each gate has its own cookie name.
     """
     digest = hmac.new(token.encode(), b'pages', 'sha256').hexdigest()
     return f'fogros2-{digest[:8]}', digest[8:]
@@ -145,12 +147,12 @@ def cookie(token: str) -> tuple[str, str]:
 
 def check(request: Request, token: str) -> None:
     """
-    Look for the token.
+    Check the token of a request.
 
-    A WebSocket has to have it in its address: a cookie comes along with what others' pages ask
-    for, too.
+    A WebSocket needs the token in its URL. A cookie is not enough, because browsers add it to
+    requests of other sites' pages too.
 
-    :raises Refused: it lacks, or is another.
+    :raises Refused: the token is missing or wrong.
     """
     name, value = cookie(token)
     given = _cookie(_values(request.lines, 'cookie'), name)
@@ -179,5 +181,5 @@ def _cookie(values: Sequence[str], name: str) -> str:
         try:
             found = http.cookies.SimpleCookie(value).get(name, found)
         except http.cookies.CookieError:
-            continue  # another's
+            continue  # another site's cookie
     return found.value if found is not None else ''

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Starts the bridge on a machine, with the gate before it and the web application beside it.
+Start the bridge on a machine, with its gate and the web application.
 
     ros2 run fogros2 bridge [these options, and the gate's] --ros-args [the bridge's parameters]
 
-``--topic PATTERN``     topics that are shown, all unless given
-``--secrets FOLDER``    where the token and what TLS needs are, or are made
-``--guarded PORT``      lets others than the robot in there, over TLS
-``--image IMAGE``       the web application's, '' for none
+``--topic PATTERN``     topics to show; default: all
+``--secrets FOLDER``    folder of the token and the TLS files, created if missing
+``--guarded PORT``      also open this port to other computers, over TLS
+``--image IMAGE``       image of the web application, '' for none
 
-Where ROS 2's own ``foxglove_bridge`` is installed that runs, otherwise
-:mod:`~fogros2_monitor.bridge`. Either listens on the loopback, at a port and an address of its
-net 127.0.0.0/8 that no page in a browser can guess: it takes no token. The gate has the port that
-viewers know. Gate and application end when this process does, however that ends.
+The bridge is ROS 2's own ``foxglove_bridge`` if it is installed, otherwise
+:mod:`~fogros2_monitor.bridge`. The bridge needs no token, so it listens on a random address and
+port of 127.0.0.0/8 that no web page can guess. Viewers connect to the gate's ports. Gate and
+application end when this process ends, even if it is killed.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from fogros2.monitor_addresses import application_port
 from fogros2_monitor import credentials
 from fogros2_monitor.application import say
 
-#: What the parameter ``topics`` is called by ``foxglove_bridge``, which takes regular expressions.
+#: The parameter ``topics`` of ``foxglove_bridge``, which takes regular expressions.
 _WHITELIST = 'topic_whitelist'
-#: The web application has no data, and no token.
+#: Address of the web application; it is no secret, as the application has no data and no token.
 _LOOPBACK = '127.0.0.1'
 
 
 def foxglove_bridge() -> str:
-    """Return the path of ROS 2's bridge, '' where it isn't installed."""
+    """Return the path of ROS 2's bridge, '' if it is not installed."""
     try:
         path = os.path.join(
             get_package_prefix('foxglove_bridge'), 'lib', 'foxglove_bridge', 'foxglove_bridge')
@@ -52,7 +52,7 @@ def foxglove_bridge() -> str:
 
 def regular_expression(pattern: str) -> str:
     r"""
-    Return a pattern with ``*`` and ``?`` as ECMAScript's regular expressions write it.
+    Convert a pattern with ``*`` and ``?`` to a regular expression of ECMAScript.
 
     >>> regular_expression('/camera/*')
     '/camera/.*'
@@ -65,11 +65,12 @@ def command(
     address: str, port: int, theirs: str, patterns: Sequence[str], ros_arguments: Sequence[str],
 ) -> list[str]:
     """
-    Return the words that run a bridge.
+    Return the command line of the bridge.
 
-    :param address: of the loopback, as for ``port``.
-    :param theirs: the path of ``foxglove_bridge``, '' for our own.
-    :param patterns: of the topics that are shown.
+    :param address: loopback address to listen on, with ``port``.
+    :param theirs: path of ``foxglove_bridge``; '': use our own bridge.
+    :param patterns: patterns of the topics to show.
+    :param ros_arguments: further arguments after ``--ros-args``.
     """
     program = [theirs] if theirs else [sys.executable, '-m', 'fogros2_monitor.bridge']
     name, values = ('topics', list(patterns)) if not theirs else (
@@ -79,7 +80,7 @@ def command(
 
 
 def hidden_place() -> tuple[str, int]:
-    """Return one of 16 million addresses of the loopback's net, and a port that is free there."""
+    """Return a random one of 16 million loopback addresses, and a free port there."""
     address = '.'.join(['127', *(str(1 + secrets.randbelow(254)) for _ in range(3))])
     with socket.create_server((address, 0)) as probe:
         return address, int(probe.getsockname()[1])
@@ -87,10 +88,11 @@ def hidden_place() -> tuple[str, int]:
 
 def guard(port: int, folder: str, name: str) -> list[str]:
     """
-    Return the gate's options for letting others in, none where there can be no certificate.
+    Return the gate's options for other computers; none if the certificate cannot be created.
 
-    :param folder: where it is, or is made.
-    :param name: the machine's.
+    :param port: port to open.
+    :param folder: folder of the certificate.
+    :param name: name of the machine.
     """
     try:
         made = credentials.make(Path(folder), name)
@@ -104,7 +106,7 @@ def guard(port: int, folder: str, name: str) -> list[str]:
 
 
 def main() -> None:
-    """Start what stands beside the bridge, and become it."""
+    """Start gate and application, then replace this process by the bridge."""
     words = sys.argv[1:]
     at = words.index('--ros-args') if '--ros-args' in words else len(words)
     parser = argparse.ArgumentParser(allow_abbrev=False)
@@ -128,7 +130,7 @@ def main() -> None:
         gate += guard(ours.guarded, folder, ours.name)
     address, port = hidden_place()
     end, kept = os.pipe()
-    os.set_inheritable(kept, True)  # by the bridge: when it is closed the others end
+    os.set_inheritable(kept, True)  # the bridge keeps this end open; at its end the others exit
     if ours.image and ours.vpn is not None:
         inside = application_port(ours.vpn)
         gate += ['--application', f'{_LOOPBACK}:{inside}']

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A port of this computer's loopback that leads to one of a machine's, over its Shell."""
+"""Forward a port of this computer's loopback interface to a machine's port, over its Shell."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fogros2.shell import Shell, Stream
 
 #: Bytes in one line of base64.
 _BLOCK = 32768
-#: Any Shell carries lines, so each block goes as one. The first line says that it is connected.
+#: Every Shell can send lines, so each block becomes a line. The first line reports a connection.
 _PROGRAM = """\
 import base64, os, socket, sys, threading
 try:
@@ -40,13 +40,13 @@ while True:
 
 class Tunnel:
     """
-    Takes connections on this computer's loopback and carries them to the machine.
+    Accept connections on this computer's loopback interface, and forward them to a machine.
 
-    :param shell: the machine's; each connection is one program there.
+    :param shell: shell of the machine; each connection runs one program there.
     :param to: host and port, as the machine sees them.
-    :param port: of this computer; 0 for any that is free.
-    :param say: takes what goes wrong with a connection.
-    :raises OSError: the port is taken.
+    :param port: port of this computer; 0: any free port.
+    :param say: callback for errors of a connection.
+    :raises OSError: the port is in use.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Tunnel:
         self.port: int = self._listener.getsockname()[1]
 
     def serve(self) -> None:
-        """Take connections until closed from another thread, or interrupted."""
+        """Accept connections until a signal, or until another thread calls close()."""
         while True:
             try:
                 link, _ = self._listener.accept()
@@ -74,9 +74,9 @@ class Tunnel:
                              daemon=True).start()
 
     def close(self) -> None:
-        """End all connections."""
+        """Close all connections."""
         with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the accept
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes accept()
         self._listener.close()
         with self._lock:
             for link in self._open:
@@ -98,7 +98,7 @@ class Tunnel:
         except FogError as error:
             self._say(str(error))
         except OSError:
-            pass  # the viewer has gone
+            pass  # the viewer disconnected
         finally:
             with self._lock:
                 self._open.discard(link)

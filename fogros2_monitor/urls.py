@@ -1,34 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Addresses that open a bridge in a viewer."""
+"""Build the URLs that open a bridge in a viewer."""
 
 from __future__ import annotations
 
 import urllib.parse
 
-#: Foxglove's application, and Lichtblick's, as their makers host them, and what a browser says in
-#: ``Origin`` for their pages.
+#: URLs of the hosted applications Foxglove and Lichtblick, and the values of ``Origin`` that a
+#: browser sends for their pages.
 FOXGLOVE = 'https://app.foxglove.dev/~/view'
 LICHTBLICK = 'https://lichtblick-suite.github.io/lichtblick/'
 APPLICATIONS = ('https://app.foxglove.dev', 'https://lichtblick-suite.github.io')
 
 def with_token(where: str, token: str, scheme: str = 'ws') -> str:
     """
-    Return the address that opens a bridge.
+    Return the URL of a bridge with its token.
 
     :param where: ``host:port``.
-    :param scheme: 'wss' at the port for others than the robot.
+    :param scheme: 'wss' for the port that is open to other computers.
     """
     return f'{scheme}://{where}/?{urllib.parse.urlencode({"token": token})}'
 
 
 def app(address: str, at: str = FOXGLOVE) -> str:
     """
-    Return a web application's address that opens a bridge.
+    Return the URL that opens a bridge in a hosted web application.
 
-    A page that came over HTTPS may open ``ws://`` on this computer's loopback alone.
+    From a page of HTTPS, a browser opens ``ws://`` only to its own computer's loopback interface.
 
-    :param address: the bridge's.
-    :param at: the application's; Lichtblick takes the same.
+    :param address: URL of the bridge.
+    :param at: URL of the application.
     """
     query = urllib.parse.urlencode({'ds': 'foxglove-websocket', 'ds.url': address})
     return f'{at}?{query}'
@@ -36,9 +36,9 @@ def app(address: str, at: str = FOXGLOVE) -> str:
 
 def served(where: str, token: str) -> str:
     """
-    Return the address at which the gate before a bridge serves the application itself.
+    Return the URL at which the gate itself serves the web application.
 
-    Where the machine has none, a page is there that leads to those above.
+    If the machine has no web application, the gate shows its page with links there.
 
     :param where: ``host:port``.
     """

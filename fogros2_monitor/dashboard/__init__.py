@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A page on this computer's loopback that shows a deployment as it goes on.
+Serve a web page on this computer's loopback interface that shows a deployment live.
 
-:mod:`~fogros2_monitor.dashboard.server` serves it and what it asks for,
-:mod:`~fogros2_monitor.dashboard.graph` runs a node beside a launch that counts messages and takes
-pictures while somebody looks.
+:mod:`~fogros2_monitor.dashboard.server` serves the page and its data.
+:mod:`~fogros2_monitor.dashboard.graph` runs a node in the ROS graph of a launch; the node counts
+messages and takes pictures while somebody watches.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of streamed topics, taken from time to time at as little cost as there is."""
+"""Take pictures of streamed topics at intervals, at a low cost."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from image_transport_h264.codec import CodecError, Decoder, Missing
 from image_transport_h264.message import KEY_REQUEST, picture
 from image_transport_h264.picture import Picture
 
-#: Seconds from one picture of an image topic to the next, the same of what only crosses between
-#: machines, and after which one that doesn't come is asked for anew.
+#: Seconds between two pictures of an image topic (IMAGE) and of a stream between machines
+#: (STREAM), and seconds without a picture after which the camera subscribes again (PATIENCE).
 IMAGE, STREAM, PATIENCE = 1.0, 5.0, 5.0
-#: What a look may come early by, and seconds from one request for a packet to the next.
+#: Seconds by which a picture may be early, and seconds between two requests for a keyframe.
 SLACK, REQUEST = 0.25, 0.3
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=4,
                   reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
@@ -35,10 +35,11 @@ Tell = Callable[[dict[str, Any]], None]
 
 class Camera:
     """
-    Takes pictures of an image topic: one message each second, as it came.
+    Take pictures of an image topic: one message per second.
 
-    :param tell: gets ``{'picture': name, 'number': n, 'data': base64}``, or with ``note`` why not.
-    :param name: the stream's topic; ``topic`` is the one to look at.
+    :param tell: callback for ``{'picture': name, 'number': n, 'data': base64}``; after an error
+        the dictionary has ``note`` with the reason instead of number and data.
+    :param name: topic of the stream; ``topic`` is the topic to subscribe to.
     """
 
     interval = IMAGE
@@ -52,14 +53,14 @@ class Camera:
 
     def look(self, *, stay: bool = False) -> None:
         """
-        Take one if it is time.
+        Take a picture if the interval is over.
 
-        :param stay: whether to stay subscribed from one to the next.
+        :param stay: whether to stay subscribed between two pictures.
         """
         self._stay = stay
         now = time.monotonic()
         if self._subscription is not None and now - self._asked > PATIENCE:
-            self.close()  # it may be of a publisher that has gone
+            self.close()  # the publisher of this subscription may be gone
         if now - self._asked > self.interval - SLACK:
             if self._subscription is None:
                 self._asked = now
@@ -67,13 +68,13 @@ class Camera:
             self._due = True
 
     def close(self) -> None:
-        """Stop waiting for one."""
+        """Unsubscribe."""
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
     def end(self) -> None:
-        """Give up."""
+        """Destroy everything that the camera created."""
         self.close()
 
     def _subscribe(self) -> Subscription:
@@ -106,9 +107,9 @@ class Camera:
 
 class StreamCamera(Camera):
     """
-    Takes pictures of a stream that nobody decodes here, of packets that need no other.
+    Take pictures of a stream that no node on the robot decodes.
 
-    Every five seconds it asks for such a packet, so that it need not follow the stream.
+    Every five seconds the camera requests a keyframe, so it need not follow the stream.
     """
 
     interval = STREAM
@@ -120,7 +121,7 @@ class StreamCamera(Camera):
         self._decoder = Decoder()
 
     def end(self) -> None:
-        """Give up."""
+        """Destroy everything that the camera created."""
         super().end()
         self._node.destroy_publisher(self._requests)
 

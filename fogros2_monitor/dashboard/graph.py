@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The program that joins a launch for the dashboard, while somebody looks.
+Join a launch for the dashboard, while somebody watches.
 
-It takes lines of JSON, ``{"machines": {name: [nodes]}, "pictures": true}``, on its standard input
-and ends with it. It prints lines of JSON: ``{"streams": [...], "topics": [...]}`` and, with each
-new picture, ``{"picture": topic, "number": n, "data": base64}``.
+The program reads lines of JSON, ``{"machines": {name: [nodes]}, "pictures": true}``, from standard
+input, and exits at its end. It prints lines of JSON: ``{"streams": [...], "topics": [...]}``, and
+for each new picture ``{"picture": topic, "number": n, "data": base64}``.
 
-A picture is taken from the image topic on the robot, where a streamed topic keeps its own name:
-that costs no decoding, and nothing crosses the VPN for it. It is one message a second: the
-subscription is made for it and goes with it. Where nobody else looks at what a decoder publishes
-here, we are a viewer as any other, and stay subscribed, as a stream that begins anew each second
-would be a poor one. Of a stream between two machines it is a packet every five seconds. Of what
-crosses, small topics are listened to all
-the time and large ones for a second in ten; nothing that nobody else listens to is listened to,
-as that would wake its encoder.
+Pictures come from the image topic on the robot, where a streamed topic keeps its name. They need
+no decoding and no traffic over the VPN. The program takes one message per second, and subscribes
+only for that message. If a decoder publishes the topic and no other node subscribes, the program
+stays subscribed, because a stream that restarts every second looks poor. Of a stream between two
+machines, the program takes a packet every five seconds.
+
+The program measures the rates of topics that cross the VPN. It subscribes to small topics all the
+time, and to topics with much traffic for one second in ten. It never subscribes to a stream that
+has no other subscriber, because that would start the encoder.
 """
 
 from __future__ import annotations
@@ -49,18 +50,18 @@ from fogros2_monitor.definitions import message_class
 if TYPE_CHECKING:
     from fogros2_monitor.dashboard.cameras import Camera
 
-#: Seconds between two looks at the graph.
+#: Poll interval of the graph in seconds.
 LOOK = 0.5
-#: Topics that are listened to at the most.
+#: Maximum number of topics with a measured rate.
 MOST = 64
-#: Hears every publisher, and keeps none of them waiting.
+#: Compatible with every publisher; best effort, so that no publisher waits for this node.
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=32,
                   reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 _IMAGE, _PACKET = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 
 
 class _Ear:
-    """Listens to a topic as its meter wants."""
+    """Subscribe to a topic when its meter asks for it."""
 
     def __init__(self, node: Node, topic: str, kind: str) -> None:
         self.meter = Meter(time.monotonic())
@@ -69,7 +70,7 @@ class _Ear:
         self._subscription: Optional[Subscription] = None
 
     def look(self, *, wanted: bool) -> None:
-        """Subscribe, or end it."""
+        """Subscribe or unsubscribe."""
         wanted = self.meter.wants(time.monotonic()) and wanted
         if wanted and self._subscription is None:
             self._subscription = self._node.create_subscription(
@@ -83,7 +84,7 @@ class _Ear:
 
 
 class GraphNode(Node):
-    """Looks at the graph, listens, and tells."""
+    """Observe the graph, measure rates, take pictures, and print the results."""
 
     def __init__(self) -> None:
         super().__init__(OWN, enable_rosout=False, start_parameter_services=False)
@@ -94,12 +95,12 @@ class GraphNode(Node):
         self.create_timer(LOOK, self._look)
 
     def know(self, machines: dict[str, list[str]], *, pictures: bool) -> None:
-        """Take what runs where, and whether pictures are wanted; from any thread."""
+        """Set the nodes of each machine, and whether to take pictures; from any thread."""
         self._hosts = Hosts(machines)
         self._pictures = pictures
 
     def tell(self, what: dict[str, Any]) -> None:
-        """Print a line; a reader that is gone has closed the standard input, too."""
+        """Print a line; ignore a reader that is gone, as it closes standard input too."""
         with contextlib.suppress(BrokenPipeError):
             sys.stdout.write(json.dumps(what) + '\n')
             sys.stdout.flush()
@@ -134,17 +135,17 @@ class GraphNode(Node):
             try:
                 self._ears[name] = _Ear(self, name, kind)
             except LookupError:
-                self._ears[name] = None  # of a type that isn't installed here
+                self._ears[name] = None  # the message type is not installed here
         ear = self._ears.get(name)
         if ear is not None:
             ear.look(wanted=heard)
 
     def _take_pictures(self, topics: list[Topic], streamed: list[Stream]) -> None:
-        """Have a camera for each stream that has pictures, and let those that are due work."""
+        """Keep a camera for each stream with images, and let each one take a due picture."""
         try:
             from fogros2_monitor.dashboard.cameras import Camera, StreamCamera
         except ModuleNotFoundError:
-            return  # all streams are between machines: the robot needn't have what images take
+            return  # all streams are between machines, so the robot may lack the image libraries
         by_name = {topic.name: topic for topic in topics}
         wanted: dict[str, tuple[type[Camera], str, bool]] = {}
         for one in streamed:
@@ -190,8 +191,8 @@ def _take_lines(node: GraphNode, ended: functools.partial[None]) -> None:
 
 
 def main() -> None:
-    """Run until the standard input ends."""
-    os.nice(5)  # watching must not take the processor from the nodes
+    """Run until standard input ends."""
+    os.nice(5)  # the nodes of the launch have priority
     rclpy.init(args=[])
     node = GraphNode()
     threading.Thread(target=_take_lines, args=(

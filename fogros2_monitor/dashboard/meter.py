@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages and bytes per second of a topic, and when to listen to it; pure but for the clock."""
+"""Measure messages and bytes per second of a topic, and decide when to subscribe; pure."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import Optional
 
-#: Seconds over which a rate is taken.
+#: Window of a rate in seconds.
 WINDOW = 5.0
-#: Bytes per second from which on a topic is listened to for ``TASTE`` seconds in each ``ROUND``:
-#: one that comes from a machine crosses the VPN once more for us.
+#: Above LARGE bytes per second, the meter subscribes for TASTE seconds in each ROUND seconds,
+#: because a topic of a machine crosses the VPN once more for the meter.
 LARGE, TASTE, ROUND = 20_000.0, 1.0, 10.0
 
 
 class Meter:
     """
-    One topic's rates; times are those of one clock, in seconds.
+    The rates of one topic; all times are seconds of one clock.
 
-    :param now: from when on it is listened to.
+    :param now: time of the subscription.
     """
 
     def __init__(self, now: float) -> None:
@@ -26,15 +26,15 @@ class Meter:
         self._listening = True
         self._rate: Optional[float] = None
         self._bandwidth: Optional[float] = None
-        #: Whether the rate was measured for a part of the time only.
+        #: Whether the rate was measured only part of the time.
         self.sampled = False
 
     def heard(self, now: float, size: int) -> None:
-        """Note a message of so many bytes."""
+        """Record a message of ``size`` bytes."""
         self._came.append((now, size))
 
     def wants(self, now: float) -> bool:
-        """Return whether to listen now; to be asked a few times a second."""
+        """Return whether to subscribe now; call this a few times per second."""
         seconds = now - self._since
         if self._listening:
             self._measure(now, seconds)
@@ -50,7 +50,7 @@ class Meter:
             self._came.popleft()
         span = min(seconds, WINDOW)
         if span < TASTE:
-            return  # a message more or less would make too much of a difference
+            return  # too short: one message would change the rate too much
         self._rate = len(self._came) / span
         self._bandwidth = sum(size for _, size in self._came) / span
         if self._bandwidth <= LARGE:

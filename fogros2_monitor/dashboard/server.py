@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Serves the page and its data on the loopback, to clients that have the token.
+Serve the page and its data on the loopback interface, to clients that have the token.
 
-The token stands in the fragment of the page's address, which no browser sends: the page puts it
-into a header of each request, which no other site's page can. ``Host`` has to be the loopback's
-(a name that somebody has lead there is another site), and ``Origin``, where a browser says it, the
-page's own. A browser that we start gets a ticket instead, which is exchanged for the token once:
-other users of this computer see its command line.
+The token is in the fragment of the page's URL, which browsers never send. The page puts the token
+into a header of each request; pages of other sites cannot do that. ``Host`` must be a name of the
+loopback interface, because an attacker can point another name to it. ``Origin``, if the browser
+sends it, must be the page's own. The URL of a started browser has a ticket instead, which the page
+exchanges for the token once, because other users of this computer can read the command line.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from fogros2.errors import FogError
 
 #: The header with the token.
 HEADER = 'X-Fogros2-Token'
-#: Seconds that a question for news may wait, that a client may say nothing, and bytes of a wish.
+#: Seconds to wait for a new state, idle time-out of a client in seconds, largest request in bytes.
 PATIENCE, SILENCE, MOST = 15.0, 60.0, 10_000
-#: Seconds for which a ticket can be exchanged, and what it begins with.
+#: Seconds for which a ticket is valid, and the prefix of a ticket.
 VALID, TICKET = 60.0, 'ticket-'
 _REFUSAL = ('the token is missing or wrong: open the address that `ros2 fog dashboard` has '
             'printed')
@@ -40,10 +40,10 @@ PAGE = Path(__file__).with_name('page.html')
 
 
 class Source(Protocol):
-    """What is shown."""
+    """The data of the dashboard."""
 
     def state(self, after: int, timeout: float) -> dict[str, Any]:
-        """Return the state as JSON values, once its version is above ``after``."""
+        """Return the state as JSON values; wait for a version above ``after``."""
 
     def log(self, machine: str, after: int) -> list[dict[str, Any]]:
         """Return a machine's log lines with numbers above ``after``."""
@@ -53,18 +53,18 @@ class Source(Protocol):
 
     def delete(self, machine: str, force: bool) -> None:
         """
-        Begin to end a machine.
+        Start to delete a machine.
 
-        :raises FogError: it can't be.
+        :raises FogError: the machine cannot be deleted.
         """
 
 
 class Dashboard:
     """
-    The server; it answers from the moment it is made.
+    The HTTP server; it listens as soon as it is constructed.
 
-    :param port: of the loopback; 0 for any that is free.
-    :raises OSError: the port is taken.
+    :param port: port on the loopback interface; 0: any free port.
+    :raises OSError: the port is in use.
     """
 
     def __init__(self, source: Source, *, port: int = 0) -> None:
@@ -80,29 +80,29 @@ class Dashboard:
 
     @property
     def url(self) -> str:
-        """Address for a browser; everyone who knows it may look and delete."""
+        """The URL for a browser; everyone who knows it can read the page and delete machines."""
         return f'http://{self.hosts[0]}/#{self.token}'
 
     def url_with_ticket(self) -> str:
-        """Return an address that lets in once, within a minute."""
+        """Return a URL that admits a browser once, within a minute."""
         ticket = TICKET + secrets.token_urlsafe(24)
         with self._lock:
             self._tickets[ticket] = time.monotonic() + VALID
         return f'http://{self.hosts[0]}/#{ticket}'
 
     def exchange(self, ticket: str) -> Optional[str]:
-        """Return the token for a ticket, None for one that has been used, or is too old."""
+        """Return the token for a ticket, None for a used, unknown or expired one."""
         with self._lock:
             valid = self._tickets.pop(ticket, 0.0)
         return self.token if time.monotonic() < valid else None
 
     def serve(self) -> None:
-        """Answer until closed from another thread, or interrupted."""
-        # a port of its own would have to be looked at for the end twice a second
+        """Answer requests until a signal, or until another thread calls close()."""
+        # close() does not use shutdown(), so the server need not poll for it.
         self._server.serve_forever(poll_interval=3600.0)
 
     def close(self) -> None:
-        """Take no more requests."""
+        """Close the listening socket."""
         self._server.server_close()
 
 
@@ -115,14 +115,14 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Leave out what a browser that goes away causes."""
+        """Ignore errors of clients that disconnect."""
         import sys
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
 
 class _Refused(Exception):
-    """A request that isn't answered: status and why."""
+    """A refused request: HTTP status and reason."""
 
     def __init__(self, status: HTTPStatus, why: str) -> None:
         super().__init__(why)
@@ -140,14 +140,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: a terminal that serves a page shows its address."""
+        """Log nothing: the terminal shows the URL of the page."""
 
     def do_GET(self) -> None:
-        """Answer a question."""
+        """Answer a GET request."""
         self._answer(self._get)
 
     def do_POST(self) -> None:
-        """Fulfil a wish."""
+        """Answer a POST request."""
         self._answer(self._post)
 
     def _answer(self, do: Any) -> None:
@@ -161,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
             do(path, dict(urllib.parse.parse_qsl(query)))
         except _Refused as error:
-            self.close_connection = True  # what it sent may not have been read
+            self.close_connection = True  # the body may not have been read
             self._json({'error': str(error)}, error.status)
         except FogError as error:
             self._json({'error': str(error.args[0]), 'hint': error.hint}, HTTPStatus.CONFLICT)
@@ -200,7 +200,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.NOT_FOUND, 'there is nothing of that name')
 
     def _wish(self, key: str) -> dict[str, Any]:
-        """Return the JSON object that came, with a text for ``key``."""
+        """Return the JSON object of the request, which must have a text for ``key``."""
         length = self.headers.get('Content-Length', '')
         if not length.isdigit() or int(length) > MOST:
             raise _Refused(HTTPStatus.BAD_REQUEST, 'a wish has a length, and a small one')
@@ -236,10 +236,10 @@ def check_host(
     host: Optional[str], origin: Optional[str], site: Optional[str], hosts: tuple[str, ...],
 ) -> None:
     """
-    Hold a request against where it should come from.
+    Check that a request comes from the page itself; raise _Refused otherwise.
 
-    :param host: its ``Host``, with ``Origin`` and ``Sec-Fetch-Site`` where it has them.
-    :param hosts: the server's own names, with their port.
+    :param host: header ``Host``; ``origin`` is ``Origin``, ``site`` is ``Sec-Fetch-Site``.
+    :param hosts: the server's own names with port.
     """
     if host not in hosts:
         raise _Refused(HTTPStatus.MISDIRECTED_REQUEST, 'this page is for the loopback alone')
@@ -250,7 +250,7 @@ def check_host(
 
 
 def content_policy(page: str) -> str:
-    """Return a Content-Security-Policy that runs the page's own script and style and no other."""
+    """Return a Content-Security-Policy that allows only the page's own script and style."""
     def sources(tag: str) -> str:
         return ' '.join(
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

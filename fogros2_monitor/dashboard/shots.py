@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images as small JPEGs for a page; depth and other deep ones in colours."""
+"""Convert images to small JPEGs for the page; depth images get colours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from image_transport_h264.picture import BadPicture, Layout, Picture
 
-#: Widest picture, in pixels, and JPEG's quality.
+#: Largest width of a picture in pixels, and JPEG quality.
 WIDTH, QUALITY = 640, 80
 _TO_BGR = {'rgb24': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGR, 'bgra': cv2.COLOR_BGRA2BGR,
            'uyvy422': cv2.COLOR_YUV2BGR_UYVY, 'yuyv422': cv2.COLOR_YUV2BGR_YUY2}
@@ -21,9 +21,9 @@ Pixels = NDArray[Any]
 
 def jpeg(picture: Picture) -> bytes:
     """
-    Return a picture as JPEG, at most ``WIDTH`` wide.
+    Return a picture as JPEG, at most ``WIDTH`` pixels wide.
 
-    :raises BadPicture: its fields contradict each other, or its encoding isn't known.
+    :raises BadPicture: the picture's fields contradict each other, or its encoding is unknown.
     """
     picture.check()
     layout = picture.layout
@@ -58,12 +58,12 @@ def _values(picture: Picture, layout: Layout, rows: Pixels) -> Pixels:
     order = '>' if picture.is_bigendian else '<'
     kind = {'32FC1': 'f4', '16SC1': 'i2'}.get(picture.encoding, 'u2')
     values = rows.view(f'{order}{kind}').astype(numpy.float32)
-    # neither nothing nor infinity is a distance
+    # Zero and infinity mark pixels without a distance.
     return numpy.where(numpy.isfinite(values) & (values != 0), values, numpy.nan)
 
 
 def _coloured(values: Pixels) -> Pixels:
-    """Return values in colours from near to far, black where there are none."""
+    """Map values to colours from near to far; pixels without a value are black."""
     known = numpy.isfinite(values)
     near, far = numpy.percentile(values[known], (2, 98)) if known.any() else (0.0, 1.0)
     scaled = numpy.clip((values - near) / max(far - near, 1e-6), 0, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics cross the VPN, by the names of the nodes at their ends; pure."""
+"""Decide which topics cross the VPN, by the names of their nodes; pure."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typing import Optional
 
 from fogros2.image_transport.topics import identifier
 
-#: Names as :func:`fogros2.image_transport.topics.names_of` makes them.
+#: Node names of :func:`fogros2.image_transport.topics.names_of`.
 _ENCODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_encoder(?:_on_(?P<host>\w+))?')
 _DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
                       r'(?:_from_(?P<source>\w+?))?(?:_on_(?P<host>\w+))?')
-#: What every node has, and what belongs to a stream.
+#: Topics that every node has, and auxiliary topics of a stream.
 _HIDDEN = re.compile(r'/rosout|/parameter_events|.*/_.*|_.*')
 _OF_STREAM = ('keyframe', 'feedback', 'pieces', 'camera_info')
-#: Types that are too large to listen to for a rate: if a node is elsewhere than its name says,
-#: such a topic may never have left its machine.
+#: Types that are too large for a measurement of the rate: if a node is not where its name says,
+#: such a topic might cross the VPN only because of the measurement.
 _LARGE = frozenset({'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2',
                     'sensor_msgs/msg/PointCloud', 'nav_msgs/msg/OccupancyGrid'})
-#: Name of the node that looks, which is none of the launch's.
+#: Name of the dashboard's own node.
 OWN = '_fogros2_dashboard'
 
 
 @dataclasses.dataclass(frozen=True)
 class Topic:
-    """A topic of the graph: its type, and the names of the nodes at its ends."""
+    """A topic of the graph: its type, and the names of its publishers and subscribers."""
 
     name: str
     kind: str
@@ -40,10 +40,10 @@ class Stream:
     """
     A streamed topic.
 
-    :param topic: as launch files have it.
-    :param between: the topic that crosses.
-    :param source: the machine it comes from, '' for the robot; ``target`` the one it goes to.
-    :param heard: whether anybody subscribes to what crosses.
+    :param topic: name in the launch file.
+    :param between: the encoded topic, which crosses the VPN.
+    :param source: sending machine, '' for the robot; ``target`` is the receiving one.
+    :param heard: whether the encoded topic has a subscriber.
     """
 
     topic: str
@@ -57,7 +57,7 @@ class Stream:
 
 @dataclasses.dataclass(frozen=True)
 class Crossing:
-    """A topic with ends on several hosts, '' for the robot."""
+    """A topic with nodes on several hosts; '' is the robot."""
 
     topic: str
     kind: str
@@ -66,15 +66,15 @@ class Crossing:
 
     @property
     def large(self) -> bool:
-        """Whether it isn't listened to for a rate."""
+        """Whether the topic is too large to measure its rate."""
         return self.kind in _LARGE
 
 
 class Hosts:
     """
-    Which host a node is on.
+    The hosts of nodes.
 
-    :param machines: by name, the names of the nodes that run there.
+    :param machines: node names by machine name.
     """
 
     def __init__(self, machines: Mapping[str, Iterable[str]]) -> None:
@@ -82,11 +82,11 @@ class Hosts:
         self._named = {identifier(name): name for name in machines}
 
     def machine(self, identified: Optional[str]) -> str:
-        """Return the machine of which a node's name has so much."""
+        """Return the machine whose identifier is part of a node's name."""
         return self._named.get(identified, identified) if identified else ''
 
     def of(self, node: str) -> str:
-        """Return a node's host; one of which nobody knows is the robot's."""
+        """Return the host of a node; unknown nodes are on the robot."""
         for pattern in (_ENCODER, _DECODER):
             if match := pattern.fullmatch(node):
                 return self.machine(match['host'])
@@ -123,10 +123,10 @@ def streams(topics: Iterable[Topic], nodes: Iterable[str], hosts: Hosts) -> list
 def crossing(
     topics: Iterable[Topic], hosts: Hosts, streamed: Iterable[Stream],
 ) -> list[Crossing]:
-    """Return the other topics that have a publisher on one host and a subscriber on another."""
+    """Return the topics, except streams, with a publisher and a subscriber on different hosts."""
     streamed = list(streamed)
     between = {one.between for one in streamed}
-    # what nodes on a machine have in place of a streamed topic stays there
+    # The local replacements of a streamed topic stay on their machine.
     local = tuple(f'/fogros2/{identifier(host)}/' for one in streamed
                   for host in (one.source, one.target) if host)
     found = []
@@ -144,5 +144,5 @@ def crossing(
 
 
 def decoded(topic: Topic) -> bool:
-    """Return whether a topic is what a stream's decoder makes of it, and nobody else's."""
+    """Return whether all publishers of a topic are decoders of streams."""
     return bool(topic.publishers) and all(map(_DECODER.fullmatch, topic.publishers))
