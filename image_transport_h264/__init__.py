@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image topics as H.264: ``codec`` without ROS, and the nodes ``encoder`` and ``decoder``."""
+"""Transport images as H.264: ``codec`` without ROS, and the nodes ``encoder`` and ``decoder``."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-H.264 byte streams, and the unit in them that carries what a ROS image has and H.264 has not.
+Parse H.264 byte streams, and insert a SEI unit with the fields of a ROS image that H.264 lacks.
 
 Annex B of ITU-T H.264 puts start codes between NAL units. A SEI message "user data unregistered"
-(D.1.6, payload type 5) belongs to the owner of its UUID; every decoder skips those it doesn't
-know, so a stream with ours in it is a plain stream to all others.
+(D.1.6, payload type 5) belongs to the owner of its UUID. Decoders skip unknown ones, so the
+stream is an ordinary H.264 stream for every other decoder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import zlib
 
 START_CODE = b'\x00\x00\x00\x01'
 SLICE, IDR, SEI, SPS, PPS, DELIMITER = 1, 5, 6, 7, 8, 9
-#: Name of our user data, made once at random.
+#: UUID of our user data, created once at random.
 UUID = bytes.fromhex('5f0b6e0c8d3a4e6fb1c27a94d0e35812')
 VERSION = 1
 
@@ -30,15 +30,15 @@ _KEY, _BIG_ENDIAN, _ALPHA_PLANE, _ALPHA_LEVEL = 1, 2, 4, 8
 @dataclasses.dataclass(frozen=True)
 class Tag:
     """
-    What travels beside the coded picture.
+    Metadata of a packet, beside the coded picture.
 
-    :param stream: chosen at random by each encoder, so that a restarted one is recognised.
-    :param sequence: counts the packets of a stream from 0; a packet that isn't a key needs the
-        one before it.
-    :param key: whether decoding can begin here.
+    :param stream: random number of the encoder, to recognise a restarted encoder.
+    :param sequence: number of the packet in the stream, from 0. A packet that is no keyframe
+        needs the previous packet.
+    :param key: whether decoding can start with this packet.
     :param checksum: CRC-32 of the packet without the tag.
-    :param alpha_level: the opacity of all pixels, if it is the same.
-    :param alpha_plane: else the opacities, row by row, compressed by zlib.
+    :param alpha_level: the opacity, if all pixels have the same one.
+    :param alpha_plane: otherwise the opacities, row by row, compressed by zlib.
     """
 
     stream: int
@@ -54,7 +54,7 @@ class Tag:
     alpha_plane: bytes = b''
 
     def pack(self) -> bytes:
-        """Return the tag as bytes."""
+        """Serialise the tag."""
         flags = (self.key * _KEY | self.is_bigendian * _BIG_ENDIAN
                  | bool(self.alpha_plane) * _ALPHA_PLANE
                  | (self.alpha_level is not None) * _ALPHA_LEVEL)
@@ -68,7 +68,7 @@ class Tag:
 
     @classmethod
     def unpack(cls, data: bytes) -> Optional[Tag]:
-        """Return the tag, or None where the bytes aren't a whole one."""
+        """Parse a tag; return None if the bytes are no complete tag."""
         end = len(data) - 4
         if end < _HEADER.size or data[0] != VERSION:
             return None
@@ -90,7 +90,7 @@ class Tag:
 
 
 def insert(tag: Tag, packet: bytes) -> bytes:
-    """Return the packet with the tag in front, behind an access unit delimiter if it has one."""
+    """Return the packet with the tag at its start, or after an access unit delimiter."""
     sealed = dataclasses.replace(tag, checksum=zlib.crc32(packet))
     unit = START_CODE + _sei(UUID + sealed.pack())
     at = 0
@@ -102,11 +102,11 @@ def insert(tag: Tag, packet: bytes) -> bytes:
 
 def extract(packet: bytes) -> tuple[Optional[Tag], bytes]:
     """
-    Return the packet's tag and the packet without it.
+    Return the packet's tag, and the packet without the tag.
 
-    Without a tag of ours, whole and undamaged, the packet comes back as it is.
+    If there is no undamaged tag of ours, return None and the unchanged packet.
     """
-    # ours stands before the picture's slices: nothing behind the first one has to be looked at
+    # Our tag is before the slices of the picture, so the search ends at the first slice.
     for begin, end in units(packet):
         kind = packet[begin] & 31
         if kind in (SLICE, IDR):
@@ -126,13 +126,13 @@ def extract(packet: bytes) -> tuple[Optional[Tag], bytes]:
 
 
 def units(packet: bytes) -> Iterator[tuple[int, int]]:
-    """Yield where each NAL unit begins (behind its start code) and ends."""
+    """Yield the begin (after the start code) and the end of each NAL unit."""
     at = packet.find(b'\x00\x00\x01')
     while at >= 0:
         begin = at + 3
         at = packet.find(b'\x00\x00\x01', begin)
         end = len(packet) if at < 0 else at
-        # zeros before a start code belong to it
+        # Zeros before a start code belong to the start code.
         while end > begin and packet[end - 1] == 0:
             end -= 1
         if end > begin:
@@ -145,7 +145,7 @@ def kinds(packet: bytes) -> list[int]:
 
 
 def _sei(payload: bytes) -> bytes:
-    """Return a SEI unit with one message of type 5, emulation prevention included."""
+    """Return a SEI unit with one message of type 5, with emulation prevention."""
     size = len(payload)
     message = bytes([5]) + b'\xff' * (size // 255) + bytes([size % 255]) + payload
     return bytes([SEI]) + re.sub(
@@ -153,7 +153,7 @@ def _sei(payload: bytes) -> bytes:
 
 
 def _sei_payload(unit: bytes) -> Optional[bytes]:
-    """Return the payload of a SEI unit's first message if it is of type 5."""
+    """Return the payload of a SEI unit's first message if the message has type 5."""
     data = unit[1:].replace(b'\x00\x00\x03', b'\x00\x00')
     if not data or data[0] != 5:
         return None

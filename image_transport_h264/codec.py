@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pictures to H.264 and back without delay: one picture in, one packet out; no ROS in it.
+Encode pictures as H.264 and decode them without delay: one packet per picture; without ROS.
 
-A packet is one access unit in Annex B form, SPS and PPS with each IDR, no B-frames, and a SEI
-unit with a Tag. Deep pictures (16 bit, float) go through FFV1 instead, lossless always.
+A packet is one access unit in Annex B form. It has SPS and PPS with each IDR, no B-frames, and a
+SEI unit with a Tag. Deep pictures (16 bit, float) are coded by FFV1 instead, always lossless.
 """
 
 from __future__ import annotations
@@ -46,41 +46,41 @@ __all__ = [
 ]
 
 SOFTWARE = 'libx264'
-#: Asked in this order; VAAPI is left out: it takes frames that live on the device.
+#: Order of preference. VAAPI is missing, because it takes frames in the memory of the device.
 HARDWARE = ('h264_nvenc', 'h264_qsv', 'h264_amf', 'h264_v4l2m2m')
-#: Seconds of the allowed bitrate that one picture may take: what bounds a key's time on the wire.
+#: Seconds of the allowed bitrate that one picture may use; limits a keyframe's time on the wire.
 BUFFER_SECONDS = 0.05
 CLOCK = 90000
-#: Pixels from which on speed counts for more than size: libx264's quickest preset, but with motion
-#: to half a pixel, and no filter before chroma is halved. Of 1080p that is 12 kB in 11 ms, where
-#: ultrafast alone makes 20 kB in 9 ms (8 kB are 6 ms at 10 Mbit/s), superfast 11 kB in 14 ms.
+#: Pixels from which speed matters more than size: libx264's preset ultrafast, with half-pixel
+#: motion, and no filter before chroma is halved. A 1080p picture is then 12 kB in 11 ms;
+#: plain ultrafast makes 20 kB in 9 ms, superfast 11 kB in 14 ms (8 kB take 6 ms at 10 Mbit/s).
 LARGE = 1500 * 1000
-#: Pixels from which on a picture is worth dividing among cores.
+#: Pixels from which several cores share a picture.
 MANY_PIXELS = 1000 * 700
 
 
 class Damaged(CodecError):
-    """A packet that isn't what was sent; decoding goes on at the next key."""
+    """A packet was damaged on its way; decoding continues with the next keyframe."""
 
 
 class Missing(CodecError):
-    """A packet that needs one which never came; decoding goes on at the next key."""
+    """A packet needs a lost packet; decoding continues with the next keyframe."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """
-    How to encode.
+    Settings of an encoder.
 
-    :param bitrate: the most that the stream takes, bits per second.
-    :param quality: libx264's constant rate factor, 0 to 51, less is better; kept as long as
-        ``bitrate`` allows.
-    :param preset: libx264's: ultrafast, superfast, ...; slower makes less of the same quality.
-        'auto' is superfast, and something quicker where the processor would be the limit.
-    :param gop: most pictures from a key to the next.
-    :param rate: pictures per second to expect, for the rate control's first guess.
+    :param bitrate: maximum bits per second.
+    :param quality: libx264's constant rate factor, 0 to 51, lower is better; applies while
+        ``bitrate`` allows it.
+    :param preset: libx264's preset: ultrafast, superfast, ...; slower presets make smaller
+        packets of the same quality. 'auto': superfast, and a faster one for large pictures.
+    :param gop: maximum distance of two keyframes, in pictures.
+    :param rate: expected pictures per second, for the first guess of the rate control.
     :param encoder: 'auto' (a hardware encoder that works here, else libx264), or FFmpeg's name.
-    :param lossless: give back the identical pixels, at whatever size.
+    :param lossless: preserve all pixels exactly, at any size.
     """
 
     bitrate: int = 8_000_000
@@ -117,7 +117,8 @@ class Packet:
     One coded picture.
 
     :param format: 'h264' or 'ffv1'.
-    :param data: Annex B, or FFV1's own form (see ``deep``).
+    :param data: Annex B form, or the form of FFV1 packets (see ``deep``).
+    :param tag: metadata, also part of ``data``.
     """
 
     format: str
@@ -126,12 +127,12 @@ class Packet:
 
     @property
     def key(self) -> bool:
-        """Whether decoding can begin here."""
+        """Whether decoding can start with this packet."""
         return self.tag.key
 
 
 class Encoder:
-    """Encodes pictures of one topic; size and encoding may change from one to the next."""
+    """Encode pictures of one topic; size and encoding may change between pictures."""
 
     def __init__(self, settings: Optional[Settings] = None) -> None:
         self._settings = settings or Settings()
@@ -145,7 +146,7 @@ class Encoder:
 
     @property
     def settings(self) -> Settings:
-        """What it encodes with; a change takes effect with the next picture, which is a key."""
+        """The settings; a change takes effect with the next picture, as a keyframe."""
         return self._settings
 
     @settings.setter
@@ -156,12 +157,12 @@ class Encoder:
         self, picture: Picture, *, key: bool = False, seconds: Optional[float] = None,
     ) -> Packet:
         """
-        Return the picture's packet.
+        Encode a picture.
 
-        :param key: make it one at which decoding can begin.
-        :param seconds: when the picture was taken, on any clock that runs forward; now without.
-        :raises BadPicture: its fields contradict each other, or its encoding isn't known.
-        :raises CodecError: the encoder refused it.
+        :param key: make the picture a keyframe.
+        :param seconds: time of the picture on any clock that runs forward; None: now.
+        :raises BadPicture: the picture's fields contradict each other, or its encoding is unknown.
+        :raises CodecError: the encoder failed.
         """
         picture.check()
         layout = picture.layout
@@ -172,7 +173,7 @@ class Encoder:
         if layout.kind == 'deep':
             data = self._deep.encode(picture, tag)
             tag = dataclasses.replace(tag, key=True)
-            self._opened = None  # the next H.264 picture can't refer across this one
+            self._opened = None  # the next H.264 picture cannot refer to the one before this one
         else:
             data, is_key = self._encode(picture, layout, key, seconds)
             tag = dataclasses.replace(tag, key=is_key)
@@ -209,11 +210,11 @@ class Encoder:
 
 class Decoder:
     """
-    Decodes packets of one topic, in the order of their coming.
+    Decode packets of one topic, in the order of their arrival.
 
-    :param show_damage: decode across losses and damage, which shows as smears, instead of
-        waiting for the next key.
-    :param encoding: of pictures whose packets have no tag, from an encoder that isn't ours.
+    :param show_damage: continue after losses and damage, with smears in the pictures, instead of
+        waiting for the next keyframe.
+    :param encoding: encoding of pictures whose packets have no tag, from other encoders.
     """
 
     def __init__(self, *, show_damage: bool = False, encoding: str = 'bgr8') -> None:
@@ -226,15 +227,15 @@ class Decoder:
 
     @property
     def needs_key(self) -> bool:
-        """Whether nothing more can be decoded before a key."""
+        """Whether decoding needs a keyframe first."""
         return self._needs_key
 
     def decode(self, data: Buffer) -> Optional[Picture]:
         """
-        Return the packet's picture, None for one that was decoded before or came too late.
+        Decode a packet; return None for a packet that was decoded before or came too late.
 
-        :raises Missing: the packet needs one that never came.
-        :raises Damaged: the packet isn't what was sent.
+        :raises Missing: the packet needs a lost packet.
+        :raises Damaged: the packet was damaged on its way.
         """
         packet = bytes(data)
         try:
@@ -271,7 +272,7 @@ class Decoder:
             self._check_order(tag)
         if key and (self._needs_key or self._codec is None
                     or (tag is not None and not _same_picture(tag, self._last))):
-            self._codec = None  # nothing of an older stream, and no frame of another size
+            self._codec = None  # a new codec: no reference to an older stream or another size
         if self._codec is None:
             self._codec = _decoder(self.show_damage)
         try:
@@ -288,13 +289,13 @@ class Decoder:
 
     def _check_order(self, tag: Optional[Tag]) -> None:
         """
-        Hold a packet that isn't a key against the last one that was decoded.
+        Check that a packet that is no keyframe follows the last decoded packet.
 
-        :raises Missing: it isn't the next one.
+        :raises Missing: packets are missing before this packet.
         """
         last = self._last
         if tag is None or last is None or self._codec is None:
-            # without tags, a loss shows in the decoder's own complaints alone
+            # Without tags, only errors of the decoder reveal a loss.
             if self._needs_key or self._codec is None or tag is not last:
                 self._needs_key = True
                 raise Missing('waiting for a key', 'waiting')
@@ -310,7 +311,7 @@ class Decoder:
         return (tag.sequence - last.sequence - 1) & 0xffffffff >= 0x80000000
 
     def _picture(self, frame: VideoFrame, tag: Optional[Tag]) -> Picture:
-        """Return the decoded frame in the tag's encoding, cut to its size."""
+        """Convert the decoded frame to the tag's encoding, and crop it to the tag's size."""
         encoding = self.encoding if tag is None else tag.encoding
         layout = LAYOUTS.get(encoding)
         if layout is None or layout.kind == 'deep':
@@ -321,7 +322,7 @@ class Decoder:
         else:
             width, height, step, big = tag.width, tag.height, tag.step, tag.is_bigendian
             row = width * layout.pixel_bytes
-            # what was coded is larger by the pixel that makes it even, at the most
+            # The encoder pads by at most one pixel, to make a side even.
             if not (0 <= frame.width - width <= 1 and 0 <= frame.height - height <= 1
                     and 0 < width <= LARGEST_SIDE and row <= step <= 2 ** 20):
                 self._codec = None
@@ -334,7 +335,7 @@ class Decoder:
 
 
 def peek(data: bytes) -> Optional[Tag]:
-    """Return the tag of a packet of either format, None where there is no whole one."""
+    """Return the tag of a packet in either format, None if it has no complete tag."""
     if data[:len(MAGIC)] != MAGIC:
         return annexb.extract(data)[0]
     try:
@@ -352,16 +353,16 @@ def _same_picture(tag: Tag, last: Optional[Tag]) -> bool:
         last.stream, last.width, last.height, last.encoding)
 
 
-# --- how kinds of pictures are coded ------------------------------------------------------------
+# --- encoder options ----------------------------------------------------------------------------
 
 @dataclasses.dataclass(frozen=True)
 class Coding:
     """
-    A way through FFmpeg.
+    How FFmpeg codes a kind of pictures.
 
     :param codec: FFmpeg's name of the encoder.
-    :param av_format: what it is given.
-    :param full_range: whether the luma uses all of 0 to 255; written into the stream.
+    :param av_format: pixel format of the encoder's input.
+    :param full_range: whether luma uses the range 0 to 255; the stream states it.
     """
 
     codec: str
@@ -370,12 +371,12 @@ class Coding:
 
     @property
     def even(self) -> bool:
-        """Whether sides have to be even: chroma of half the size can't be cut by one pixel."""
+        """Whether sides must be even, because half-size chroma cannot be cropped by one pixel."""
         return self.av_format in ('yuv420p', 'nv12', 'yuv422p')
 
 
 def _coding(layout: Layout, settings: Settings) -> Coding:
-    # YUV from a camera keeps the range it came with; what that is, the message doesn't say
+    # YUV of a camera keeps its range, which the message does not state.
     full = layout.kind != 'yuv422'
     if settings.lossless:
         codec, av_format = {
@@ -394,7 +395,7 @@ def _open(coding: Coding, width: int, height: int, settings: Settings) -> VideoC
     """
     Open FFmpeg's encoder.
 
-    :raises CodecError: it can't be opened.
+    :raises CodecError: the encoder cannot be opened.
     """
     try:
         codec = CodecContext.create(coding.codec, 'w')
@@ -410,7 +411,7 @@ def _open(coding: Coding, width: int, height: int, settings: Settings) -> VideoC
             codec.colorspace = int(Colorspace.ITU601)
             if coding.full_range:
                 codec.color_range = int(ColorRange.JPEG)
-        # slices decode on two cores as well, and cost a little size: only where it pays
+        # Slices let several cores decode too, but make packets larger: only for large pictures.
         codec.thread_type = 'SLICE'
         codec.thread_count = min(4, os.cpu_count() or 1) if width * height >= MANY_PIXELS else 1
         codec.options = _options(coding, settings, width * height)
@@ -433,12 +434,12 @@ def _options(coding: Coding, settings: Settings, pixels: int) -> dict[str, str]:
             options['preset'] = 'superfast'
         if settings.lossless:
             return options | {'qp': '0'}
-        # adaptive quantisation takes bits from texture, where eyes miss an error; those who look
-        # at these pictures look for texture. Without it VGA of a room has 1 dB more for a fifth
-        # more bytes, and SLAM's way a tenth less error; a smooth scene has 0.6 dB for 2 %
+        # Adaptive quantisation takes bits from texture, where viewers miss errors, but robots
+        # need texture. Without it, VGA pictures of a room have 1 dB more for 20 % more bytes, and
+        # the path of SLAM 10 % less error; a smooth scene has 0.6 dB more for 2 % more bytes.
         options['aq-mode'] = '0'
         return options | limits | {'crf': f'{settings.quality:g}'}
-    # each names zero latency its own way; options that an encoder lacks are skipped by FFmpeg
+    # Each encoder has its own options for zero latency; FFmpeg skips options that it lacks.
     return limits | {
         'forced-idr': '1', 'forced_idr': '1', 'delay': '0', 'zerolatency': '1', 'tune': 'ull',
         'async_depth': '1', 'low_delay_brc': '1', 'usage': 'ultralowlatency',
@@ -450,7 +451,7 @@ def working_encoders() -> list[str]:
     """
     Return the encoders that work on this computer, hardware first, libx264 last; probed once.
 
-    One works if its first packets decode at once to about the picture that went in.
+    An encoder works if each of its first packets decodes at once to nearly the same picture.
     """
     return [*(name for name in HARDWARE if _works(name)), SOFTWARE]
 
@@ -474,15 +475,15 @@ def _works(name: str) -> bool:
 def _decoder(show_damage: bool) -> VideoCodecContext:
     codec = CodecContext.create('h264', 'r')
     assert isinstance(codec, VideoCodecContext)
-    # frame threads would hold pictures back; slices don't
+    # Frame threads would delay pictures; slice threads do not.
     codec.thread_type, codec.thread_count = 'SLICE', min(4, os.cpu_count() or 1)
     codec.options = {'flags': '+low_delay' + ('+output_corrupt' if show_damage else '')}
     return codec
 
 
-# --- pixels in and out of FFmpeg's frames -------------------------------------------------------
+# --- conversion from and to FFmpeg's frames -----------------------------------------------------
 
-#: PyAV before it had the option converts in one thread anyway.
+#: Older versions of PyAV lack the option and convert in one thread.
 _ONE_THREAD: dict[str, Any] = (
     {'threads': 1} if 'threads' in (VideoFrame.reformat.__doc__ or '') else {})
 
@@ -491,20 +492,20 @@ def _reformat(frame: VideoFrame, **options: Any) -> VideoFrame:
     """
     Convert a frame in one thread.
 
-    swscale's slices write a few bytes past their last row (9.5, 4:2:2 of some widths): with
-    several threads that row may be ready already.
+    swscale's slices write a few bytes beyond their last row (9.5, 4:2:2 of some widths). With
+    several threads they would overwrite a row that is already converted.
     """
     return frame.reformat(**_ONE_THREAD, **options)
 
 
 def _padded(rows: Pixels, layout: Layout, even: bool) -> Pixels:
-    """Return the rows, the last row and column repeated where sides have to be even."""
+    """Return the rows; repeat the last row and column if the sides must be even."""
     height, row = rows.shape
     width = row // layout.pixel_bytes
     if not even or not (height % 2 or width % 2):
         return rows
     if width % 2:
-        # of 4:2:2 the last pixel has one chroma; the other one is its neighbour's
+        # In 4:2:2, the last pixel has only one chroma value; take the other one of its neighbour.
         tail = rows[:, -layout.pixel_bytes:]
         if layout.kind == 'yuv422':
             tail = tail.copy()
@@ -517,7 +518,7 @@ def _padded(rows: Pixels, layout: Layout, even: bool) -> Pixels:
 
 
 def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
-    """Return the picture as the encoder wants it."""
+    """Convert a picture to a frame for the encoder."""
     rows = picture.rows()
     if layout.alpha and coding.codec == 'libx264rgb':
         pixels = rows.reshape(picture.height, picture.width, 4) if rows.flags.c_contiguous else (
@@ -536,7 +537,7 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
         frame = VideoFrame(width, height, layout.av_format)
         lines(frame)[:height, :rows.shape[1]] = rows
         return _reformat(frame, format=coding.av_format)
-    # FFmpeg reads the message's own memory
+    # The frame shares the memory of the message.
     shared = numpy.lib.stride_tricks.as_strided(
         rows, (height, width, layout.pixel_bytes), (rows.strides[0], layout.pixel_bytes, 1),
         writeable=False)
@@ -552,8 +553,8 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
 def _pixels(
     frame: VideoFrame, layout: Layout, width: int, height: int, step: int,
 ) -> array.array[int]:
-    """Return the frame's pixels as ``step * height`` bytes in the layout."""
-    # as an array that rclpy takes over as it is: the only copy behind the codec is made into it
+    """Convert a frame to ``step * height`` bytes in the layout."""
+    # rclpy takes an array over as it is, so this is the only copy after the codec.
     memory = array.array('B', [0]) * (height * step)
     out = numpy.frombuffer(memory, numpy.uint8).reshape(height, step)
     _convert(frame, layout, width, height, out)
@@ -572,7 +573,7 @@ def _convert(
             frame, format=layout.av_format, src_color_range=ColorRange.MPEG,
             dst_color_range=ColorRange.MPEG)
     else:
-        # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten
+        # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten.
         narrow = layout.alpha and frame.width % 16 != 0
         av_format = layout.av_format.replace('a', '24') if narrow else layout.av_format
         converted = _reformat(
@@ -587,7 +588,7 @@ def _convert(
 
 
 def _colorspace(frame: VideoFrame) -> int:
-    # what a stream doesn't say: standard definition is BT.601's, high definition BT.709's
+    # The default of streams that state none: BT.601 for standard definition, BT.709 for high.
     told = int(frame.colorspace)
     if told in (1, 4, 5, 6, 7, 9):
         return told
@@ -595,7 +596,7 @@ def _colorspace(frame: VideoFrame) -> int:
 
 
 def _alpha(picture: Picture) -> tuple[Optional[int], bytes]:
-    """Return the opacity that all pixels have, or that of each, compressed."""
+    """Return the common opacity of all pixels, or the compressed opacities."""
     opacity = picture.rows()[:, 3::4]
     first = int(opacity[0, 0])
     if (opacity == first).all():

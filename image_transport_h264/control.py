@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the encoder does about the links to all its receivers: bitrate, frame rate, protection."""
+"""Adapt the encoder to the links of all receivers: bitrate, frame rate, error correction."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from typing import Optional
 from image_transport_h264.codec import Settings
 from image_transport_h264.rate import Governor
 
-#: Receivers that say nothing for so long no longer hold the others back.
+#: Seconds after which a silent receiver no longer limits the others.
 SILENT = 3.0
-#: Seconds over which the stream's rate is taken.
+#: Window of the stream's rate in seconds.
 RATE_SECONDS = 1.0
-#: Packets are sent again in pieces only where the bitrate allows so many times what is used.
+#: Packets are repeated in pieces only if the bitrate is at least this multiple of the used rate.
 ROOM = 2.0
-#: A higher bitrate is worth a key only from this factor on, and only if the lower one binds.
+#: A higher bitrate needs a new keyframe. It is worth one only if it is higher by the factor WORTH
+#: and the stream uses the share BINDING of the current one.
 WORTH, BINDING = 1.4, 0.5
 
 
 class Control:
     """
-    Follows all receivers; the one with the slowest link decides.
+    Adapt to all receivers; the slowest link decides.
 
-    :param asked: what the user wants, kept where the links allow it.
-    :param max_rate: most pictures per second, 0 for all.
-    :param adapt: without, nothing but ``max_rate`` is done.
+    :param asked: the user's settings, kept if the links allow them.
+    :param max_rate: maximum pictures per second, 0: no limit.
+    :param adapt: False: apply only ``max_rate``.
     """
 
     def __init__(self, asked: Settings, max_rate: float = 0.0, adapt: bool = True) -> None:
@@ -39,11 +40,11 @@ class Control:
 
     @property
     def round_trip(self) -> float:
-        """The slowest receiver's quickest round trip of late, in seconds; 0 while unknown."""
+        """The recent minimum round trip of the slowest receiver in seconds; 0: unknown."""
         return max((governor.round_trip for governor in self._governors.values()), default=0.0)
 
     def ask(self, asked: Settings, max_rate: float, adapt: bool) -> None:
-        """Take what the user wants from now on."""
+        """Set the user's settings from now on."""
         if not 0 <= max_rate <= 1000:
             raise ValueError(f'max_rate {max_rate} is not between 0 and 1000')
         self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
@@ -52,29 +53,29 @@ class Control:
             governor.bitrate = min(governor.bitrate, governor.ceiling)
 
     def heard(self, receiver: int, sequence: int, lost: int, now: float) -> None:
-        """Note an acknowledgement."""
+        """Record an acknowledgement of a receiver."""
         governor = self._governors.get(receiver)
         if governor is None:
             governor = self._governors[receiver] = Governor(self.asked.bitrate)
         governor.acknowledged(sequence, lost, now)
 
     def due(self, now: float, pixels: int) -> bool:
-        """Return whether the picture that has come is to be sent."""
+        """Return whether to send the picture that has just arrived."""
         if self._arrived is not None:
             self._interval += 0.1 * (min(now - self._arrived, 1.0) - self._interval)
         self._arrived = now
         while self._sent and self._sent[0][0] < now - RATE_SECONDS:
             self._sent.popleft()
         if self.max_rate:
-            # pictures come with jitter: one that is early by less than half its time is in time
+            # Pictures have jitter: one that is early by less than half an interval is on time.
             if now < self._next_due - 0.5 * self._interval:
                 return False
             self._next_due = max(self._next_due + 1 / self.max_rate, now)
         for receiver in [receiver for receiver, governor in self._governors.items()
                          if (governor.heard or 0) < now - SILENT and len(self._governors) > 1]:
             del self._governors[receiver]
-        # each one is asked, as each one forgets what is lost
-        # after a stall images come in a burst, which says nothing of their rate
+        # Ask every governor, because the call also makes a governor forget lost packets.
+        # After a stall, images arrive in a burst, whose intervals are not their rate.
         since = max(now - self._last_sent, 0.9 * self._interval)
         said = [governor.may_send(now, pixels, since)
                 for governor in self._governors.values()]
@@ -82,9 +83,9 @@ class Control:
 
     def settings(self, current: Settings, now: float) -> Settings:
         """
-        Return what to encode with; ``current`` as long as a change isn't worth a key.
+        Return the settings for the next picture; ``current`` if a change is not worth a keyframe.
 
-        :param current: what was encoded with so far.
+        :param current: the settings of the last picture.
         """
         used = self._used()
         for governor in self._governors.values():
@@ -102,12 +103,12 @@ class Control:
         return dataclasses.replace(self.asked, bitrate=wanted, rate=rate)
 
     def protects(self, now: float) -> bool:
-        """Return whether packets go in pieces as well: a link loses, and has room."""
+        """Return whether to repeat packets in pieces: a link loses packets, and has room."""
         return any(governor.loses(now) and self._used() * ROOM < governor.bitrate
                    for governor in self._governors.values())
 
     def sent(self, sequence: int, size: int, now: float) -> None:
-        """Note that a packet of ``size`` bytes, repetitions included, leaves."""
+        """Record that a packet of ``size`` bytes, repetitions included, was sent."""
         self._last_sent = now
         self._sent.append((now, size * 8))
         for governor in self._governors.values():

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The node beside the subscriber: takes a coded stream, publishes images.
+Decode a stream on the subscriber's side, and publish its images.
 
-Publishes ``image`` (remap it) from ``<image>/h264``, or from what the parameter ``stream`` names;
-see doc/h264.md for all topics and parameters.
+The node publishes ``image`` (remap it) from ``<image>/h264``, or from the topic in the parameter
+``stream``. See doc/h264.md for all topics and parameters.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from image_transport_h264.receivers import make_receiver
 
 
 class DecoderNode(LazyNode):
-    """Decodes in a worker thread, while anybody listens to the images."""
+    """Decode in a worker thread, while the images have a subscriber."""
 
     def __init__(self) -> None:
         super().__init__('h264_decoder')
@@ -41,7 +41,7 @@ class DecoderNode(LazyNode):
         self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
 
     def destroy_node(self) -> None:
-        """End the worker, then the node."""
+        """Stop the worker, then destroy the node."""
         self._receiver.stop()
         super().destroy_node()
 
@@ -50,16 +50,16 @@ class DecoderNode(LazyNode):
 
 
 def main() -> None:
-    """Run until interrupted."""
+    """Run the node until a signal."""
     memory.keep()
     rclpy.init()
     node = DecoderNode()
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # what causes it shuts rclpy down, in a thread of its own: not twice
+        pass  # both mean that rclpy shuts down, in its own thread
     finally:
-        # a second one must not end this halfway
+        # A second Ctrl-C must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         failed = node.failed
         node.destroy_node()

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Depth and other deep images, bit by bit as they were: FFV1, an intra-only lossless codec.
+Code depth images and other deep images without loss by FFV1, an intra-only codec.
 
-Of a noisy 640x480 depth image FFV1 leaves 203 kB in 15 ms, PNG 292 kB in 14 ms or 280 kB in
-68 ms; of a 32-bit one 782 kB, PNG 910 kB. Floats are coded as two 16-bit pictures, high halves
-above low ones. A packet is MAGIC, the tag, FFV1's configuration record and the coded picture,
-each with its length: every packet is a key.
+A noisy 640x480 depth image takes 203 kB in 15 ms with FFV1, 292 kB in 14 ms or 280 kB in 68 ms
+with PNG; a 32-bit one takes 782 kB, and 910 kB with PNG. A float image is coded as two 16-bit
+pictures, the high halves above the low ones. A packet consists of MAGIC, the tag, FFV1's
+configuration record and the coded picture, each with its length. Every packet is a keyframe.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from image_transport_h264.annexb import Tag
 from image_transport_h264.picture import CodecError, LARGEST_SIDE, LAYOUTS, Picture, Pixels
 
 MAGIC = b'FFV1tag1'
-#: FFV1 refuses a picture of one column and two rows.
+#: Minimum width, because FFV1 refuses a picture of one column and two rows.
 NARROWEST = 2
 _LENGTHS = struct.Struct('>HHI')
 
 
 class DeepEncoder:
-    """Encodes pictures of kind 'deep', each on its own."""
+    """Encode pictures of kind 'deep', each one independently."""
 
     def __init__(self) -> None:
         self._codec: Optional[VideoCodecContext] = None
         self._size = (0, 0)
 
     def encode(self, picture: Picture, tag: Tag) -> bytes:
-        """Return the packet; the picture has been checked."""
+        """Encode a checked picture."""
         high_low = _planes(picture)
         height, width = high_low.shape[0], max(NARROWEST, high_low.shape[1])
         if self._codec is None or self._size != (width, height):
             self._codec, self._size = _open(width, height), (width, height)
-        # the pixels are 16-bit whatever they mean: no conversion, one copy into the frame
+        # The pixels have 16 bits in any case: no conversion, and one copy into the frame.
         frame = VideoFrame(width, height, 'gray16le')
         _fill(frame, high_low)
         coded = b''.join(bytes(packet) for packet in self._codec.encode(frame))
@@ -57,7 +57,7 @@ class DeepEncoder:
 
 
 class DeepDecoder:
-    """Decodes what DeepEncoder made."""
+    """Decode packets of DeepEncoder."""
 
     def __init__(self) -> None:
         self._codec: Optional[VideoCodecContext] = None
@@ -65,7 +65,7 @@ class DeepDecoder:
 
     def decode(self, packet: bytes) -> tuple[Tag, Picture]:
         """
-        Return the tag and the picture.
+        Decode a packet to its tag and picture.
 
         :raises CodecError: the packet is damaged.
         """
@@ -99,7 +99,7 @@ class DeepDecoder:
 
 def split(packet: bytes) -> tuple[Tag, bytes, bytes]:
     """
-    Return tag, configuration and coded picture.
+    Split a packet into tag, configuration record and coded picture.
 
     :raises CodecError: the packet is damaged.
     """
@@ -117,7 +117,7 @@ def split(packet: bytes) -> tuple[Tag, bytes, bytes]:
 
 
 def lines(frame: VideoFrame, plane: int = 0) -> Pixels:
-    """Return a plane's memory as an array (lines, bytes per line)."""
+    """Return the memory of a plane as an array (lines, bytes per line)."""
     memory = frame.planes[plane]
     flat: Pixels = numpy.frombuffer(cast(memoryview, memory), numpy.uint8)
     return flat.reshape(-1, memory.line_size)
@@ -129,7 +129,7 @@ def _open(width: int, height: int) -> VideoCodecContext:
     codec.width, codec.height, codec.pix_fmt = width, height, 'gray16le'
     codec.time_base = Fraction(1, 30)
     codec.gop_size = 1
-    # slices so that two cores share a picture, each with a checksum
+    # Slices let two cores share a picture; each slice has a checksum.
     codec.thread_type, codec.thread_count = 'SLICE', 2
     codec.options = {'level': '3', 'slicecrc': '1'} | (
         {'slices': '4'} if min(width, height) >= 64 else {})
@@ -138,7 +138,7 @@ def _open(width: int, height: int) -> VideoCodecContext:
 
 
 def _planes(picture: Picture) -> NDArray[numpy.uint16]:
-    """Return the pixels as 16-bit numbers, (height, width); 32-bit ones as two such pictures."""
+    """Return the pixels as 16-bit numbers (height, width); 32-bit ones as two pictures."""
     order = '>' if picture.is_bigendian else '<'
     size = picture.layout.pixel_bytes
     rows = picture.rows()

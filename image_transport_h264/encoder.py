@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The node beside the publisher: takes images, publishes them coded.
+Encode images on the publisher's side, and publish the stream.
 
-Subscribes to ``image`` (remap it) and publishes ``<image>/h264``, or what the parameter ``stream``
-names; see doc/h264.md for all topics and parameters. The parameter ``topic`` is the name that
-messages have for ``image``.
+The node subscribes to ``image`` (remap it), and publishes ``<image>/h264``, or the topic in the
+parameter ``stream``. See doc/h264.md for all topics and parameters. The parameter ``topic`` is
+the name of ``image`` in log messages.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
 from image_transport_h264.worker import Worker
 
-#: Seconds until a topic without a publisher is reported.
+#: Seconds until the node reports a topic without a publisher.
 PATIENCE = 5.0
 
 
 class EncoderNode(LazyNode):
-    """Hands images to a worker thread, the newest if there are several, while anybody listens."""
+    """Encode the newest image in a worker thread, while the stream has a subscriber."""
 
     def __init__(self) -> None:
         super().__init__('h264_encoder')
@@ -38,7 +38,7 @@ class EncoderNode(LazyNode):
         self._sender = make_sender(self, codec, stream, self._listeners_changed)
         self._worker: Worker[Image] = Worker('encode', self._sender.send, self.fail)
         self._images = Tap(self, Image, topic, IMAGE_QOS, self._worker.put)
-        # not every image has a camera that describes itself: this too only while it is wanted
+        # Many cameras publish no CameraInfo, so subscribe to it only on request.
         self._infos: Optional[Relay] = None
         if self.declare_parameter('camera_info', True).value:
             self._infos = Relay(self, CameraInfo, camera_info_topic(topic),
@@ -49,12 +49,12 @@ class EncoderNode(LazyNode):
         self.get_logger().info(f'{topic} goes out as {stream} ({codec})')
 
     def destroy_node(self) -> None:
-        """End the worker, then the node."""
+        """Stop the worker, then destroy the node."""
         self._worker.stop()
         super().destroy_node()
 
     def _look_for_images(self, topic: str, named: str) -> None:
-        """Warn once if nobody publishes images, with the nearest topic that has some."""
+        """Warn once if nobody publishes images, and name the most similar topic with images."""
         self._look.cancel()
         if self.count_publishers(topic):
             return
@@ -70,16 +70,16 @@ class EncoderNode(LazyNode):
 
 
 def main() -> None:
-    """Run until interrupted."""
+    """Run the node until a signal."""
     memory.keep()
     rclpy.init()
     node = EncoderNode()
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # what causes it shuts rclpy down, in a thread of its own: not twice
+        pass  # both mean that rclpy shuts down, in its own thread
     finally:
-        # a second one must not end this halfway
+        # A second Ctrl-C must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         failed = node.failed
         node.destroy_node()

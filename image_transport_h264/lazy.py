@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both nodes have: work only while somebody listens, and one log line per cause."""
+"""Share the base of both nodes: work only for subscribers, log each cause once."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from rclpy.subscription import Subscription
 
 from image_transport_h264.turns import Turns
 
-#: A stream's packets: for recorders and others who ask for it, those the network lost come again.
+#: Packets of a stream; reliable for recorders and other subscribers that ask for it.
 STREAM_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
-#: Pictures: the newest.
+#: Images: the newest ones.
 IMAGE_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=2, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
-#: What is of no use late.
+#: Messages that are useless if they are late.
 FEEDBACK_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE)
-#: Pieces of packets: late ones are of no use to their reader.
+#: Pieces of packets: useless if they are late.
 PIECES_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE)
@@ -38,19 +38,19 @@ REQUEST_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE)
 
 
-#: Seconds that a message's acknowledgement is waited for: a reader that hangs delays the others.
+#: Time-out of a message's acknowledgement in seconds; a reader that hangs delays the others.
 LONGEST = 2.0
 
 
 def best_effort(qos: QoSProfile) -> QoSProfile:
-    """Return the profile without repetition of what was lost."""
+    """Return the profile with best-effort reliability."""
     return QoSProfile(
         history=qos.history, depth=qos.depth, durability=qos.durability,
         reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class LazyNode(Node):
-    """A node that subscribes while it is subscribed to."""
+    """A node that subscribes only while its topics have subscribers."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -60,46 +60,46 @@ class LazyNode(Node):
         self.failed = False
 
     def destroy_node(self) -> None:
-        """End the node, whose worker has ended."""
+        """Destroy the node after its worker has stopped."""
         self._turns.close()
         super().destroy_node()
 
     def fail(self) -> None:
-        """End the process: a node that can't do its work is to be started anew."""
+        """Shut the process down, so that the launch can restart the node."""
         self.failed = True
         rclpy.try_shutdown(context=self.context)
 
     def put_out(self, publisher: Publisher, message: Any) -> None:
-        """Publish, unless a subscriber is so slow that the middleware has no room for more."""
+        """Publish a message; drop it if a slow subscriber leaves the middleware no room."""
         try:
             publisher.publish(message)
-        except RuntimeError as error:  # RCLError, in rclpy's words
+        except RuntimeError as error:  # RCLError of rclpy
             if not rclpy.ok(context=self.context):
                 return
             self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
 
     def put_through(self, publisher: Publisher, message: Any) -> None:
         """
-        Publish a large message when it is this node's turn, and wait until its readers have it.
+        Publish a large message when it is this node's turn, and wait for its acknowledgement.
 
-        Large images in quick succession leave a slow link no room for what it lost of them: none
-        would ever be whole. What comes meanwhile is left out, but for the newest.
+        Large images in quick succession leave a slow link no room to repeat lost parts, so no
+        image would ever arrive. Of the images that come meanwhile, only the newest is kept.
         """
         with self._turns.taken(LONGEST):
             self.put_out(publisher, message)
             self.all_acknowledged(publisher)
 
     def all_acknowledged(self, publisher: Publisher) -> bool:
-        """Wait until reliable readers have all that was published; False if that takes long."""
+        """Wait until reliable readers have all messages; return False after a time-out."""
         try:
             return bool(publisher.wait_for_all_acked(Duration(seconds=LONGEST)))
-        except RuntimeError:  # RCLError, in rclpy's words
+        except RuntimeError:  # RCLError of rclpy
             if rclpy.ok(context=self.context):
                 raise
-            return False  # the node ends
+            return False  # the node is shutting down
 
     def complain(self, cause: str, message: str) -> None:
-        """Warn of a cause, the first time it comes up."""
+        """Log a warning for the first message of each cause."""
         with self._complaining:
             if cause in self._complained:
                 return
@@ -109,13 +109,13 @@ class LazyNode(Node):
     def offer(
         self, kind: Any, topic: str, qos: QoSProfile, changed: Callable[[], None],
     ) -> Publisher:
-        """Return a publisher; ``changed`` is called when subscribers come or go."""
+        """Create a publisher; ``changed`` is called when subscribers come or go."""
         return self.create_publisher(
             kind, topic, qos,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: changed()))
 
     def fitting(self, topic: str, qos: QoSProfile) -> QoSProfile:
-        """Return the profile, best effort if a publisher of the topic has nothing better."""
+        """Return the profile, with best effort unless all publishers of the topic are reliable."""
         told = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
         if told and all(kind == ReliabilityPolicy.RELIABLE for kind in told):
             return qos
@@ -124,9 +124,9 @@ class LazyNode(Node):
 
 class Tap:
     """
-    A subscription that exists while it is wanted.
+    A subscription that exists only on request.
 
-    Made anew if a publisher comes up that would be heard better, or not at all, otherwise.
+    The tap subscribes again if a new publisher needs another reliability.
     """
 
     def __init__(
@@ -140,11 +140,11 @@ class Tap:
 
     @property
     def open(self) -> bool:
-        """Whether it is subscribed."""
+        """Whether the tap is subscribed."""
         return self._subscription is not None
 
     def want(self, wanted: bool) -> None:
-        """Subscribe or end it; in the executor's thread."""
+        """Subscribe or unsubscribe; call this in the executor's thread."""
         if wanted and self._subscription is None:
             self._subscribe()
         elif not wanted and self._subscription is not None:
@@ -152,10 +152,10 @@ class Tap:
             self._subscription = None
 
     def ask_for(self, qos: QoSProfile) -> None:
-        """Take messages by another profile from now on; in the executor's thread."""
+        """Change the profile of the subscription; call this in the executor's thread."""
         if self._subscription is None or qos.reliability == self._qos.reliability:
             return
-        # first the new one, so that the topic is subscribed to at any time; some come twice
+        # Subscribe before unsubscribing, so that no message is missed; some arrive twice.
         self._qos, old = qos, self._subscription
         self._subscribe()
         self._node.destroy_subscription(old)
@@ -175,7 +175,7 @@ class Tap:
 
 
 class Relay:
-    """Passes messages from a topic to another while the other is subscribed to."""
+    """Forward messages from a topic to another while the other one has subscribers."""
 
     def __init__(
         self, node: LazyNode, kind: Any, source: str, target: str, qos: QoSProfile,

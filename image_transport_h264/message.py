@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages from and to pictures and packets."""
+"""Convert between ROS messages, pictures and packets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 
 from image_transport_h264.codec import Packet, Picture
 
-#: What follows the stream's name in the names of the topics that belong to it.
+#: Last part of the names of a stream's auxiliary topics.
 KEY_REQUEST, FEEDBACK, PIECES, CAMERA_INFO = 'keyframe', 'feedback', 'pieces', 'camera_info'
 
 #: seconds, nanoseconds, length of the frame id
@@ -21,20 +21,20 @@ _HEADER = struct.Struct('>iIH')
 
 
 def picture(message: Image) -> Picture:
-    """Return the message's picture, which shares its data."""
+    """Return the picture of a message; it shares the message's data."""
     return Picture(message.width, message.height, message.encoding, message.step,
                    memoryview(message.data), bool(message.is_bigendian))
 
 
 def image(header: Header, shown: Picture) -> Image:
-    """Return a picture as a message: one copy."""
+    """Return a picture as a message, with one copy of the data."""
     return Image(
         header=header, height=shown.height, width=shown.width, encoding=shown.encoding,
         is_bigendian=int(shown.is_bigendian), step=shown.step, data=octets(shown.data))
 
 
 def octets(data: Any) -> 'array.array[int]':
-    """Return bytes as the array that rclpy takes without looking at each of them."""
+    """Convert bytes to an array, which rclpy takes over without a check of each byte."""
     if isinstance(data, array.array):
         return data
     values = array.array('B')
@@ -46,19 +46,19 @@ def compressed(header: Header, packet: Packet) -> CompressedImage:
     """
     Return a packet as a message.
 
-    ``format`` is 'h264' alone, as viewers know it: what it was before coding is in the packet.
+    ``format`` is only 'h264', which viewers know; the packet contains the original encoding.
     """
     return CompressedImage(header=header, format=packet.format, data=octets(packet.data))
 
 
 def with_header(header: Header, data: bytes) -> bytes:
-    """Return a packet with its message's header in front, for the way in pieces."""
+    """Return a packet with its message's header in front, to be sent in pieces."""
     name: bytes = header.frame_id.encode()
     return _HEADER.pack(header.stamp.sec, header.stamp.nanosec, len(name)) + name + data
 
 
 def header_and_data(whole: bytes) -> tuple[Header, bytes]:
-    """Return what ``with_header`` put together."""
+    """Split the bytes of :func:`with_header` into header and packet."""
     seconds, nanoseconds, length = _HEADER.unpack_from(whole)
     header = Header(frame_id=whole[_HEADER.size:_HEADER.size + length].decode(errors='replace'))
     header.stamp.sec, header.stamp.nanosec = seconds, nanoseconds
@@ -66,12 +66,12 @@ def header_and_data(whole: bytes) -> tuple[Header, bytes]:
 
 
 def camera_info_topic(topic: str) -> str:
-    """Return the topic beside an image's on which its camera describes itself."""
+    """Return the topic of the CameraInfo messages that belong to an image topic."""
     return topic.rpartition('/')[0] + '/' + CAMERA_INFO
 
 
 def installed(package: str, name: str) -> Optional[Any]:
-    """Return a message class of a package that not every ROS 2 has, None where it hasn't."""
+    """Return a message class of an optional package, None if it is not installed."""
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name, None)
     except ModuleNotFoundError:

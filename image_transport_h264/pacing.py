@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How many images may be under way at once, judged by how long their acknowledgements take.
+Limit the number of images in flight by the time of their acknowledgements.
 
-An image that is sent while the link is still busy with the one before waits in the link's queue,
-and where the queue is full, parts of it are lost. So the next image leaves when the last one is
-acknowledged: one image under way fills a link whose round trip is short. On a long link most of
-that time is the round trip, and more images fit: the window grows while they wait for nothing,
-as TCP Vegas does (Brakmo and Peterson 1995, "End to end congestion avoidance on a global
-internet").
+An image that is sent while the link still sends the previous one waits in the link's queue. If
+the queue is full, parts of the image are lost. So the next image is sent when the last one is
+acknowledged: one image in flight fills a link with a short round trip. On a long link, more images
+fit. The window grows while no image waits, as in TCP Vegas (Brakmo and Peterson 1995,
+"End to end congestion avoidance on a global internet").
 """
 
 from __future__ import annotations
@@ -15,30 +14,30 @@ from __future__ import annotations
 from collections import deque
 import dataclasses
 
-#: Images under way at the most; the publisher keeps as many, to repeat parts of them.
+#: Maximum images in flight; the publisher keeps as many, to repeat lost parts.
 MOST = 8
-#: Acknowledgements of a full window between two decisions: chance delays some, a queue all.
+#: Acknowledgements of a full window per decision; chance delays some of them, a queue all.
 ROUND = 4
-#: Images that wait in the link's queue: below the first the window grows, above the second it
+#: Number of images that wait in the link's queue: below FEW the window grows, above MANY it
 #: shrinks.
 FEW, MANY = 0.25, 0.75
-#: Seconds over which the quickest acknowledgement counts.
+#: Seconds for which the quickest acknowledgement counts.
 MEMORY = 10.0
-#: Seconds until a window that was too large is tried again, and the longest after it has been too
-#: large several times in a row.
+#: Seconds until a window that was too large is tried again; the pause doubles up to
+#: MOST_PATIENCE if it is too large several times in a row.
 PATIENCE, MOST_PATIENCE = 5.0, 60.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """An image under way: when it was sent (s), and as how many-th of those under way."""
+    """An image in flight: when it was sent (s), and its place among the images in flight."""
 
     when: float
     place: int
 
 
 class Pace:
-    """The window of images under way; times are seconds of one clock that does not go back."""
+    """The window of images in flight; times are seconds of one monotonic clock."""
 
     def __init__(self) -> None:
         self.window = 1
@@ -49,28 +48,28 @@ class Pace:
         self._tried = -MOST_PATIENCE
 
     def may_send(self) -> bool:
-        """Return whether there is room for another image."""
+        """Return whether the window has room for another image."""
         return self._under_way < self.window
 
     def sent(self, now: float) -> Sent:
-        """Note that an image leaves; pass the result to :meth:`acknowledged`."""
+        """Record that an image was sent; pass the result to :meth:`acknowledged`."""
         self._under_way += 1
         return Sent(now, self._under_way)
 
     def acknowledged(self, sent: Sent, now: float) -> None:
-        """Note that all readers have an image, and set the window."""
+        """Record that all readers have an image, and adapt the window."""
         self._under_way -= 1
         trip = max(now - sent.when, 1e-6)
         self._trips.append((now, trip))
         while self._trips[0][0] < now - MEMORY:
             self._trips.popleft()
         if sent.place < self.window:
-            return  # the window did not hold this image up, so it says nothing about its size
+            return  # the window did not delay this image, so it says nothing about its size
         quickest = min(trip for _, trip in self._trips)
         self._queued.append(self.window * (1 - quickest / trip))
         if len(self._queued) < ROUND:
             return
-        # a repeated fragment or a busy processor delays some images, a queue delays all
+        # A repeated fragment or a busy processor delays some images, a queue delays all.
         queued = min(self._queued)
         self._queued.clear()
         if queued > MANY:
@@ -81,7 +80,7 @@ class Pace:
             self._patience = 0.0
 
     def expired(self, now: float) -> None:
-        """Note that an image was given up: the link is slow or gone, or a reader hangs."""
+        """Record that an image was given up: the link is slow or gone, or a reader hangs."""
         self._under_way -= 1
         self._shrink(1, now)
 

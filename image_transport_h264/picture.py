@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures as ``sensor_msgs/Image`` describes them, without ROS: layouts and checks."""
+"""Describe images as ``sensor_msgs/Image`` does, without ROS: layouts and checks."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Buffer = Union[bytes, bytearray, memoryview, 'array.array[int]']
 Pixels = NDArray[numpy.uint8]
 Kind = Literal['rgb', 'grey', 'yuv422', 'deep']
 
-#: Larger than any camera; a header that asks for more is damage.
+#: Maximum side in pixels, larger than any camera's; a larger value means a damaged header.
 LARGEST_SIDE = 16384
 
 
 class CodecError(ValueError):
     """
-    A picture that can't be encoded, or a packet that can't be decoded.
+    A picture cannot be encoded, or a packet cannot be decoded.
 
-    :param cause: a few constant words, so that a log can count causes and not messages.
+    :param cause: a few constant words, so that a log can count causes instead of messages.
     """
 
     def __init__(self, message: str, cause: str) -> None:
@@ -31,18 +31,18 @@ class CodecError(ValueError):
 
 
 class BadPicture(CodecError):
-    """An image whose fields contradict each other, or whose encoding isn't known."""
+    """An image's fields contradict each other, or its encoding is unknown."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """
-    How an encoding lies in memory.
+    Memory layout of an encoding.
 
-    :param kind: which way it is coded.
-    :param av_format: FFmpeg's name of the same layout.
+    :param kind: how pictures of this encoding are coded.
+    :param av_format: FFmpeg's name of the layout.
     :param pixel_bytes: bytes per pixel.
-    :param alpha: whether the last byte of a pixel is opacity.
+    :param alpha: whether the last byte of a pixel is its opacity.
     """
 
     kind: Kind
@@ -74,10 +74,10 @@ LAYOUTS: dict[str, Layout] = {
 @dataclasses.dataclass(frozen=True)
 class Picture:
     """
-    One image; the fields mean what they mean in ``sensor_msgs/Image``.
+    One image; the fields have the meaning of ``sensor_msgs/Image``.
 
-    :param step: bytes from a row to the next; more than the pixels need where rows are padded.
-    :param data: ``step * height`` bytes; read, never changed.
+    :param step: bytes from one row to the next, padding included.
+    :param data: ``step * height`` bytes, never modified.
     """
 
     width: int
@@ -90,9 +90,9 @@ class Picture:
     @property
     def layout(self) -> Layout:
         """
-        Return the encoding's layout.
+        Return the layout of the encoding.
 
-        :raises BadPicture: the encoding isn't known.
+        :raises BadPicture: the encoding is unknown.
         """
         try:
             return LAYOUTS[self.encoding]
@@ -108,10 +108,10 @@ class Picture:
 
     def check(self) -> None:
         """
-        Hold the fields against each other.
+        Check that the fields agree.
 
-        :raises BadPicture: an unknown encoding, no pixels, a step shorter than a row, or data of
-            another length than step and height say.
+        :raises BadPicture: an unknown encoding, no pixels, too many pixels, a step shorter than a
+            row, or data of another length than ``step * height``.
         """
         row = self.row_bytes
         if self.width < 1 or self.height < 1:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How much a link takes, judged by acknowledgements: first the bitrate gives way, then the frames.
+Estimate the capacity of a link by acknowledgements; lower first the bitrate, then the frame rate.
 
-The sender notes when each packet left; the receiver acknowledges each as it comes. What a packet
-took beyond the quickest of late, and beyond its own time on the wire, it spent waiting in a queue.
-A queue that lasts means that more is sent than the link takes: the bitrate goes below the rate at
-which packets arrive, and no packet leaves until the queue has drained. Without acknowledgements
-(a subscriber that isn't our decoder) nothing is known, and nothing is held back.
+The sender records when each packet left; the receiver acknowledges each packet on arrival. A
+packet's delay beyond the recent minimum and beyond its own time on the wire is time in a queue.
+A lasting queue means that the sender exceeds the link's capacity. The bitrate then goes below the
+rate of arrival, and no packet leaves until the queue is empty. Without acknowledgements (of a
+subscriber that is not our decoder) the capacity is unknown, and there is no limit.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from collections import deque
 import dataclasses
 from typing import Optional
 
-#: Seconds of waiting that make a queue if nothing, over so many seconds and acknowledgements, took
-#: less: what a loss or a busy processor holds up is followed by something quick.
+#: Seconds of delay that count as a queue if all packets had it for QUEUE_SECONDS and for so many
+#: acknowledgements. After a loss or a busy processor, at least one packet is quick.
 QUEUE, QUEUE_SECONDS, QUEUE_ACKNOWLEDGEMENTS = 0.04, 0.3, 4
-#: Seconds that packets may be under way, beyond the usual, before new pictures are left out.
+#: Seconds beyond the usual round trip after which new pictures are skipped.
 LATEST = 0.25
-#: Seconds after which a packet counts as lost, and the link as unknown.
+#: Seconds after which a packet counts as lost, and the state of the link as unknown.
 LOST = 1.5
-#: Seconds over which the quickest round trip and the rate of arrival are taken.
+#: Windows of the minimum round trip and of the rate of arrival, in seconds.
 MEMORY, ARRIVALS = 10.0, 0.5
-#: What is left of the measured rate, and how the bitrate grows afterwards.
+#: The share of the measured rate to use, and how the bitrate grows afterwards.
 YIELD, GROWTH, GROWTH_INTERVAL, CALM = 0.8, 1.15, 0.25, 0.5
-#: A queue shrinks after the bitrate has given way. What stays, and isn't so many times as long, is
-#: no queue of ours but a busy computer, say: the bitrate waits for so many seconds before it gives
-#: way again, and for twice as many each time, up to a limit.
+#: A queue shrinks after the bitrate went down. If it stays, and is not longer by the factor WORSE,
+#: the cause is not our traffic, but for example a busy computer. The bitrate then waits PATIENCE
+#: seconds before it goes down again, and twice as long each time, up to MOST_PATIENCE.
 WORSE, PATIENCE, MOST_PATIENCE = 1.3, 5.0, 60.0
-#: Seconds after a loss for which more are expected.
+#: Seconds after a loss for which more losses are expected.
 LOSS_MEMORY = 20.0
-#: Bits per pixel below which fewer pictures look better than worse ones.
+#: Minimum bits per pixel; below it, fewer pictures look better than worse ones.
 LEAST_BITS = 0.03
 LEAST_BITRATE = 50_000
 
@@ -46,9 +46,9 @@ class _Sent:
 
 class Governor:
     """
-    Follows one receiver.
+    Estimate the link to one receiver.
 
-    :param ceiling: bits per second that are never exceeded.
+    :param ceiling: maximum bits per second.
     """
 
     def __init__(self, ceiling: int) -> None:
@@ -70,23 +70,23 @@ class Governor:
 
     @property
     def round_trip(self) -> float:
-        """The quickest round trip of late, in seconds; 0 while unknown."""
+        """The recent minimum round trip in seconds; 0: unknown."""
         return min((trip for _, trip in self._trips), default=0.0)
 
     def sent(self, sequence: int, size: int, now: float) -> None:
-        """Note that a packet of ``size`` bytes has left."""
+        """Record that a packet of ``size`` bytes was sent."""
         if self.heard is not None:
             self._sent.append(_Sent(sequence, size * 8, now))
 
     def loses(self, now: float) -> bool:
-        """Return whether packets were lost of late."""
+        """Return whether the link lost packets recently."""
         return self._loss is not None and now - self._loss < LOSS_MEMORY
 
     def acknowledged(self, sequence: int, lost: int, now: float) -> None:
         """
-        Note that the receiver has a packet; those before it are there too, or lost.
+        Record that a packet has arrived; all packets before it have arrived too, or are lost.
 
-        :param lost: packets that didn't come whole, since the receiver began to count.
+        :param lost: number of incomplete packets since the receiver started to count.
         """
         if self.heard is None:
             self._calm_since = now
@@ -106,7 +106,7 @@ class Governor:
         self._arrivals.append((now, sent.bits))
         while self._arrivals[0][0] < now - ARRIVALS:
             self._arrivals.popleft()
-        # a large packet takes its time on any link: that is no queue
+        # A large packet takes its time on any link; that time is no queue.
         wire = sent.bits / max(self.bitrate, self._rate)
         waited = trip - self.round_trip - wire
         self._waits.append((now, waited))
@@ -126,22 +126,23 @@ class Governor:
 
     def may_send(self, now: float, pixels: int, interval: float) -> bool:
         """
-        Whether a picture is to be sent now.
+        Return whether to send a picture now.
 
-        :param interval: seconds since the last one that was sent.
+        :param pixels: pixels of the picture.
+        :param interval: seconds since the last picture that was sent.
         """
         self._forget(now)
         if self._sent and now - self._sent[0].when > self.round_trip + LATEST:
             return False
-        # a little early is in time: pictures come with jitter
+        # Pictures have jitter, so a slightly early one is on time.
         return interval * self.bitrate >= 0.8 * LEAST_BITS * pixels or interval > 1.0
 
     def grow(self, now: float, used: float) -> None:
         """
-        Let the bitrate grow after a while without a queue.
+        Increase the bitrate after some time without a queue.
 
-        :param used: bits per second sent of late; what isn't used tells nothing of the link, so
-            the bitrate goes no further than a few times beyond.
+        :param used: recently sent bits per second. An unused bitrate was never tested on the
+            link, so the bitrate grows only while the stream uses enough of it.
         """
         if (self.heard is None or now - self._calm_since < CALM
                 or now - self._grown < GROWTH_INTERVAL):
@@ -151,7 +152,7 @@ class Governor:
             self.bitrate = min(self.ceiling, int(self.bitrate * GROWTH))
 
     def _yield(self, now: float) -> None:
-        """Go below the rate at which packets arrived."""
+        """Lower the bitrate below the rate of arrival."""
         self._cut = now
         self._waits.clear()
         rate = self._arrival_rate(now)
@@ -163,13 +164,13 @@ class Governor:
     def _arrival_rate(self, now: float) -> float:
         if len(self._arrivals) < 2:
             return 0.0
-        # the first one's bits had passed before the interval began
+        # The bits of the first packet arrived before the interval began.
         seconds = max(now, self._arrivals[-1][0]) - self._arrivals[0][0]
         bits = sum(bits for _, bits in self._arrivals) - self._arrivals[0][1]
         return bits / max(seconds, 0.02)
 
     def _forget(self, now: float) -> None:
-        """Give up on packets that are lost, with half the bitrate if all were."""
+        """Forget lost packets; halve the bitrate if all packets were lost."""
         if self._sent and now - self._sent[0].when > LOST:
             if self._sent[-1].when < now - LOST / 2 or (self.heard or 0) < now - LOST:
                 self.bitrate = max(LEAST_BITRATE, self.bitrate // 2)

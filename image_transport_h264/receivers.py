@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the decoder node does with a stream, by codec: video, single pictures, as it is."""
+"""Receive a stream in the decoder node, by codec: video, single pictures, or raw images."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ from image_transport_h264.repair import Assembler
 from image_transport_h264.worker import Worker
 
 Publish = Callable[[Image], None]
-#: A packet; its tag, if it is still to be acknowledged.
+#: A packet, with its tag if it is to be acknowledged when it is decoded.
 Coded = tuple[Header, bytes, Optional[Tag]]
-#: Packets that may wait for the decoder; more of them means that it can't follow.
+#: Maximum number of packets that wait for the decoder; with more, the decoder is too slow.
 WAITING = 8
-#: Waiting packets from which on one is acknowledged when it is decoded, and not when it comes.
+#: From this number of waiting packets on, packets are acknowledged when they are decoded.
 BUSY = 3
-#: Seconds after which a request for a key is repeated.
+#: Seconds after which a request for a keyframe is repeated.
 REQUEST_INTERVAL = 0.1
 
 
 class Receiver(abc.ABC):
-    """Hands what a stream brings to ``publish`` as images."""
+    """Receive a stream, and pass its images to ``publish``."""
 
     @abc.abstractmethod
     def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or end it."""
+        """Subscribe to the stream, or unsubscribe."""
 
     @abc.abstractmethod
     def stop(self) -> None:
-        """End the thread, if there is one."""
+        """Stop the worker thread."""
 
 
 def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> Receiver:
     """
-    Return the codec's receiver.
+    Create the receiver of a codec.
 
-    :raises ValueError: no such codec.
+    :raises ValueError: the codec is unknown.
     """
     if codec == 'h264':
         return VideoReceiver(node, stream, publish)
@@ -70,23 +70,23 @@ def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> 
 
 
 class RawReceiver(Receiver):
-    """Passes images on as they are."""
+    """Forward raw images."""
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
         self._worker: Worker[Image] = Worker('pass', publish, node.fail)
         self._tap = Tap(node, Image, stream, IMAGE_QOS, self._worker.put)
 
     def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or end it."""
+        """Subscribe to the stream, or unsubscribe."""
         self._tap.want(wanted)
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the worker thread."""
         self._worker.stop()
 
 
 class StillReceiver(Receiver):
-    """Decodes JPEG and PNG."""
+    """Decode JPEG and PNG images."""
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
         self._node, self._publish = node, publish
@@ -94,11 +94,11 @@ class StillReceiver(Receiver):
         self._tap = Tap(node, CompressedImage, stream, IMAGE_QOS, self._worker.put)
 
     def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or end it."""
+        """Subscribe to the stream, or unsubscribe."""
         self._tap.want(wanted)
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the worker thread."""
         self._worker.stop()
 
     def _decode(self, coded: CompressedImage) -> None:
@@ -111,7 +111,7 @@ class StillReceiver(Receiver):
 
 
 class VideoReceiver(Receiver):
-    """Decodes H.264, acknowledges each packet, asks for a key where one is needed."""
+    """Decode H.264, acknowledge each packet, and request keyframes when the decoder needs one."""
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
         self._node, self._publish = node, publish
@@ -131,18 +131,18 @@ class VideoReceiver(Receiver):
         self._acknowledged: Optional[Tag] = None
         self._lost = 0
         self._acknowledging = threading.Lock()
-        # as deep pictures take it, which could never come whole otherwise
+        # Reliable, because a deep picture would never arrive completely otherwise.
         self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._whole, adapt=False)
         self._pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
                            adapt=False)
 
     def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or end it."""
+        """Subscribe to the stream, or unsubscribe."""
         self._tap.want(wanted)
         self._pieces.want(wanted)
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the worker thread."""
         self._worker.stop()
 
     def _whole(self, coded: CompressedImage) -> None:
@@ -152,11 +152,11 @@ class VideoReceiver(Receiver):
             self._count(tag)
         if coded.format == 'ffv1':
             self._tap.ask_for(STREAM_QOS)
-            # the sender waits for the middleware's acknowledgement
+            # The sender waits for the acknowledgement of the middleware.
             self._worker.put((coded.header, data, None))
             return
-        # what the network loses is repaired by pieces or a new key: waiting for it to come again
-        # would hold up what has come
+        # Pieces or a new keyframe repair losses; repetition by the middleware would delay packets
+        # that have already arrived.
         self._tap.ask_for(best_effort(STREAM_QOS))
         self._take(coded.header, data, tag)
 
@@ -167,10 +167,10 @@ class VideoReceiver(Receiver):
             self._take(header, data, peek(data))
 
     def _take(self, header: Header, data: bytes, tag: Optional[Tag]) -> None:
-        # what is acknowledged at once tells of the link; if decoding is what takes long, the
-        # sender has to hear of that
+        # An early acknowledgement measures the link. If decoding is the bottleneck, acknowledge
+        # late, so that the sender slows down.
         late = self._worker.waiting >= BUSY
-        # the other thread goes to work while this one acknowledges
+        # First start the other thread's work, then acknowledge.
         self._worker.put((header, data, tag if late else None))
         if tag is not None and not late:
             self._acknowledge(tag)
@@ -191,7 +191,7 @@ class VideoReceiver(Receiver):
         try:
             picture = self._decoder.decode(data)
         except Missing as error:
-            # a loss is the network's, and repaired in a moment
+            # A loss in the network is ordinary, and soon repaired.
             self._node.get_logger().debug(str(error))
             self._ask()
             return
@@ -199,12 +199,12 @@ class VideoReceiver(Receiver):
             self._node.complain(error.cause, f'packet not shown: {error}')
             self._ask()
             return
-        # of pictures that come in a burst, after a repaired loss, the last ones are of interest
+        # After a repaired loss, pictures come in a burst; show only the last ones.
         if picture is not None and self._worker.waiting < 2:
             self._publish(message.image(header, picture))
 
     def _count(self, tag: Tag) -> None:
-        """Count the packets that are missing between those that came whole."""
+        """Count the packets that are missing between complete packets."""
         last = self._counted
         if last is not None and tag.stream == last.stream:
             gap = (tag.sequence - last.sequence) & 0xffffffff
@@ -214,7 +214,7 @@ class VideoReceiver(Receiver):
         self._counted = tag
 
     def _ask(self) -> None:
-        """Ask for a key, and again only after a while."""
+        """Request a keyframe, at most once per interval."""
         now = time.monotonic()
         if now - self._asked >= REQUEST_INTERVAL:
             self._asked = now

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Packets in pieces of which some may be lost: forward error correction for links that lose.
+Split packets into pieces, and repair lost pieces: forward error correction for lossy links.
 
-A packet of ten fragments is lost with any one of them: at 2 % loss that is every fifth. So while a
-receiver reports losses, each packet is sent once more in pieces that fit into one datagram each,
-with parities: the pieces in turn form groups, and a group's parity (its pieces' exclusive or)
-replaces any one of them. Nothing is asked for twice, so a repair costs no round trip.
+The loss of one fragment loses a whole packet: with ten fragments and 2 % loss, every fifth one.
+While a receiver reports losses, the sender also sends each packet in pieces that fit into one
+datagram each, with parities. The pieces form groups in turn. The parity of a group (the exclusive
+or of its pieces) replaces any one piece. No piece is sent on request, so a repair costs no round
+trip.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ import zlib
 import numpy
 from numpy.typing import NDArray
 
-#: Bytes of a piece, so that with all headers it stays below the VPN's 1420.
+#: Bytes of a piece; with all headers it stays below the VPN's MTU of 1420 bytes.
 PIECE = 1100
-#: Pieces that share a parity.
+#: Number of pieces that share a parity.
 GROUP = 5
-#: Packets that are put together at once; what is older is given up.
+#: Number of packets to reassemble at once; older ones are given up.
 OPEN = 6
 _HEADER = struct.Struct('>IIIHHH')
-#: A piece's checksum: what is damaged counts as lost.
+#: Checksum of a piece; a damaged piece counts as lost.
 _SUM = struct.Struct('>I')
 
 
 def pieces(stream: int, sequence: int, packet: bytes) -> list[bytes]:
-    """Return a packet as pieces, parities last; any loss of one in a group can be repaired."""
+    """Split a packet into pieces, parities last; one lost piece per group can be repaired."""
     count = max(1, -(-len(packet) // PIECE))
     parities = -(-count // GROUP)
     block = numpy.zeros((count, PIECE), numpy.uint8)
@@ -38,7 +39,7 @@ def pieces(stream: int, sequence: int, packet: bytes) -> list[bytes]:
     out = []
     for index in range(count + parities):
         if index < count:
-            # what the last piece lacks is zero, and needs not travel
+            # The last piece is padded with zeros, which need not be sent.
             body = packet[index * PIECE:(index + 1) * PIECE]
         else:
             body = numpy.bitwise_xor.reduce(block[index - count::parities], axis=0).tobytes()
@@ -58,13 +59,13 @@ class _Packet:
 
 
 class Assembler:
-    """Puts packets together from their pieces, in whatever order those come."""
+    """Reassemble packets from pieces in any order."""
 
     def __init__(self) -> None:
         self._packets: dict[tuple[int, int], _Packet] = {}
 
     def add(self, piece: bytes) -> Optional[bytes]:
-        """Take a piece; return its packet if this was the one that was still missing."""
+        """Add a piece; return its packet if this piece completes the packet, else None."""
         start = _SUM.size + _HEADER.size
         if len(piece) < start or _SUM.unpack_from(piece)[0] != zlib.crc32(piece[_SUM.size:]):
             return None
@@ -93,7 +94,7 @@ class Assembler:
         return whole
 
     def _repair(self, packet: _Packet) -> bool:
-        """Fill groups that miss one piece; return whether the packet is whole."""
+        """Repair groups with one missing piece; return whether the packet is complete."""
         whole = True
         for parity in range(packet.parities):
             members = [*range(parity, packet.count, packet.parities), packet.count + parity]

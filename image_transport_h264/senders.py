@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the encoder node does with an image, by codec: video, single pictures, as it is."""
+"""Send images from the encoder node, by codec: video, single pictures, or raw images."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ from image_transport_h264.pacing import MOST, Pace, Sent
 from image_transport_h264.repair import pieces
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
-#: Bytes from which on images of all nodes of this computer take turns.
+#: Bytes from which the nodes of this computer take turns to send images.
 LARGE = 200_000
 
 
 class Sender(abc.ABC):
-    """Publishes coded images; ``send`` runs in the worker's thread."""
+    """Encode and publish images; ``send`` runs in the worker's thread."""
 
     publishers: Sequence[Publisher]
 
     def listeners(self) -> int:
-        """Return how many subscriptions the stream has."""
+        """Return the number of subscriptions of the stream."""
         return sum(publisher.get_subscription_count() for publisher in self.publishers)
 
     @abc.abstractmethod
     def send(self, image: Image) -> None:
-        """Code and publish an image."""
+        """Encode and publish an image."""
 
 
 def make_sender(
     node: LazyNode, codec: str, stream: str, changed: Callable[[], None],
 ) -> Sender:
     """
-    Return the codec's sender.
+    Create the sender of a codec.
 
-    :param changed: called when the stream's subscribers come or go.
-    :raises ValueError: no such codec.
+    :param changed: callback for a change of the stream's subscribers.
+    :raises ValueError: the codec is unknown.
     """
     if codec == 'h264':
         return VideoSender(node, stream, changed)
@@ -70,9 +70,9 @@ def make_sender(
 
 class PictureSender(Sender):
     """
-    Publishes complete images no faster than they are acknowledged, so that none waits on the link.
+    Publish complete images at the rate of their acknowledgements, so that none waits on the link.
 
-    The node keeps the newest image meanwhile and drops the others.
+    Meanwhile the node keeps the newest image, and drops the others.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class PictureSender(Sender):
         self._under_way: list[Future[tuple[Sent, float, bool]]] = []
 
     def _put(self, message: Any) -> None:
-        """Publish a message; return when another one may be sent."""
+        """Publish a message, and wait until the next one may be sent."""
         if len(message.data) >= LARGE:
             self._node.put_through(self._publisher, message)
             return
@@ -103,7 +103,7 @@ class PictureSender(Sender):
         return sent, time.monotonic(), arrived
 
     def _settle(self) -> None:
-        """Tell the pace of the images that are no longer under way."""
+        """Report images that are acknowledged or given up to the pace."""
         for future in [future for future in self._under_way if future.done()]:
             self._under_way.remove(future)
             sent, when, arrived = future.result()
@@ -114,7 +114,7 @@ class PictureSender(Sender):
 
 
 class RawSender(PictureSender):
-    """Passes images on as they are."""
+    """Publish raw images."""
 
     def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
         super().__init__(node, Image, stream, changed)
@@ -125,7 +125,7 @@ class RawSender(PictureSender):
 
 
 class StillSender(PictureSender):
-    """Publishes JPEG or PNG, as the C++ ``compressed`` transport does."""
+    """Publish JPEG or PNG images, as the C++ ``compressed`` transport does."""
 
     def __init__(
         self, node: LazyNode, codec: str, stream: str, changed: Callable[[], None],
@@ -136,7 +136,7 @@ class StillSender(PictureSender):
         node.add_on_set_parameters_callback(self._set)
 
     def send(self, image: Image) -> None:
-        """Encode the image by itself."""
+        """Encode and publish the image."""
         try:
             form, data = stills.encode(message.picture(image), self._kind, self._quality)
         except CodecError as error:
@@ -155,7 +155,7 @@ class StillSender(PictureSender):
         return SetParametersResult(successful=True)
 
 
-#: name, default, what it is for
+#: name, default, description
 PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ('bitrate', 8_000_000, 'most bits per second that the stream takes'),
     ('quality', 25.0, "libx264's constant rate factor, 0 to 51, less is better"),
@@ -169,7 +169,7 @@ PARAMETERS: tuple[tuple[str, Any, str], ...] = (
 
 
 class VideoSender(Sender):
-    """Publishes H.264; follows what each decoder tells of the link."""
+    """Publish H.264, and adapt to the links that the decoders report."""
 
     def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
         self._node = node
@@ -188,7 +188,7 @@ class VideoSender(Sender):
         self._video = node.offer(CompressedImage, stream, STREAM_QOS, self._matched)
         self.publishers = [self._video]
         self._others: list[tuple[Publisher, Any, Callable[[Any, Header, Packet], Any]]] = []
-        # the same packets in the messages that others know, where those are installed
+        # Also publish the packets as the messages of other packages, where these are installed.
         base = stream.rpartition('/')[0]
         for package, name, topic, make in (
             ('ffmpeg_image_transport_msgs', 'FFMPEGPacket', 'ffmpeg', message.ffmpeg_packet),
@@ -211,7 +211,7 @@ class VideoSender(Sender):
     def _matched(self) -> None:
         known = self.listeners()
         if known > self._known:
-            # a new reader has no key picture to begin with
+            # A new reader needs a keyframe to start.
             with self._lock:
                 self._key_wanted = True
         self._known = known
@@ -219,7 +219,7 @@ class VideoSender(Sender):
 
     def _key_requested(self, _: Empty) -> None:
         with self._lock:
-            # one that left less than a round trip ago is the answer already
+            # A keyframe that left less than a round trip ago already answers the request.
             if time.monotonic() - self._last_key > 1.5 * self._control.round_trip + 0.02:
                 self._key_wanted = True
 
@@ -246,7 +246,7 @@ class VideoSender(Sender):
     # --- in the worker's thread
 
     def send(self, image: Image) -> None:
-        """Encode and publish the image, unless it is one that has to be left out."""
+        """Encode and publish the image, unless the rate control skips it."""
         now = time.monotonic()
         picture = message.picture(image)
         with self._lock:
@@ -262,8 +262,8 @@ class VideoSender(Sender):
                 self._key_wanted |= key
             return
         if packet.format == 'ffv1':
-            # worth nothing without any of its parts: decoders have those come again, and by that
-            # it goes at the link's rate
+            # An incomplete deep picture is useless, so the middleware repeats lost parts; the
+            # wait for the acknowledgement limits the rate to the link's.
             self._node.put_through(self._video, message.compressed(image.header, packet))
             return
         with self._lock:
@@ -278,7 +278,7 @@ class VideoSender(Sender):
                 self._last_key = left
             self._control.sent(
                 packet.tag.sequence, len(packet.data) + sum(map(len, again)), left)
-        # the pieces first: with one lost, the packet is whole a datagram later, and not a packet
+        # Pieces first: after a loss, the packet is then complete one datagram later.
         for piece in again:
             self._node.put_out(self._pieces, UInt8MultiArray(data=message.octets(piece)))
         self._publish(image.header, packet)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JPEG and PNG, each picture on its own, as ROS's ``compressed`` image transport writes them."""
+"""Code single pictures as JPEG or PNG, as ROS's ``compressed`` image transport does."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from image_transport_h264.codec import Damaged
 from image_transport_h264.picture import BadPicture, Buffer, Layout, LAYOUTS, Picture
 
 Format = Literal['jpeg', 'png']
-#: 8 or 16 bits a channel.
+#: Arrays with 8 or 16 bits per channel.
 Pixels = NDArray[Any]
 PNG_LEVEL = 3
 _TO_BGR = {'rgb24': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGRA,
@@ -22,10 +22,10 @@ _TO_BGR = {'rgb24': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGRA,
 
 def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, bytes]:
     """
-    Return what goes into ``format`` and ``data`` of ``sensor_msgs/CompressedImage``.
+    Return ``format`` and ``data`` of a ``sensor_msgs/CompressedImage``.
 
-    :param quality: JPEG's, 1 to 100.
-    :raises BadPicture: bad fields, or an encoding that the format can't hold.
+    :param quality: quality of JPEG, 1 to 100.
+    :raises BadPicture: the fields are invalid, or the format cannot hold the encoding.
     """
     picture.check()
     layout = picture.layout
@@ -49,10 +49,10 @@ def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, byte
 
 def decode(form: str, data: Buffer) -> Picture:
     """
-    Return the picture.
+    Decode a JPEG or PNG image.
 
-    :param form: the message's ``format``; names the encoding that was before, if any.
-    :raises Damaged: it isn't a picture.
+    :param form: ``format`` of the message; it may name the original encoding.
+    :raises Damaged: the data are no image.
     """
     try:
         pixels = cv2.imdecode(numpy.frombuffer(data, numpy.uint8), cv2.IMREAD_UNCHANGED)
@@ -66,7 +66,7 @@ def decode(form: str, data: Buffer) -> Picture:
         encoding = {1: 'mono8', 3: 'bgr8', 4: 'bgra8'}[1 if pixels.ndim == 2 else pixels.shape[2]]
         layout = LAYOUTS[encoding]
     if layout.kind == 'yuv422':
-        # what was 4:2:2 comes back as colours: OpenCV has no way there without a loss
+        # OpenCV has no lossless conversion back to 4:2:2, so return colours.
         encoding, layout = 'bgr8', LAYOUTS['bgr8']
     rows = numpy.ascontiguousarray(_as(pixels, layout))
     height, width = rows.shape[:2]
@@ -88,7 +88,7 @@ def _pixels(picture: Picture, layout: Layout) -> Pixels:
 
 
 def _as(pixels: Pixels, layout: Layout) -> Pixels:
-    """Return OpenCV's pixels as the layout has them; alpha that JPEG lost is full."""
+    """Convert OpenCV's pixels to the layout; JPEG lost the alpha channel, so make it opaque."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     if layout.kind in ('grey', 'deep'):
         return pixels if channels == 1 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)

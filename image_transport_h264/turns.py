@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-One large message at a time from this computer: what several nodes agree on without talking.
+Let the nodes of one computer send large messages in turn.
 
-Two raw images at once on a slow link are worse than one after the other: each fills the link's
-queue, most of both is lost there, and what is sent again for one is in the way of the other.
+Two raw images at once on a slow link are worse than one after the other. Each fills the link's
+queue, most parts of both are lost there, and repeated parts of one delay the other.
 """
 
 from __future__ import annotations
@@ -15,41 +15,41 @@ import os
 from pathlib import Path
 import time
 
-#: Seconds between two looks at who has the turn; the smallest image that waits takes as long on a
-#: link of 1 Gbit/s.
+#: Poll interval of the lock in seconds; on a link of 1 Gbit/s, the smallest image that takes turns
+#: takes as long.
 _LOOK = 0.002
 
 
 class Turns:
     """
-    Advisory locks on what is there anyway, so that nothing is made; the kernel frees a dead one's.
+    Take turns by advisory locks on existing files, so that no lock file is created.
 
-    A process that has the turn can't take it again before one that waits: the next in line holds a
-    second lock until its turn comes.
+    The kernel frees the locks of a dead process. A process that had its turn cannot take the next
+    one before a waiting process: the next in line holds a second lock while it waits.
 
-    :param path: a file, the same for all who take turns; its folder stands for the line.
+    :param path: a file that is the same for all processes; its folder is the second lock.
     """
 
     def __init__(self, path: Path = Path(__file__)) -> None:
         self._files: list[int] = []
         for one in (path, path.parent):
-            # as part of an archive it is no file, and everybody goes at once, as without this
+            # Inside an archive there is no such file; all nodes then send at once.
             with contextlib.suppress(OSError):
                 self._files.append(os.open(one, os.O_RDONLY | os.O_CLOEXEC))
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         while self._files:
             os.close(self._files.pop())
 
     @contextlib.contextmanager
     def taken(self, longest: float) -> Iterator[bool]:
         """
-        Wait for the turn and have it until the block ends.
+        Wait for the turn, and hold it until the block ends.
 
-        :param longest: seconds to wait; then it goes on without the turn, as one who hangs must
-            not hold up the others for ever.
-        :return: whether it is ours.
+        :param longest: seconds to wait; then continue without the turn, because a process that
+            hangs must not block the others.
+        :return: whether this process has the turn.
         """
         deadline = time.monotonic() + longest
         ours = len(self._files) == 2 and _lock(self._files[1], deadline)
@@ -72,6 +72,6 @@ def _lock(file: int, deadline: float) -> bool:
                 return False
             time.sleep(_LOOK)
         except OSError:
-            return False  # a network's file system that knows no locks
+            return False  # a network file system without locks
         else:
             return True

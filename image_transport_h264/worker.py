@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A thread that works on the newest item and holds at most one more, so that nothing queues."""
+"""Run work on the newest items in a thread, with a bounded queue."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Item = TypeVar('Item')
 
 class Worker(Generic[Item]):
     """
-    Hands items to ``work`` in a thread of its own.
+    Pass items to ``work`` in a thread.
 
-    :param waiting: items that may wait; a further one pushes the oldest out.
-    :param failed: called when ``work`` has raised, which ends the thread.
+    :param waiting: maximum number of waiting items; a further one replaces the oldest.
+    :param failed: callback after ``work`` raised, which ends the thread.
     """
 
     def __init__(
@@ -28,13 +28,13 @@ class Worker(Generic[Item]):
         self._waiting = waiting
         self._news = threading.Condition()
         self._stopping = False
-        #: Items that were pushed out.
+        #: Number of items that were replaced before the work on them began.
         self.dropped = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def put(self, item: Item) -> bool:
-        """Hand an item over and return at once: whether none had to go for it."""
+        """Queue an item, and return at once; return False if it replaced an older item."""
         with self._news:
             whole = len(self._items) < self._waiting
             if not whole:
@@ -46,11 +46,11 @@ class Worker(Generic[Item]):
 
     @property
     def waiting(self) -> int:
-        """Items that wait."""
+        """Number of waiting items."""
         return len(self._items)
 
     def stop(self) -> None:
-        """End the thread after the item it works on; what waits is dropped."""
+        """Stop the thread after its current item; drop the waiting items."""
         with self._news:
             self._stopping = True
             self._news.notify()
@@ -73,5 +73,5 @@ class Worker(Generic[Item]):
                     return
                 item = self._items.popleft()
             self._work(item)
-            # nothing may keep a picture alive while the thread waits
+            # Free the picture while the thread waits for the next one.
             del item
