@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The one orchestrator: from machine specs to machines that run nodes, and back to nothing.
+Create machines from specs, run nodes on them, and delete the machines again.
 
 A :class:`Launch` is the robot's side of one launch. :meth:`Launch.up` takes one machine through
-the steps of the paper; several run in parallel, each in a thread of its caller. Every undo is
-pushed before its step runs. In the order of the steps:
-
-``launch``      what all machines share, checks before anything is created, the way down
-``choosing``    what providers choose before anything is created, and what it costs
-``robot``       what this computer needs to have; ``robot_vpn``: its VPN interface
-``deployment``  one machine's way up, step by step; ``job``: what its steps share
-``creating``    steps 1 to 3: create or take a kept one, wait until it can be reached
-``entering``    log in, give the machine a host key of its own, close the way in behind the VPN
-``guarding``    the agent, armed before anything slow; nodes and heartbeat
+the steps of the paper. Several machines come up in parallel, each in a thread of the caller.
+Each step pushes its undo before it runs. The modules, in the order of the steps:
+``launch``      what all machines share, checks before anything is created, the end of a launch
+``choosing``    choices of the providers before anything is created, and prices
+``robot``       programs and rights that this computer needs; ``robot_vpn``: its VPN interface
+``deployment``  the steps of one machine; ``job``: what the steps share
+``creating``    steps 1 to 3: create or reuse a machine, wait until it can be reached
+``entering``    log in, replace the host key, move SSH into the VPN and close the SSH port
+``guarding``    the agent, started before any slow step; nodes and heartbeat
 ``joining``     step 5: the machine's end of the VPN
-``running``     a machine that is up; ``watching``: whether it still exists
-``comparing``   its clock beside the robot's
+``running``     a machine that is up; ``watching``: check that the machine still exists
+``comparing``   compare the machine's clock with the robot's
 """
 
 from fogros2.deploy.launch import Launch

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Step 9: containers beside a machine's nodes, and images that nodes run in."""
+"""Step 9: start a machine's containers, and download the images that nodes run in."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fogros2.shell import Shell
 
 class Containers:
     """
-    What one machine has of containers; thread-safe.
+    The container engine, the containers and the images of one machine; thread-safe.
 
-    :param directory: of the machine's agent.
-    :param configuration: path of the middleware's configuration there.
+    :param directory: the agent's directory on the machine.
+    :param configuration: path of the middleware's configuration on the machine.
     """
 
     def __init__(self, job: Job, shell: Shell, directory: str, configuration: str) -> None:
@@ -28,22 +28,22 @@ class Containers:
         self._configuration = configuration
         self._lock = threading.Lock()
         self._engine = False
-        #: What the engine knows images as, by what the launch file calls them.
+        #: Name in the engine by (name in the launch file, middleware).
         self._images: dict[tuple[str, str], str] = {}
 
     def start(self, environment: Callable[[], Mapping[str, str]]) -> None:
         """
-        Start a machine's containers, before its nodes, and get the images that those run in.
+        Start a machine's containers, and download the images of the nodes that start later.
 
-        An engine is installed where there is none.
+        Installs a container engine if the machine has none.
 
-        :param environment: waits for the VPN's interface and the middleware's configuration, which
-            a node reads as it starts; returns the variables of the machine's nodes.
-        :raises CommandError: a container doesn't start.
-        :raises PrerequisiteError: the machine can't have an engine, or an image.
+        :param environment: waits for the VPN interface and the middleware's configuration, which
+            a node reads when it starts; returns the environment variables of the machine's nodes.
+        :raises CommandError: a container does not start.
+        :raises PrerequisiteError: the machine cannot install an engine, or download an image.
         """
         job = self._job
-        # here, as nodes in images come later and are to be stopped before
+        # pushed now: nodes that start later run in these images, and stop before this undo
         job.undoing('containers', self._remove)
         if job.spec.containers:
             self._start_containers(environment)
@@ -67,7 +67,7 @@ class Containers:
             detail.append(f'{len(lines)}')
 
     def _lacking(self, container: containers.Container) -> str:
-        """Return the middleware that a container's image has to have, '' for any."""
+        """Return the middleware that a container's image must have, '' for any."""
         if not containers.on_machine_network(container) \
                 or containers.sets(container, 'RMW_IMPLEMENTATION'):
             return ''
@@ -75,10 +75,10 @@ class Containers:
 
     def inside(self, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
         """
-        Return nodes as they are to be started: those with an image run in it, there by then.
+        Download the images of nodes; return the nodes with the commands of their containers.
 
-        :raises PrerequisiteError: the machine can't have an engine, or an image.
-        :raises Unsupported: no engine can run there.
+        :raises PrerequisiteError: the machine cannot install an engine, or download an image.
+        :raises Unsupported: no engine can run on the machine.
         """
         images = self._get(node.image for node in nodes if node.image)
         return [node if not node.image else containers.inside(
@@ -87,7 +87,7 @@ class Containers:
             for node in nodes]
 
     def _get(self, images: Iterable[str]) -> dict[str, str]:
-        """Return what the engine knows images as that nodes run in."""
+        """Download images that nodes run in; return each image's name in the engine."""
         found = dict.fromkeys(images, '')
         if not found:
             return found
@@ -102,7 +102,7 @@ class Containers:
         return found
 
     def _image(self, image: str, rmw: str = '') -> str:
-        """Return what the engine knows an image as, downloaded if it wasn't there."""
+        """Return the engine's name of an image; download the image if it is missing."""
         job = self._job
         if (image, rmw) not in self._images:
             self._ensure_engine()

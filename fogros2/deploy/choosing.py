@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What providers choose for the machines of a launch, before any is made, and what they cost."""
+"""Make the open choices of machine specs before any machine exists, and track the cost."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fogros2.report import Reporter, step
 
 class Choices:
     """
-    The choices and the cost of one launch; thread-safe.
+    Choices and cost of one launch; thread-safe.
 
     :param provider: returns a provider by its name.
     """
@@ -32,7 +32,7 @@ class Choices:
 
     def resolved(self, spec: MachineSpec) -> MachineSpec:
         """
-        Return a spec with every open choice made, once in a launch.
+        Resolve every open choice of a spec, such as 'nearest', once for each launch.
 
         :raises FogError: nothing fits.
         """
@@ -54,14 +54,14 @@ class Choices:
         return chosen
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:
-        """Return what a machine of a resolved spec costs an hour (US dollars), None if unknown."""
+        """Return the price of a machine in US dollars per hour, None if unknown."""
         try:
             return self._provider(spec.provider).cost_per_hour(spec)
         except FogError:
-            return None  # a price is for people to read; what limits it was checked
+            return None  # the price is only displayed; a price limit was checked before
 
     def begin(self, name: str, price: Optional[Decimal]) -> None:
-        """Note that a machine costs money since the first call of this."""
+        """Start to count a machine's cost; a later call changes the price, not the start."""
         if price is None:
             return
         with self._lock:
@@ -69,14 +69,14 @@ class Choices:
             self._costs[name] = (price, begin, None)
 
     def end(self, name: str) -> None:
-        """Note that a machine costs this launch nothing more; harmless twice."""
+        """Stop to count a machine's cost; idempotent."""
         with self._lock:
             known = self._costs.get(name)
             if known is not None and known[2] is None:
                 self._costs[name] = (known[0], known[1], time.monotonic())
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
-        """Return name, US dollars per hour and seconds of each machine whose price is known."""
+        """Return (name, US dollars per hour, seconds) of each machine with a known price."""
         now = time.monotonic()
         with self._lock:
             return [(name, price, (now if end is None else end) - begin)

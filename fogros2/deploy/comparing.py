@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares a machine's clock with the robot's while the launch runs."""
+"""Compare a machine's clock with the robot's clock while the launch runs."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from fogros2.agent_client import Heartbeat
 from fogros2.clock import ClockOffset, OffsetAlarm
 from fogros2.report import ClockMeasured, Reporter
 
-#: Seconds between two looks at what the heartbeat measured.
+#: Poll interval of the heartbeat's measurements, in seconds.
 INTERVAL = 5.0
 
 
 class Comparison:
     """
-    Reports the offset of a machine's clock when it changes, and warns of a large one.
+    Report the offset of a machine's clock when it changes, and warn if it is large.
 
-    Its own thread reports, as a report may wait for a terminal and a heartbeat must not.
+    A separate thread reports: a report may block on a terminal, and a heartbeat must not block.
 
-    :param interval: seconds between two looks.
+    :param interval: poll interval in seconds.
     """
 
     def __init__(

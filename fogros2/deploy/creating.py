@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps 1 to 3: make a machine, or take the one that was kept, and wait until it runs."""
+"""Steps 1 to 3: create a machine or reuse a kept one, and wait until it runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from fogros2.store import boot_id, process_start, robot_name
 
 
 class Creation:
-    """How a deployment comes by its machine, and how the machine ends."""
+    """Create or reuse the machine of a deployment, and end it by its ``on_exit``."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
@@ -44,10 +44,10 @@ class Creation:
 
     def run(self) -> Machine:
         """
-        Return the machine, as soon as a connection can be tried.
+        Create or reuse the machine; return it when a connection can be tried.
 
-        :raises NameTaken: somebody else has a machine of that name, or it is another than asked.
-        :raises ProviderError: refused, or it ended while it came up.
+        :raises NameTaken: another launch uses the name, or the kept machine has other options.
+        :raises ProviderError: the provider refused, or the machine ended while it started.
         """
         job = self._job
         with job.step('machine') as detail:
@@ -73,10 +73,10 @@ class Creation:
                 detail.append(machine.note)
             return machine
 
-    # -- one that is there ----------------------------------------------------------------------
+    # -- a kept machine -------------------------------------------------------------------------
 
     def _kept(self) -> Optional[Machine]:
-        """Return the machine of this name that an earlier launch kept or stopped, if any."""
+        """Return the machine of this name that an earlier launch kept or stopped, or None."""
         job = self._job
         if job.folder.exists():
             before = job.folder.load()
@@ -93,16 +93,16 @@ class Creation:
                     machine = job.provider.describe(before.machine_id)
                     if machine.state is not MachineState.DELETED:
                         self._check_alike(before.asked_options, machine)
-                        # what was chosen then holds; all else is as this launch has it
+                        # the earlier choices still hold; everything else comes from this launch
                         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
                         job.record = dataclasses.replace(before, spec=job.spec)
                         job.former = before.last or before.launch
                         return machine
-        # one that this robot doesn't know of is found, and refused, by ``create``
+        # ``create`` finds and refuses a machine that this robot has no record of
         return None
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
-        """Refuse to take a machine for another one than it was asked to be."""
+        """Raise if the kept machine was created with other options than this launch asks for."""
         job = self._job
         then, now = (json.loads(model.to_json(o)) for o in (before, job.spec.options))
         other = sorted(key for key in {*then, *now} if then.get(key) != now.get(key))
@@ -124,12 +124,12 @@ class Creation:
         self._claim(job.record.token)
         job.provider.adopt(machine.id, job.spec, self._tags())
         if before.monitor_open:
-            # of a launch that was killed
+            # left open by a launch that was killed
             job.provider.publish(machine, monitor_addresses.guarded_port(before.monitor), ())
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             job.provider.start(machine.id)
 
-    # -- a new one ------------------------------------------------------------------------------
+    # -- a new machine --------------------------------------------------------------------------
 
     def _create(self) -> None:
         job = self._job
@@ -158,9 +158,9 @@ class Creation:
                 dependencies=dependencies, cancel=job.cancel,
                 application=monitor_addresses.IMAGE if job.spec.monitored else ''))
         except FogError as error:
-            # of one that was refused nothing has to be looked for
+            # after a refusal, no machine has to be looked for
             self._asked = not error.refused
-            # where there was no answer there may be a machine: only a look tells
+            # without an answer a machine may exist: only a search by tags shows it
             self._refused = isinstance(error, (ConfigurationError, PrerequisiteError))
             for failure in error.undo_failures:
                 job.launch.undo_failed(job.name, 'undo', failure)
@@ -168,13 +168,13 @@ class Creation:
         job.save(machine_id=machine_id)
 
     def _tags(self) -> dict[str, str]:
-        """Return the tags that change with the launch that has the machine."""
+        """Return the tags that change with the launch that uses the machine."""
         spec = self._job.spec
         return {TAG_LAUNCH: self._job.launch.id, TAG_ON_EXIT: spec.on_exit,
                 TAG_EXPIRES: str(int(time.time() + spec.lifetime))}
 
     def _dependencies(self) -> str:
-        """Return the hash by which an image is found that has what the machine will need."""
+        """Return the hash of the machine's dependencies, by which the provider finds an image."""
         job = self._job
         try:
             under = job.launch.underlay(job.spec.workspaces)
@@ -184,7 +184,7 @@ class Creation:
             job.spec, under, [package for package, _ in job.launch.programs(job.name)])
 
     def _claim(self, token: str) -> None:
-        """Write down that this launch has the machine, before there is anything to lose."""
+        """Record that this launch has the machine, before the provider creates anything."""
         job = self._job
         pid = os.getpid()
         job.save(
@@ -204,7 +204,7 @@ class Creation:
     # -- the end --------------------------------------------------------------------------------
 
     def _end(self) -> None:
-        """End the machine by its ``on_exit``; the record goes only when the machine has gone."""
+        """End the machine by its ``on_exit``; delete the record only after the machine."""
         job = self._job
         mode = job.spec.on_exit
         if job.deleted or job.failed and not job.reused:
@@ -223,7 +223,7 @@ class Creation:
             job.launch.choices.end(job.name)
 
     def _made(self) -> list[str]:
-        """Return the id of the machine; a creation that failed half-way is found by its tags."""
+        """Return the machine's id; find the machine of a failed creation by its tags."""
         job = self._job
         if job.record.machine_id is not None:
             return [job.record.machine_id]
@@ -237,4 +237,4 @@ class Creation:
         except FogError:
             if not self._refused:
                 raise
-            return []  # it couldn't even be asked; this was a second look
+            return []  # the creation was refused before the provider was asked

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One machine's way up, step by step; its undo stack becomes the running machine's way down."""
+"""Bring one machine up, step by step; its undo stack later takes the running machine down."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Deployment:
         self.joining = Joining(self.job, self.guard)
 
     def run(self) -> RunningMachine:
-        """Take the steps; on any failure undo those taken."""
+        """Run all steps; on a failure, undo the steps that were started."""
         job = self.job
         with job.undo:
             job.undo.enter_context(job.folder.lock())
-            # the robot's side needs nothing of the machine's: it comes up meanwhile
+            # the robot's VPN interface needs nothing from the machine: it comes up in parallel
             with ThreadPoolExecutor(6, f'fog-{job.name}') as pool:
                 robot = pool.submit(self.launch.robot_vpn().ensure)
                 machine = self.creation.run()
@@ -63,7 +63,7 @@ class Deployment:
                 installing = pool.submit(self.prepare_host, shell, planned.set_result)
                 wait([planned, installing], return_when=FIRST_COMPLETED)
                 ros = planned.result() if planned.done() else installing.result()
-                # while it is installed there
+                # in parallel with the installation on the machine
                 with job.failing():
                     interface = self.joining.fit(interface, ros.facts.routes)
                 joining = pool.submit(self.joining.join, machine, shell, agent, interface)
@@ -86,7 +86,7 @@ class Deployment:
                 heartbeat = self.guard.start(agent, interface, ros, dds)
                 detail.append(f'VPN round trip {(heartbeat.round_trip or 0) * 1e3:.2f} ms')
             job.save(public_key=public_key)
-            # once more, to come first on the way down
+            # pushed a second time, so that the nodes stop first on the way down
             self.guard.undo_nodes(agent)
             self.start_router(agent, interface)
             self.entrance.go_inside(interface)
@@ -99,7 +99,7 @@ class Deployment:
             return running
 
     def _all_of(self, *tasks: Future[Any]) -> None:
-        """Wait for steps that run side by side; the first that fails ends the others."""
+        """Wait for parallel steps; the first failure cancels the others."""
         for task in wait(tasks, return_when=FIRST_EXCEPTION).done:
             if task.exception() is not None:
                 self.job.cancel.set()
@@ -110,7 +110,7 @@ class Deployment:
     def prepare_host(
         self, shell: Shell, on_plan: Callable[[bootstrap.RosInstall], object],
     ) -> bootstrap.RosInstall:
-        """Make the machine ready for ROS 2 nodes; see :func:`fogros2.bootstrap.ensure`."""
+        """Install what ROS 2 nodes need on the machine; see :func:`fogros2.bootstrap.ensure`."""
         job = self.job
         with job.step('ROS 2') as detail:
             ros, note = bootstrap.ensure(
@@ -122,7 +122,7 @@ class Deployment:
             return ros
 
     def equip(self, equipment: Equipment) -> None:
-        """Bring what programs import that are known to come; later ones bring theirs."""
+        """Install what the known programs import; programs that start later add theirs."""
         equipment.ensure(self.launch.programs(self.job.name))
 
     # -- steps 6 and 7: workspace, DDS ----------------------------------------------------------
@@ -130,7 +130,7 @@ class Deployment:
     def sync(
         self, shell: Shell, ros: bootstrap.RosInstall, installed: Future[bootstrap.RosInstall],
     ) -> None:
-        """Send the workspace, and build it where it has to be, with what is installed by then."""
+        """Send the workspace; build it on the machine if needed, after the installation."""
         job = self.job
         if job.spec.workspace is None:
             return
@@ -149,20 +149,20 @@ class Deployment:
         return f'{self.guard.directory}/{self.launch.dds().file_name}'
 
     def configure_dds(self, shell: Shell, interface: VpnInterface) -> dict[str, str]:
-        """Write the DDS configuration there; return the variables that nodes need."""
+        """Write the DDS configuration on the machine; return the variables that nodes need."""
         vendor = self.launch.dds()
-        # the robot hears of a machine by multicast, machines of each other by asking
+        # the robot finds a machine by multicast; machines find each other by unicast to peers
         peers = self.launch.addresses_but(self.job.name)
         path = self.configuration
         shell.put(
             vendor.render(vendor.machine_interfaces(
                 interface.address if vendor.by_address else interface.name), peers).encode(),
-            # for the users of containers, too; the folder lets nobody else in
+            # users inside containers read it too; the folder's mode excludes other users
             path, mode=0o644, timeout=self.job.timeouts.command)
         return dict(vendor.environment(path, {}))
 
     def start_router(self, agent: AgentClient, interface: VpnInterface) -> None:
-        """Start the router that the machine's nodes meet at, for a middleware that has one."""
+        """Start the router of the machine's nodes, for a middleware that has one."""
         name = self.job.name
         router = self.launch.dds().router(
             interface.address, self.launch.addresses_but(name), None)
@@ -176,6 +176,6 @@ class Deployment:
 
 
 def _after(ready: Future[bootstrap.RosInstall], do: Callable[..., None], *words: Any) -> None:
-    """Do something when ROS is there; raises what kept it from getting there."""
+    """Call a function after ROS 2 is installed; raise the error of the installation."""
     ready.result()
     do(*words)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How a launch gets into a machine: with SSH from outside at first, through the VPN from then on.
+Log in to a machine: by SSH from outside at first, through the VPN later.
 
-Where the provider handed the machine's host key over at boot, somebody else may have read it: over
-the first connection the machine makes another, which is the pinned one from then on.
+Some providers hand over the machine's host key at boot, where another program may have read it.
+The machine then generates a new host key over the first connection, and the robot pins that key.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from fogros2.shell import host_key, Shell
 from fogros2.shell.movable import MovableShell
 from fogros2.waiting import wait_until
 
-#: Seconds one attempt to log in may take: a cancel isn't seen before its end. A computer that
-#: exists already has answered once, and gets no more than this.
+#: Time-out of one login attempt in seconds: a cancel takes effect only at its end. An existing
+#: computer, which does not boot, gets no more time than this.
 LOGIN_ATTEMPT = 10.0
-#: Seconds between two looks at the robot's public address, and the machine, while it waits.
+#: Seconds between two checks of the machine's state and of the robot's public address.
 ADDRESS_INTERVAL = 10.0
-#: What a machine that still boots answers.
+#: Errors of a machine that is still booting.
 _TRANSIENT: tuple[type[FogError], ...] = (ConnectError, DeadlineExceeded)
 
 
 class Entrance:
-    """The way into one machine."""
+    """The robot's login to one machine."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
@@ -48,9 +48,9 @@ class Entrance:
 
     def connect(self, machine: Machine) -> Shell:
         """
-        Return a shell on the machine, logged in, with a host key that nobody else has.
+        Log in to the machine; return a shell whose pinned host key only the machine has.
 
-        :raises ShellError: it doesn't let us in.
+        :raises ShellError: the machine refuses the login.
         """
         job = self._job
         assert machine.shell is not None
@@ -64,7 +64,7 @@ class Entrance:
             if job.provider.firewall:
                 job.undoing('firewall', self._close)
                 if job.reused:
-                    # the launch before closed it; or the robot has another address by now
+                    # the earlier launch closed the port, or the robot's address has changed
                     self._open()
             shell = self._shell = MovableShell(self._shell_to(endpoint))
             job.shell = shell
@@ -77,9 +77,9 @@ class Entrance:
 
     def go_inside(self, interface: VpnInterface) -> None:
         """
-        Reach the machine through the VPN, which carries by now, and close the way from outside.
+        Move SSH into the VPN, and close the SSH port to the outside.
 
-        Where the provider has no firewall everything stays as it is.
+        Does nothing where the provider has no firewall.
         """
         job, shell, outside = self._job, self._shell, self._job.record.shell
         if not job.provider.firewall or shell is None or outside is None:
@@ -97,7 +97,7 @@ class Entrance:
             detail.append(f'SSH through the VPN alone, port {outside.port} closed')
 
     def _go_outside(self) -> None:
-        """Reach a machine that is kept without the VPN, which is about to be taken down."""
+        """Reach a kept machine from outside again, before the VPN is taken down."""
         job, shell, outside = self._job, self._shell, self._job.record.shell
         if job.survives and shell is not None and outside is not None:
             self._open()
@@ -109,7 +109,7 @@ class Entrance:
             job.provider.allow(job.machine_id, job.record.shell.port, [])
 
     def _open(self) -> None:
-        """Let this robot in from where it is now."""
+        """Open the SSH port to the robot's current public address."""
         job = self._job
         assert job.record.shell is not None
         address = job.provider.robot_address()
@@ -123,9 +123,9 @@ class Entrance:
         self, shell: Shell, transient: tuple[type[FogError], ...] = _TRANSIENT,
     ) -> None:
         """
-        Wait until the machine lets us in; else say what it answered last.
+        Retry the login until it succeeds; after the time-out, raise the last error.
 
-        :param transient: errors that may pass.
+        :param transient: errors that are retried.
         """
         job = self._job
         last: Optional[FogError] = None
@@ -149,7 +149,7 @@ class Entrance:
             raise last or error from error
 
     def _patience(self) -> float:
-        """Return how long (s) logging in may take; one that runs may have to boot yet."""
+        """Return the login time-out in seconds; a machine that may still boot gets more."""
         job = self._job
         if not job.provider.owned:
             return min(job.timeouts.ssh, LOGIN_ATTEMPT)
@@ -159,7 +159,7 @@ class Entrance:
 
     def _look_around(self) -> None:
         """
-        Look now and then whether the machine is there, and the robot where it was let in from.
+        Check now and then that the machine runs, and that the firewall admits the robot.
 
         :raises ProviderError: the machine has ended.
         """
@@ -176,7 +176,7 @@ class Entrance:
         if state not in (MachineState.PENDING, MachineState.RUNNING):
             raise ProviderError(f"'{job.name}' ended while it was coming up",
                                 "the provider's own log says why")
-        # who can't be asked now is asked again; the login says what is wrong in the end
+        # a failed look-up is retried at the next check; the login's error is reported in the end
         with contextlib.suppress(FogError):
             if job.provider.robot_address() != self._allowed:
                 self._open()
@@ -188,5 +188,5 @@ class Entrance:
         job.save(shell=endpoint, host_key=key)
         job.provider.pin(job.machine_id, key)
         shell.move(self._shell_to(endpoint))
-        # its SSH server may take a moment to read the new one
+        # the SSH server may need a moment to load the new key
         self._log_in(shell, transient=(*_TRANSIENT, HostKeyError))

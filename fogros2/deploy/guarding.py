@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps 8 to 11: the agent that guards a machine, armed before anything slow."""
+"""Steps 8 to 11: install the agent on a machine, configure it and send it heartbeats."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from fogros2.shell import Shell
 from fogros2.waiting import wait_until
 
 AGENT_FOLDER = '/run/fogros2'
-#: Seconds between two looks for the provider's notice that it takes the machine away.
+#: Poll interval in seconds for the provider's preemption notice.
 NOTICE_INTERVAL = 5.0
 
-# All in one round trip. Its input is the configuration, one line (which sh reads byte by byte, so
-# the rest is left to cat), then the agent. $1 folder of all agents, $2 this one's, $3 program,
-# $4 our configuration, $5 login user.
+# Install and start the agent in one round trip. Standard input is the configuration in one line,
+# then the agent's source; sh reads the line byte by byte, so that cat gets the rest.
+# $1 folder of all agents, $2 this agent's folder, $3 program, $4 our configuration, $5 login user.
 _INSTALL = """\
 umask 077
 install -d -m 755 "$1"
@@ -47,8 +47,9 @@ mv -f -- "$aside" "$3"
 python3 -IS "$3" serve --detach --config "$4"
 """
 
-# One that was released has left; one that was never reached hasn't. Another robot's stays: the
-# agent says in its configuration whose it is. $1 folder, $2 launch, $3 our configuration.
+# Remove the agent. A released agent has exited; an agent that was never reached still runs.
+# Another robot's agent stays: its configuration names its launch.
+# $1 folder, $2 launch, $3 our configuration.
 _REMOVE = """\
 running() { [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }
 rm -f -- "$3"
@@ -67,13 +68,13 @@ rmdir -- "${1%/*}" 2>/dev/null || :
 
 
 class Guard:
-    """The agent of one machine, from the robot's side."""
+    """The agent of one machine, seen from the robot."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._released = False
         self._rearming: Optional[_Rearming] = None
-        #: The number of the first event that is this launch's.
+        #: Number of the first event that belongs to this launch.
         self.first_event = 1
 
     @property
@@ -81,18 +82,18 @@ class Guard:
         """The agent's folder on the machine."""
         return self._job.provider.agent_directory or f'{AGENT_FOLDER}/{self._job.name}'
 
-    # -- armed ----------------------------------------------------------------------------------
+    # -- on the way up --------------------------------------------------------------------------
 
     def arm(self, machine: Machine, shell: Shell) -> AgentClient:
         """
-        Make sure that an agent guards the machine.
+        Make sure that an agent guards the machine; connect to the agent.
 
-        :raises AgentError: another launch has it.
+        :raises AgentError: another launch uses the machine.
         """
         job, program = self._job, self._job.provider.agent_program
         config = plan.agent_config(job.spec, job.launch.id, self.directory, machine.end_command)
         config['user'] = machine.shell.user if machine.shell else ''
-        # from here on we speak to it all the time, first to re-arm it, then by heartbeats
+        # from now on the launch keeps in touch: first by re-arming the agent, then by heartbeats
         config['boot_timeout'] = job.spec.robot_timeout
         with job.step('guard'):
             agent = None
@@ -101,7 +102,7 @@ class Guard:
                 if job.on(shell, [Command.script(
                         f'[ ! -S {self.directory}/agent.sock ] || echo there', sudo=True,
                         what='look for an agent')]).strip():
-                    # of a launch that died, or of another robot, whose it stays
+                    # of a launch that died, or of another robot, which keeps it
                     agent = self._reach(shell, program, config)
                 job.undoing('guard', functools.partial(self._remove, shell))
                 if agent is None:
@@ -148,20 +149,20 @@ class Guard:
         self, shell: Shell, program: str, config: Mapping[str, Any],
     ) -> Optional[AgentClient]:
         """
-        Return a connection to the machine's agent, ours from now on; None while there is none.
+        Connect to the machine's agent and claim it; return None if there is no agent yet.
 
-        :raises AgentError: another launch has it.
+        :raises AgentError: another launch uses the machine.
         """
-        # no cancel: it is needed on the way down as well, and requests have deadlines
+        # no cancel: the way down needs the connection too, and each request has a time-out
         agent = AgentClient(shell, self.directory, agent_path=program)
         try:
-            # the record said that the launch before is gone: its agent may not know yet
+            # the record shows that the former launch has ended; its agent may not know that yet
             answer = agent.request('configure', timeout=self._job.timeouts.agent,
                                    force=self._job.former, **config)
         except FogError as error:
             agent.close()
             if isinstance(error, AgentAbsent):
-                return None  # the machine's SSH server may be there before its agent
+                return None  # the SSH server may be up before the agent
             raise
         self.first_event = int(answer.get('next', 1))
         return agent
@@ -180,9 +181,9 @@ class Guard:
         dds: Mapping[str, str],
     ) -> Heartbeat:
         """
-        Tell the agent how to run nodes, and send it heartbeats from now on.
+        Send the agent the environment of nodes, and start the heartbeat.
 
-        :raises VpnError: nothing comes back through the VPN.
+        :raises VpnError: no heartbeat was answered through the VPN.
         """
         job = self._job
         robot = job.launch.robot_vpn().interface
@@ -221,11 +222,11 @@ class Guard:
     # -- the way down ---------------------------------------------------------------------------
 
     def undo_nodes(self, agent: AgentClient) -> None:
-        """Push what has to come first on the way down: the nodes end."""
+        """Push the undo that stops the nodes; it has to run first on the way down."""
         self._job.undoing('nodes', lambda: self.release(agent))
 
     def release(self, agent: AgentClient) -> None:
-        """Have the agent of a computer that stays end the nodes and let go of it; once."""
+        """Make the agent of a surviving machine stop the nodes and release the machine; once."""
         job = self._job
         if not job.survives or self._released:
             return
@@ -234,7 +235,7 @@ class Guard:
             self._rearming.close()
         with contextlib.suppress(AgentAbsent):
             try:
-                # answers when the nodes are gone; out of reach, its watch gets there by itself
+                # answered when the nodes have ended; an agent out of reach ends them by itself
                 agent.request('release', timeout=job.patience(job.timeouts.command), silent=SILENT,
                               launch=job.launch.id, on_exit=job.spec.on_exit,
                               exit=not job.provider.agent_program)
@@ -244,7 +245,7 @@ class Guard:
 
 
 class _Rearming:
-    """Tells an agent that the launch lives for as long as the VPN has no heartbeat yet."""
+    """Re-arm an agent periodically, until heartbeats come through the VPN."""
 
     def __init__(self, agent: AgentClient, launch_id: str, interval: float) -> None:
         self._agent = agent
@@ -258,8 +259,8 @@ class _Rearming:
             try:
                 self._agent.request('configure', launch=self._launch_id, again=True)
             except FogError:
-                pass  # the next one may get through; the step under way says what is wrong
+                pass  # the next one may get through; the current step reports a lasting failure
 
     def close(self) -> None:
-        """Stop: heartbeats go on in its place."""
+        """Stop re-arming the agent."""
         self._done.set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the steps of one machine's deployment share."""
+"""The state that the steps of one machine's deployment share."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from fogros2.store import MachineDirectory, Record
 if TYPE_CHECKING:
     from fogros2.deploy.launch import Launch
 
-#: Seconds in which a machine that is to be tidied up has to answer, and those that each further
-#: part of it may take if it doesn't: a Ctrl-C shouldn't wait for a computer that is off.
+#: Seconds in which a machine has to answer on the way down, and the time-out of each further
+#: undo step if the machine does not: Ctrl-C must not wait long for a computer that is off.
 ANSWER, HURRIED = 4.0, 2.0
-#: Seconds that it may say nothing, having answered before, and one command may take then.
+#: Seconds without a sign of life that the way down accepts; time-out of one of its commands.
 SILENT = 15.0
 
 
 class Job:
     """
-    One machine's deployment: its record, what was asked and decided, and the way back.
+    One machine's deployment: spec, record, shell, undo stack, cancel event.
 
-    :param spec: as the launch file has it; ``spec`` becomes the one with all choices made.
+    :param spec: the launch file's spec; later steps replace it by one with all choices made.
     """
 
     def __init__(self, launch: Launch, spec: MachineSpec) -> None:
@@ -43,24 +43,24 @@ class Job:
         self.undo = contextlib.ExitStack()
         self.undo.callback(self._tell_left)
         self._left: list[str] = []
-        #: Whether an earlier launch made the machine, and the id of the one that had it last.
+        #: Whether an earlier launch created the machine, and the id of its last launch.
         self.reused = False
         self.former = ''
-        #: Until the machine is up.
+        #: False as soon as the machine is up.
         self.failed = True
         #: ``gone``: the provider reports the machine as stopped.
         #: ``deleted``: the provider no longer knows the machine.
         self.gone = self.deleted = False
         self.shell: Optional[Shell] = None
-        #: Asks the machine's agent for a sign of life, within so many seconds.
+        #: Ping the machine's agent; the argument is the time-out in seconds.
         self.ask: Optional[Callable[[float], object]] = None
         self._hurried: Optional[bool] = None
-        #: Set when the launch's is, or when a step failed: those beside it needn't go on.
+        #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
         self.cancel = Either(launch.cancel)
 
     @contextlib.contextmanager
     def failing(self) -> Iterator[None]:
-        """End what runs beside the block if that fails."""
+        """Cancel the parallel steps if the block fails."""
         try:
             yield
         except BaseException:
@@ -73,14 +73,14 @@ class Job:
 
     def undoing(self, name: str, undo: Callable[[], None]) -> None:
         """
-        Push an undo step; its failure is reported, and the others run all the same.
+        Push an undo step; if it fails, report the error, and run the other undo steps.
 
-        What stays on a machine that doesn't answer is reported once, in the end.
+        Steps that fail because the machine does not answer are reported together, at the end.
         """
         self.undo.callback(self.undone, name, undo)
 
     def undone(self, name: str, undo: Callable[[], None]) -> None:
-        """Take an undo step now, in the same manner."""
+        """Run an undo step now, with the error handling of :meth:`undoing`."""
         def tried() -> None:
             try:
                 undo()
@@ -92,14 +92,14 @@ class Job:
         self.launch.attempt(self.name, name, tried)
 
     def _tell_left(self) -> None:
-        """Say what is left on a machine that didn't answer, and how it ends."""
+        """Report what stays on a machine that did not answer, and how the machine ends."""
         def tell() -> None:
             if self.folder.exists():
                 ends = 'ends the nodes'
                 hint = f'the next launch may take the machine, or: ros2 fog delete {self.name}'
             else:
                 ends, hint = 'ends all of that and leaves', 'nothing needs to be done'
-            # one whose agent was about to start may have none
+            # the agent may not have started yet
             agent = 'its agent' if self.ask is not None else 'its agent, if it has one by now,'
             raise ConnectError(
                 f"'{self.name}' does not answer, so what it has of this launch stays there "
@@ -110,20 +110,20 @@ class Job:
             self.launch.attempt(self.name, 'left there', tell)
 
     def save(self, **changes: Any) -> None:
-        """Write changes of the record down."""
-        # known here even where it can't be written down, as the way down needs it
+        """Change fields of the record and write it to disk."""
+        # the way down needs the changes even if they cannot be written
         self.record = dataclasses.replace(self.record, **changes)
         self.folder.save(self.record)
 
     @property
     def machine_id(self) -> str:
-        """The provider's id of the machine; there is one as soon as it was asked for."""
+        """The provider's id of the machine; set as soon as the provider has created it."""
         assert self.record.machine_id is not None
         return self.record.machine_id
 
     @property
     def survives(self) -> bool:
-        """Whether the computer stays when the launch ends, so that it has to be tidied up."""
+        """Whether the machine outlives the launch, so that the launch has to clean it up."""
         if self.gone:
             return False
         if self.failed and not self.reused:
@@ -131,7 +131,7 @@ class Job:
         return self.spec.on_exit == 'keep' or not self.provider.owned
 
     def on(self, shell: Shell, commands: Iterable[Command]) -> str:
-        """Run commands on the machine on the way up; return what the last one printed."""
+        """Run commands on the machine on the way up; return the last one's output."""
         output = ''
         for command in commands:
             output = shell.run(
@@ -139,7 +139,7 @@ class Job:
         return output
 
     def tidy(self, shell: Shell, commands: Iterable[Command]) -> None:
-        """Run commands on the machine on the way down."""
+        """Run commands on the machine on the way down, with short time-outs."""
         for command in commands:
             try:
                 shell.run(command, timeout=self.patience(min(self.timeouts.vpn, SILENT)))
@@ -148,14 +148,14 @@ class Job:
                 raise
 
     def hurry(self) -> None:
-        """Shorten the time-outs of the remaining undo steps: the machine doesn't answer."""
+        """Shorten the time-outs of the remaining undo steps: the machine does not answer."""
         self._hurried = True
 
     def patience(self, seconds: float) -> float:
         """
-        Return how long a part of the way down may take that needs the machine.
+        Return the time-out in seconds of an undo step that needs the machine.
 
-        :param seconds: what it may take of a machine that answers; the first to ask finds out.
+        :param seconds: the time-out if the machine answers; the first call checks whether it does.
         """
         if self._hurried is None:
             self._hurried = not self._answers()
@@ -169,7 +169,7 @@ class Job:
         except DeadlineExceeded:
             return False
         except FogError:
-            pass  # the agent has gone, the machine may be there
+            pass  # the agent has ended; the machine may still be there
         try:
             if self.shell is not None:
                 self.shell.run(
@@ -181,16 +181,16 @@ class Job:
 
 
 class Either(threading.Event):
-    """An event that counts as set when another one is set, too."""
+    """An event that also counts as set when another event is set."""
 
     def __init__(self, other: threading.Event) -> None:
         super().__init__()
         self._other = other
 
     def is_set(self) -> bool:
-        """Return whether one of the two is set."""
+        """Return whether one of the two events is set."""
         return super().is_set() or self._other.is_set()
 
     def wait(self, timeout: Optional[float] = None) -> bool:
-        """Wait for the other one, a Ctrl-C; that this one was set is seen after ``timeout``."""
+        """Wait for the other event; notice this event only after ``timeout`` seconds."""
         return self._other.wait(timeout) or self.is_set()

@@ -19,7 +19,7 @@ from fogros2.report import step
 from fogros2.shell import Shell
 from fogros2.vpn import addresses
 
-#: What sends a packet to an address and port, so that the other side hears of this one.
+#: Sends a packet to an address and port, from which the peer learns this end's endpoint.
 _KNOCK = """\
 import socket, sys
 socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', (sys.argv[1], int(sys.argv[2])))
@@ -27,7 +27,7 @@ socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', (sys.argv[1], int(s
 
 
 class Joining:
-    """How one machine becomes part of the launch's VPN, and leaves it."""
+    """Add one machine to the launch's VPN, and remove it."""
 
     def __init__(self, job: Job, guard: Guard) -> None:
         self._job = job
@@ -35,7 +35,7 @@ class Joining:
         self._member: Optional[VpnMember] = None
 
     def interface(self) -> VpnInterface:
-        """Return the machine's interface, decided and written down before it is made."""
+        """Return the machine's interface; record it before it is created."""
         job = self._job
         robot = job.launch.robot_vpn().interface
         port = job.record.vpn.port if job.record.vpn else plan.machine_port(job.launch.id)
@@ -47,11 +47,11 @@ class Joining:
 
     def fit(self, interface: VpnInterface, routes: Sequence[str]) -> VpnInterface:
         """
-        Return the interface as it suits a machine with these routes, IPv4, in CIDR form.
+        Adapt the interface to a machine with these routes (IPv4, CIDR).
 
-        The robot chose the launch's subnet before there was a machine, and its nodes may run. So
-        the launch isn't numbered anew where a machine has a network that overlaps; the machine
-        leads its peers' addresses alone into the VPN.
+        The robot chose the launch's subnet before the machine existed, and its nodes may already
+        run, so the subnet stays. If one of the machine's networks overlaps the subnet, the machine
+        routes only its peers' addresses into the VPN.
         """
         if addresses.overlapping(interface.network, routes):
             interface = dataclasses.replace(interface, host_routes=True)
@@ -62,9 +62,9 @@ class Joining:
         self, machine: Machine, shell: Shell, agent: AgentClient, interface: VpnInterface,
     ) -> VpnMember:
         """
-        Bring the machine's interface up, and let the others know of it.
+        Bring the machine's interface up, and add the machine to the peers of the others.
 
-        :raises VpnError: its port is taken, or neither of the two can dial the other.
+        :raises VpnError: the port is in use, or neither end can reach the other.
         """
         job = self._job
         with job.step('VPN') as detail:
@@ -78,7 +78,7 @@ class Joining:
                 robot.interface.port)
 
             def keep(peers: Sequence[Peer]) -> None:
-                """Have the agent repair the machine's VPN when its program dies."""
+                """Make the agent repair the machine's VPN when its program ends."""
                 agent.request(
                     'keep', timeout=job.timeouts.agent, what='vpn', interval=1.0,
                     alive=list(vpn.alive(interface).argv),
@@ -88,7 +88,7 @@ class Joining:
             member = VpnMember(
                 place, interface, lambda commands: job.on(shell, commands), keep)
             try:
-                # who is dialled has to know the other by then: the next attempt comes after 5 s
+                # configure the end that is dialled first: the dialling end retries only after 5 s
                 if place.robot_endpoint is not None:
                     robot.admit(member)
                     member.up(robot)
@@ -115,9 +115,9 @@ class Joining:
 
     def redial(self, machine: Machine) -> None:
         """
-        Have a machine that dials the robot do so where the robot is by now.
+        Update the robot's endpoint on a machine that dials the robot, if it has changed.
 
-        :param machine: what its provider tells of it.
+        :param machine: what the provider reports.
         """
         member, job = self._member, self._job
         if member is None or member.place.robot_endpoint is None or not machine.robot_host:
@@ -131,7 +131,7 @@ class Joining:
                 member.redial(robot, endpoint)
                 detail.append(f'dials {endpoint}')
                 if job.shell is not None:
-                    # by its next packet the robot learns the way back; a keepalive would take 25 s
+                    # its next packet shows the robot the way back; a keepalive would take 25 s
                     job.on(job.shell, [Command(
                         ('python3', '-IS', '-c', _KNOCK, robot.interface.address,
                          str(plan.HEARTBEAT_PORT)), what='greet the robot')])
@@ -139,6 +139,6 @@ class Joining:
     def _leave(self, shell: Shell, agent: AgentClient, interface: VpnInterface) -> None:
         job = self._job
         if job.survives:
-            # or the agent would take the interface for a broken one
+            # otherwise the agent would repair the interface
             job.undone('nodes', lambda: self._guard.release(agent))
             job.tidy(shell, job.launch.robot_vpn().vpn.down(interface))

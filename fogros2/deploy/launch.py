@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's side of one launch: its machines, its VPN interface, its DDS configuration."""
+"""The robot's side of one launch: machines, the VPN interface, the DDS configuration."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ class Launch:
     """
     The robot's side of one launch; thread-safe.
 
-    :param report: gets each step as it begins and ends.
-    :param cancel: set to make every wait of the deployment end with Cancelled.
-    :param environment: the environment that the launch was started in.
+    :param report: receives each step when it begins and when it ends.
+    :param cancel: when set, every wait of the deployment raises Cancelled.
+    :param environment: the environment variables of the launch; ``os.environ`` if None.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Launch:
     ) -> None:
         self.id = secrets.token_hex(3)
         self.store = store or Store()
-        # `ros2 fog status --watch` and the dashboard read what is kept
+        # `ros2 fog status --watch` and the dashboard read the journal
         self.report: Reporter = Journal(report, self.store.root / 'launches' / self.id)
         self.timeouts = timeouts or Timeouts()
         self.cancel = cancel or threading.Event()
@@ -93,11 +93,11 @@ class Launch:
         images: Mapping[str, Sequence[str]] = {},
     ) -> None:
         """
-        Check everything that can be checked at no cost.
+        Check everything that can be checked at no cost, and make the open choices.
 
-        :param programs: per machine name the (package, executable) pairs that will run there.
-        :param images: likewise the container images that nodes there will run in.
-        :raises FogError: the first thing that is wrong, with its remedy.
+        :param programs: machine name to the (package, executable) pairs that will run there.
+        :param images: machine name to the container images that nodes there will run in.
+        :raises FogError: the first problem that was found, with its remedy.
         """
         self.dds()
         check_robot()
@@ -134,10 +134,10 @@ class Launch:
                 choice.result()
 
     def _choose(self, spec: MachineSpec) -> None:
-        """Choose what the spec leaves open, and look whether what travels will run there."""
+        """Make the open choices of a spec; check that wheels and workspace fit its processor."""
         spec = self.choices.resolved(spec)
         if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
-            return  # it depends on the machine's system alone
+            return  # only the machine's system decides
         architecture = self.provider(spec.provider).architecture(spec)
         if architecture:
             bootstrap.check_architecture(
@@ -145,7 +145,7 @@ class Launch:
                 workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)
 
     def _may_be_kept(self, spec: MachineSpec) -> bool:
-        """Return whether a machine of an earlier launch may be taken, whose choices hold."""
+        """Return whether this spec may reuse a machine of an earlier launch, with its choices."""
         folder = self.store.machine(spec.name)
         try:
             before = folder.load() if folder.exists() else None
@@ -164,9 +164,9 @@ class Launch:
 
     def provider(self, name: str) -> Provider:
         """
-        Return the provider of that name, one for all machines of the launch.
+        Return the provider with this name; all machines of the launch share it.
 
-        :raises ConfigurationError: there is none.
+        :raises ConfigurationError: there is no such provider.
         """
         with self._lock:
             if name not in self._providers:
@@ -176,18 +176,18 @@ class Launch:
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
         """
-        Return each machine of the launch whose price is known, those that have ended too.
+        Return the cost of each machine with a known price, ended machines included.
 
-        Name, US dollars per hour, and the seconds that this launch has had it.
+        Each item is (name, US dollars per hour, seconds that this launch has used the machine).
         """
         return self.choices.cost()
 
     def use_dds(self, name: str) -> None:
         """
-        Have all nodes use a middleware, as if RMW_IMPLEMENTATION had named it.
+        Select the middleware of all nodes, as if RMW_IMPLEMENTATION had named it.
 
-        :param name: as RMW_IMPLEMENTATION has it, or short: 'cyclonedds', 'fastdds', 'zenoh'.
-        :raises DdsError: there is no plugin for it, or terminals and nodes that run have another.
+        :param name: a value of RMW_IMPLEMENTATION, or 'cyclonedds', 'fastdds', 'zenoh'.
+        :raises DdsError: no plugin has this name, or the launch already uses another middleware.
         """
         rmw = plan.rmw_of(name, plugin_system.names('fogros2.dds'))
         with self._lock:
@@ -202,9 +202,9 @@ class Launch:
 
     def dds(self) -> DdsVendor:
         """
-        Return the DDS vendor of the launch.
+        Return the DDS vendor plugin of the launch.
 
-        :raises DdsError: the user's RMW_IMPLEMENTATION has no plugin, or isn't installed.
+        :raises DdsError: the user's RMW_IMPLEMENTATION has no plugin, or is not installed.
         """
         if not self._rmw:
             rmw = plan.choose_rmw(self.user_environment, plugin_system.names('fogros2.dds'))
@@ -218,7 +218,7 @@ class Launch:
         """
         The ROS domain of all nodes of the launch.
 
-        :raises ConfigurationError: ROS_DOMAIN_ID is no number.
+        :raises ConfigurationError: ROS_DOMAIN_ID is not a number.
         """
         text = self.user_environment.get('ROS_DOMAIN_ID') or '0'
         try:
@@ -231,7 +231,7 @@ class Launch:
         """
         Return the robot's own ROS 2 as paths, and workspaces; the first need not be sourced.
 
-        :raises PrerequisiteError: there is none.
+        :raises PrerequisiteError: the robot has no ROS 2.
         """
         ros2 = shutil.which('ros2', path=self.user_environment.get('PATH'))
         if ros2 is None:
@@ -242,12 +242,12 @@ class Launch:
 
     def robot_environment(self) -> dict[str, str]:
         """
-        Return the variables that the robot's nodes need, with the VPN's interface there.
+        Bring the VPN interface up; return the environment variables of the robot's nodes.
 
-        A node takes the interfaces that it finds when it starts, so this one has to be there
-        before the first of them, well before any machine is. It takes a tenth of a second, once.
+        A node uses the network interfaces that exist when it starts. So the VPN interface has to
+        exist before the first node, long before any machine. The first call takes about 0.1 s.
 
-        :raises FogError: this computer can't have it.
+        :raises FogError: this computer cannot create the interface.
         """
         with self._lock:
             if self._robot_environment is None:
@@ -262,11 +262,11 @@ class Launch:
                 # no peers: the machines announce themselves
                 write_private(
                     path, vendor.render(interfaces, (), self.user_environment).encode())
-                # for terminals that join, which look for the second
+                # for terminals that join the launch: they read the domain and the middleware
                 write_private(path.with_name('domain'), str(self.domain).encode())
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
                 robot.ensure()
-                # a node with the VPN's interface, as any: it ends before the interface
+                # the ROS 2 daemon is a node that uses the interface: it has to end first
                 self.undo.callback(ros2_daemon.stop, path.parent)
                 self._route(vendor, path.parent)
                 self._robot_environment = dict(
@@ -274,7 +274,7 @@ class Launch:
             return dict(self._robot_environment)
 
     def _route(self, vendor: DdsVendor, folder: Path) -> None:
-        """Start the router that the robot's nodes meet at, for a middleware that has one."""
+        """Start the router of the robot's nodes, for a middleware that has one."""
         robot = self.robot_vpn().interface
         machines = [
             plan.machine_interface('', robot.network, index, 0, '').address
@@ -282,11 +282,11 @@ class Launch:
         router = vendor.router(robot.address, machines, self.user_environment)
         if router is not None:
             running = routing.RobotRouter(router, folder, self.user_environment)
-            # after the robot's nodes, and before the VPN
+            # runs after the robot's nodes have ended, and before the VPN goes down
             self.undo.callback(running.close)
 
     def expect(self, names: Iterable[str]) -> None:
-        """Give machines their addresses ahead, so that nodes started meanwhile know them."""
+        """Reserve the VPN addresses of machines, so that nodes that start earlier know them."""
         with self._lock:
             for name in names:
                 self._indices.setdefault(name, len(self._indices))
@@ -296,7 +296,7 @@ class Launch:
         return self._indices[name]
 
     def addresses_but(self, name: str) -> list[str]:
-        """Return the VPN addresses of all machines that are known of, but one."""
+        """Return the VPN addresses of all known machines except one."""
         network = self.robot_vpn().interface.network
         with self._lock:
             indices = [index for other, index in self._indices.items() if other != name]
@@ -306,11 +306,11 @@ class Launch:
 
     def up(self, spec: MachineSpec) -> RunningMachine:
         """
-        Bring a machine up and return it; a second call for the same name joins the first.
+        Bring a machine up and return it; a second call for the same name waits for the first.
 
-        Blocks for as long as it takes: call it in a thread.
+        Blocks until the machine is up, possibly for minutes: call it in a thread.
 
-        :raises FogError: what failed; nothing of the machine is left then.
+        :raises FogError: a step failed; its undo steps have removed the machine.
         :raises Cancelled: the launch is ending.
         """
         with self._lock:
@@ -336,23 +336,23 @@ class Launch:
         """
         Start the machines' launch processes once all machines are up.
 
-        Nodes start sooner by what that takes; before, it would take the processors from machines
-        on the same computer that are still coming up.
+        This shortens the start of nodes. Earlier, it would slow down machines on the same
+        computer that are still coming up.
         """
         ups = list(self._ups.values())
         if self.ending or not all(up.done() for up in ups):
-            return  # one that is kept would be left with the process
+            return  # a kept machine would keep the process
         for machine in self.machines():
-            with contextlib.suppress(FogError):  # the first start would say the same
+            with contextlib.suppress(FogError):  # the first start of a node reports the same error
                 machine.warm()
 
     def robot_vpn(self) -> RobotVpn:
-        """Return the robot's VPN, chosen but not necessarily up."""
+        """Return the robot's VPN; its interface need not be up yet."""
         with self._lock:
             if self._robot is None:
                 folder = self.store.launch(self.id)
                 self.undo.callback(self._remove_folder, folder)
-                # by this, `ros2 fog gc` tells the folder of a launch that was killed
+                # `ros2 fog gc` reads this to recognise the folder of a killed launch
                 pid = os.getpid()
                 write_private(folder / 'process.json', model.to_json(
                     {'pid': pid, 'pid_start': process_start(pid),
@@ -379,10 +379,10 @@ class Launch:
 
     def down(self) -> list[FogError]:
         """
-        End everything, each machine by its ``on_exit``, the VPN's interface last; idempotent.
+        End every machine by its ``on_exit``, then the VPN interface; idempotent.
 
-        Call it when the robot's nodes have exited: they must not lose the interface while they
-        run. Returns the undo steps that failed; the others ran all the same.
+        Call it after the robot's nodes have exited: they need the interface while they run.
+        Returns the errors of undo steps that failed; the other undo steps ran.
         """
         with self._lock:
             self._closed = True
@@ -400,18 +400,18 @@ class Launch:
                 unexpected = unexpected or error
         with self._lock:
             self._ups.clear()
-            # whatever it was that went wrong there: the interface goes
+            # whatever failed before, the VPN interface has to go
             self.undo.close()
             failures, self._failures = self._failures + list(known.values()), []
         if unexpected is not None:
             for name, error in known.items():
-                # nobody gets these any more to tell them
+                # the exception below replaces the return value: report these errors here
                 self.report(StepFailed(name, 'end', 0.0, str(error), fatal=False))
             raise unexpected
         return failures
 
     def attempt(self, machine: str, name: str, undo: Callable[[], None]) -> None:
-        """Run an undo step; if it fails, report and remember it, so that the others still run."""
+        """Run an undo step; if it fails, report and remember the error."""
         begin = time.monotonic()
         try:
             undo()
@@ -421,13 +421,13 @@ class Launch:
     def undo_failed(
         self, machine: str, name: str, error: FogError, seconds: float = 0.0,
     ) -> None:
-        """Report and remember what could not be taken away."""
+        """Report and remember the error of an undo step."""
         self.report(StepFailed(machine, name, seconds, str(error)))
         with self._lock:
             self._failures.append(error)
 
     def robot(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
-        """Run commands on the robot, one after the other; return what the last one printed."""
+        """Run commands on the robot, one after the other; return the last one's output."""
         output = ''
         for command in commands:
             output = process.run(command, timeout=self.timeouts.vpn,
@@ -436,6 +436,6 @@ class Launch:
 
 
 def _end(up: Future[RunningMachine]) -> None:
-    """End a machine; one that still comes up sees the cancel and takes itself away."""
+    """End a machine; one that is still coming up is cancelled and removes itself."""
     if up.exception() is None:
         up.result().close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's own part: what it needs to have, and what a dead launch left on it."""
+"""Check what the robot needs for a launch, and clean up after a launch that died."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from fogros2.store import Record, Store
 from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 
-#: Programs that the robot's side calls, and the Debian packages that have them.
+#: Programs that the robot's side calls, and the Debian packages that contain them.
 ROBOT_PROGRAMS = {
     'ip': 'iproute2', 'wg': 'wireguard-tools', 'nft': 'nftables', 'rsync': 'rsync',
     'ssh-keygen': 'openssh-client',
 }
 
-#: Held while sudo may ask, so that two threads don't ask at once.
+#: Held while sudo may ask for a password, so that only one thread asks.
 _ASKING = threading.Lock()
 
 
 def provider(name: str) -> Provider:
     """
-    Return the provider of that name.
+    Return the provider with this name.
 
-    :raises ConfigurationError: there is none.
+    :raises ConfigurationError: there is no such provider.
     """
     instance: Provider = plugin_system.load('fogros2.provider', name)()
     return instance
@@ -52,10 +52,10 @@ def check_robot() -> None:
 
 def check_sudo(*, ask: bool = False) -> None:
     """
-    Check that root's commands run without a question in the middle of a launch.
+    Check that commands can run as root without a password prompt during a launch.
 
-    :param ask: have sudo ask for its password now, where somebody sits at a terminal.
-    :raises PrerequisiteError: they don't.
+    :param ask: let sudo ask for its password now, if there is a terminal.
+    :raises PrerequisiteError: commands cannot run as root without a prompt.
     """
     if process.which('sudo') is None:
         raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
@@ -72,12 +72,12 @@ def check_sudo(*, ask: bool = False) -> None:
 
 def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
     """
-    Take away what a launch that died left on the robot for a machine that is gone.
+    Remove what a launch that died left on the robot for a machine that is gone.
 
-    Its VPN interface with its program and filter, the launch's folder, the machine's folder with
-    its keys. A launch that still runs keeps its own; idempotent.
+    Removes the VPN interface with its program and filter, the launch's folder, and the machine's
+    folder with its keys. Does not touch the interface of a launch that still runs; idempotent.
 
-    :raises FogError: something could not be taken away; the record stays then.
+    :raises FogError: something could not be removed; the record then stays.
     """
     if record.robot_vpn is not None and record.launch and not record.launch_alive:
         with step(report, record.name, 'VPN interface'):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's VPN interface, one per launch, and the machines that it leads to."""
+"""The robot's VPN interface, one for each launch, and the machines that it connects."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from fogros2.vpn import addresses, helped, Vpn
 if TYPE_CHECKING:
     from fogros2.deploy.launch import Launch
 
-#: Seconds between two uses of sudo's ticket, which lives for some minutes after each.
+#: Seconds between two refreshes of sudo's ticket, which is valid for some minutes.
 TICKET_REFRESH = 30.0
-#: Seconds that a new machine waits until the others know it as a peer.
+#: Seconds that a new machine waits for the others to add it as a peer.
 TELLING = 5.0
-#: Seconds between two attempts to repair the interface, at the most, where they fail.
+#: Longest interval in seconds between two attempts to repair the interface.
 SELDOM = 15.0
 
 
 class RobotVpn:
-    """The robot's VPN interface, one per launch, and the machines that it leads to."""
+    """The robot's VPN interface, one for each launch, and the machines that it connects."""
 
-    #: Whether nothing of it is on this computer.
+    #: True while no part of the interface exists on this computer.
     down = True
     _ticket = True
     _told_of_sudo = False
@@ -53,20 +53,20 @@ class RobotVpn:
         if helped.permitted():
             self.interface = dataclasses.replace(
                 self.interface, key_file=helped.key_file(self.interface.name))
-            # the ticket then serves container machines alone: who has none needs none
+            # sudo's ticket then serves only container machines: without a ticket, refresh none
             self._ticket = process.refresh_ticket()
 
     def ensure(self) -> Peer:
         """
-        Bring the interface up if it isn't; return the robot as the machines' peer.
+        Bring the interface up if it is down; return the robot as the machines' peer.
 
-        :raises Cancelled: it has been taken down for good.
+        :raises Cancelled: the launch has taken the interface down.
         """
         with self._lock:
             if not self._up:
                 launch = self._launch
                 if self._stop.is_set():
-                    # a thread that was about to tell a machine its peers: nobody would take the
+                    # a late thread that still updates a machine's peers: nobody would take the
                     # interface down a second time
                     raise Cancelled('the VPN interface')
                 with step(launch.report, '', 'VPN interface') as detail:
@@ -91,7 +91,7 @@ class RobotVpn:
             raise
 
     def peers_of(self, member: VpnMember) -> list[Peer]:
-        """Return the peers of a machine as they are now."""
+        """Return the current peers of a machine."""
         robot = self.ensure()
         with self._lock:
             others = [other.place for name, other in sorted(self._members.items())
@@ -99,16 +99,16 @@ class RobotVpn:
         return plan.machine_peers(robot, member.place, others)
 
     def admit(self, member: VpnMember) -> None:
-        """Let the robot know of a new machine."""
+        """Add a machine to the robot's peers."""
         with self._lock:
             self._members[member.name] = member
             self._launch.robot(self.vpn.peers(self.interface, self._sorted()))
 
     def spread(self, new: VpnMember) -> None:
         """
-        Add a new machine to the peers of the others.
+        Add a new machine to the peers of the other machines.
 
-        A machine that can't be updated now is updated later: the new one needn't wait.
+        A machine that cannot be updated now is retried in the background.
         """
         new.update(self)
         with self._lock:
@@ -122,7 +122,7 @@ class RobotVpn:
             thread.join(max(0.0, until - time.monotonic()))
 
     def _tell(self, member: VpnMember) -> None:
-        """Tell a machine its peers, again and again until that works."""
+        """Update a machine's peers; retry until that succeeds."""
         pause = 1.0
         while not self._launch.ending and self._members.get(member.name) is member:
             try:
@@ -137,7 +137,7 @@ class RobotVpn:
             pause = min(2 * pause, 5.0)
 
     def remove(self, name: str) -> None:
-        """Forget a machine; update the robot's interface unless it goes as well."""
+        """Remove a machine from the robot's peers, unless the whole launch is ending."""
         with self._lock:
             gone = self._members.pop(name, None)
             if gone is not None and self._up and not self._launch.ending:
@@ -148,7 +148,7 @@ class RobotVpn:
         return [self._members[name].place.peer for name in sorted(self._members)]
 
     def _keep(self) -> None:
-        """Get the interface's program going again when it died; nodes don't notice."""
+        """Restart the interface's program when it ends; nodes do not notice."""
         asked = time.monotonic()
         pause = 1.0
         while not self._stop.wait(pause):
@@ -159,8 +159,8 @@ class RobotVpn:
                 if self._stop.is_set():
                     return
                 if self._launch.ending:
-                    continue  # with the machines go the networks that lead to them
-                # what can't be repaired is reported now and then, not each second
+                    continue  # the networks that lead to the machines end with them
+                # report a lasting failure now and then, not every second
                 pause = min(2 * pause, SELDOM)
                 try:
                     alive = process.run(self.vpn.alive(self.interface), check=False,
@@ -173,10 +173,10 @@ class RobotVpn:
                             self.vpn.repair(self.interface, self._sorted()), cancel=False)
                     pause = 1.0
                 except FogError:
-                    pass  # a repair's is reported by its step; the next round tries again
+                    pass  # the step has reported a failed repair; the next round tries again
 
     def _refresh_ticket(self) -> None:
-        """Keep sudo from wanting a password before all is taken down; say so once if it does."""
+        """Refresh sudo's ticket, so that the way down needs no password; warn once if it fails."""
         if process.refresh_ticket():
             self._told_of_sudo = False
         elif not self._told_of_sudo:
@@ -197,10 +197,10 @@ class RobotVpn:
 
 class VpnMember:
     """
-    A machine in the VPN: told its peers anew when another joins.
+    A machine in the VPN, whose peers are updated when other machines join.
 
     :param on: runs commands on the machine.
-    :param keep: has its agent repair the interface with these peers.
+    :param keep: makes the machine's agent repair the interface with these peers.
     """
 
     def __init__(
@@ -218,16 +218,16 @@ class VpnMember:
         self._kept: Optional[list[Peer]] = None
 
     def up(self, robot: RobotVpn) -> None:
-        """Bring the machine's interface up with the peers of this moment."""
+        """Bring the machine's interface up with its current peers."""
         with self._lock:
             self._told = robot.peers_of(self)
             self._on(robot.vpn.up(self.interface, self._told))
 
     def update(self, robot: RobotVpn) -> None:
-        """Tell the machine and its agent the peers, unless they know them."""
+        """Send the machine and its agent the current peers, if these have changed."""
         with self._lock:
             if self._told is None:
-                return  # it takes the peers of the moment at which it comes up
+                return  # ``up`` will use the peers of that moment
             peers = robot.peers_of(self)
             if peers != self._told:
                 self._on(robot.vpn.peers(self.interface, peers))
@@ -237,11 +237,11 @@ class VpnMember:
                 self._kept = peers
 
     def redial(self, robot: RobotVpn, endpoint: str) -> None:
-        """Have the machine dial the robot at another ``host:port`` from now on."""
+        """Make the machine dial the robot at another ``host:port`` from now on."""
         before = self.place
         self.place = dataclasses.replace(before, robot_endpoint=endpoint)
         try:
             self.update(robot)
         except FogError:
-            self.place = before  # so that the next look tries again
+            self.place = before  # so that the next check tries again
             raise

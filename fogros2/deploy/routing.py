@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Routers, for middlewares whose nodes meet at one: the robot's process, a machine's node."""
+"""Run the routers of a middleware that needs them: a process on the robot, nodes elsewhere."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from fogros2.errors import DdsError
 from fogros2.model import Command, NodeSpec
 from fogros2.store import write_private
 
-#: Machines of a launch that the robot's router knows the addresses of, before there is any.
+#: Number of machine addresses that the robot's router knows before any machine exists.
 MACHINES = 32
-#: Seconds before one that died is started anew.
+#: Seconds before a router that ended is restarted.
 PAUSE = 1.0
-#: Starts a program and ends it when standard input is closed: a robot's launch that was killed
-#: leaves no router behind.
+#: Starts a program and ends it when standard input is closed, so that no router outlives
+#: a launch that was killed.
 _GUARDED = """\
 exec 3<&0 >&2
 { read -r _ <&3; kill $$; } &
@@ -29,11 +29,11 @@ exec 3<&- </dev/null "$0"
 
 class RobotRouter:
     """
-    The router beside the robot's nodes, started anew when it dies.
+    The router beside the robot's nodes; restarted when it ends.
 
-    :param folder: takes its configuration and its log.
-    :param environment: of the launch.
-    :raises DdsError: its program isn't there.
+    :param folder: directory for its configuration and its log.
+    :param environment: the launch's environment variables.
+    :raises DdsError: the router's program is not installed.
     """
 
     def __init__(self, router: Router, folder: Path, environment: Mapping[str, str]) -> None:
@@ -69,13 +69,13 @@ class RobotRouter:
             self._stop.wait(PAUSE)
 
     def close(self) -> None:
-        """End it."""
+        """End the router."""
         self._stop.set()
         self._thread.join()
 
 
 def node(router: Router, machine: str) -> NodeSpec:
-    """Return the router beside a machine's nodes, which comes back when it dies."""
+    """Return the router of a machine's nodes as a node that respawns."""
     return NodeSpec(
         id=f'{machine}/router', name='router', package=router.package,
         executable=router.executable, files={'router.json5': router.config},

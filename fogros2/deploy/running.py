@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fogros2.deploy.launch import Launch
 
 
-#: Events that this side alone emits; those of the agent have a ``seq``.
+#: Events that the robot's side alone emits; events of the agent have a ``seq``.
 _OURS = ('lost', 'connection', 'gap')
 
 
@@ -31,10 +31,10 @@ class RunningMachine:
     """
     A machine of the launch that is up, and the nodes on it.
 
-    :param first_event: number of the agent's first event that is this launch's.
-    :param found: takes what the provider tells of the machine when its heartbeat stays away.
-    :param equipment: brings what some nodes import.
-    :param containers: brings the images that some run in.
+    :param first_event: number of the first agent event that belongs to this launch.
+    :param found: called with the provider's report when the machine exists but is silent.
+    :param equipment: installs what some nodes import.
+    :param containers: downloads the images that some nodes run in.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class RunningMachine:
         self.heartbeat = heartbeat
         self.vpn_address = interface.address
         self.interface = interface
-        #: The machine's way down.
+        #: The undo stack that ends the machine.
         self.undo = contextlib.ExitStack()
         self._launch = launch
         self._job = job
@@ -67,30 +67,30 @@ class RunningMachine:
             job.undo.callback(self._watch.close)
 
     def warm(self) -> None:
-        """Start the process that will run the nodes, unless it runs."""
+        """Start the machine's launch process ahead of its nodes; once."""
         if not self._warm:
             self._warm = True
             self.agent.request('launch')
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """
-        Start nodes; what becomes of them arrives as events.
+        Start nodes; their state changes arrive as events.
 
-        :raises PrerequisiteError: the machine can't have what they import, or their image.
+        :raises PrerequisiteError: the machine cannot get their imports or their image.
         """
         nodes = self._equipment.fitted(self._containers.inside(nodes))
         self.agent.request('start', nodes=[_json(node) for node in nodes])
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
-        """Stop nodes in order (SIGINT, SIGTERM, SIGKILL), all without ``ids``."""
+        """Stop nodes by SIGINT, SIGTERM, SIGKILL in turn; all nodes if ``ids`` is None."""
         self._request('stop', nodes=None if ids is None else list(ids))
 
     def signal(self, node: str, name: str) -> None:
-        """Send a node a signal, by its name (``SIGUSR1``)."""
+        """Send a node a signal, given by its name (``SIGUSR1``)."""
         self._request('signal', node=node, signal=name)
 
     def _request(self, command: str, **arguments: Any) -> None:
-        """Ask the agent for something; at the end nobody out of reach is waited for."""
+        """Send the agent a request, with a shorter time-out while the launch ends."""
         if self._launch.cancel.is_set():
             self.agent.request(
                 command, timeout=self._job.patience(30.0), silent=SILENT, **arguments)
@@ -98,23 +98,24 @@ class RunningMachine:
             self.agent.request(command, timeout=30.0, **arguments)
 
     def serves(self, port: int) -> None:
-        """Remember the TCP port of the bridge to Foxglove that runs there."""
+        """Record the TCP port of the Foxglove bridge on the machine."""
         self._job.save(monitor=port)
 
     def publish(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """
-        Let networks (CIDR) reach a TCP port of the machine until its end; return where they do.
+        Open a TCP port of the machine until the machine ends; return (host, port) to connect to.
 
-        :raises FogError: the provider doesn't open it.
+        :param sources: networks (CIDR) that may connect.
+        :raises FogError: the provider cannot open the port.
         """
         job = self._job
 
         def close() -> None:
-            # what ends takes it along
+            # the firewall rule of a deleted machine goes with the machine
             if job.survives or job.spec.on_exit == 'stop':
                 job.provider.publish(self.machine, port, ())
 
-        if port not in self._published:  # what listens there may have been started again
+        if port not in self._published:  # a program that listens there may have restarted
             self.undo.callback(job.undone, 'port of the monitor', close)
             self._published[port] = job.provider.publish(self.machine, port, sources)
             job.save(monitor_open=monitor_addresses.place(*self._published[port]))
@@ -122,22 +123,22 @@ class RunningMachine:
 
     def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
         """
-        Hand every event of the machine since this launch has it to ``callback``.
+        Pass every event of the machine since the start of this launch to ``callback``.
 
-        It is called from a thread of the connection's, or from one that watches the machine, and
-        must not make requests of the agent. Besides what the agent says (see ``agent.py``):
+        A thread of the connection or of the watch calls it; ``callback`` must not send requests to
+        the agent. In addition to the agent's events (see ``agent.py``) there are:
 
-        ``{'event': 'notice', 'reason': ...}``  the provider is about to take the machine away, by
-            its own words; once. The agent answers requests still, for as long as they say.
-        ``{'event': 'lost', 'reason': ...}``  the machine is gone: ended, stopped, evicted; once,
-            and nothing comes after it. Requests fail from now on.
-        ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``  the connection's changes.
-        ``{'event': 'gap', 'count': n}``  so many events came too late for the agent's log.
+        ``{'event': 'notice', 'reason': ...}``  a preemption notice, once: the provider will
+            reclaim the machine. The agent still answers requests until then.
+        ``{'event': 'lost', 'reason': ...}``  the machine ended, stopped or was evicted; once, and
+            the last event. Requests fail from now on.
+        ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``  the connection changed.
+        ``{'event': 'gap', 'count': n}``  n events were dropped from the agent's log.
         """
         def tell(event: dict[str, Any]) -> None:
             if self._lost or event['event'] in _OURS and 'seq' in event:
-                return  # the machine's agent has no say in these
-            # an agent that leaves at the end as it was told is no news
+                return  # a hijacked agent must not forge these events
+            # an agent that exits at the end of the launch is expected
             if event['event'] != 'connection' or not self._launch.ending:
                 callback(event)
 
@@ -150,12 +151,12 @@ class RunningMachine:
         try:
             self.agent.subscribe(tell, since=self._first_event)
         except AgentError:
-            # that it is gone may have been told meanwhile, and the connection closed
+            # another thread may have reported the loss and closed the connection meanwhile
             if not self._lost:
                 raise
 
     def _gone(self, reason: str) -> None:
-        """Tell, once, that the provider has the machine no longer; nobody else asks it."""
+        """Report, once, that the provider has ended the machine; close the connection."""
         with self._lock:
             self._lost = reason
             callbacks = list(self._callbacks)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a machine from which nothing comes still exists, and how it is reached by now."""
+"""Check that a silent machine still exists, and update how the robot reaches it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fogros2.errors import FogError, MachineNotFound
 from fogros2.model import Machine, MachineState
 from fogros2.report import StepFailed
 
-#: Seconds without an answer after which the provider is asked, and between two questions.
+#: Seconds without a heartbeat before the provider is asked, and the poll interval after that.
 SILENCE, INTERVAL = 5.0, 5.0
 
 _ENDED = {
@@ -25,14 +25,14 @@ _ENDED = {
 
 class Watch:
     """
-    Asks the provider about a machine whose heartbeat stays away, until it is known to be gone.
+    Ask the provider about a machine without heartbeat, until the machine is known to be gone.
 
-    A machine that is merely out of reach still exists: nothing is reported. An error of no known
-    kind is a fault of ours, or of a plugin: it is said at once, as nobody watches from then on,
-    and raised by ``close``, so that the nodes needn't suffer from it.
+    A machine that exists but is out of reach is not reported. An unknown exception is a defect of
+    FogROS2 or of a plugin: it ends the watch and is reported at once, and ``close`` raises it, so
+    that the nodes continue until then.
 
-    :param gone: is called with the reason, once, from the watch's own thread.
-    :param found: is called with what the provider tells of one that exists.
+    :param gone: called with the reason, once, from the watch's thread.
+    :param found: called with the provider's report of a machine that runs.
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class Watch:
 
     def close(self) -> None:
         """
-        Stop watching; a question under way is answered to nobody.
+        Stop watching; ignore the answer to a pending question.
 
-        :raises BaseException: what had ended it before, once.
+        :raises BaseException: the exception that ended the watch, once.
         """
         self._done.set()
         fault, self._fault = self._fault, None
@@ -68,7 +68,7 @@ class Watch:
         self, kind: Optional[type[BaseException]], error: Optional[BaseException],
         traceback: Optional[TracebackType],
     ) -> bool:
-        """Keep what ended the watch for ``close``, and say it."""
+        """Keep the exception that ended the watch for ``close``, and report it."""
         if error is not None:
             self._fault = error
             self._job.launch.report(StepFailed(
@@ -83,7 +83,7 @@ class Watch:
             age = self._heartbeat.age
             if age is not None and age > SILENCE:
                 reason, deleted = self._ask()
-                # an agent that speaks is there, whatever its provider says
+                # while the agent sends, the machine exists, whatever the provider reports
                 if reason and self._agent.silent_for > SILENCE and not self._done.is_set():
                     self._job.gone, self._job.deleted = True, deleted
                     self._gone(reason)
@@ -91,14 +91,14 @@ class Watch:
                 pause = INTERVAL
 
     def _ask(self) -> tuple[str, bool]:
-        """Return why the machine runs no more ('': it does, or nobody knows), and if it's gone."""
+        """Return why the machine ended ('' if it runs or is unknown), and if it is deleted."""
         job = self._job
         try:
             machine = job.provider.describe(job.machine_id)
         except MachineNotFound as error:
             return str(error.args[0]), True
         except FogError:
-            return '', False  # no network here, maybe: asked again
+            return '', False  # perhaps the robot has no network: retried
         if machine.state is MachineState.RUNNING and not self._done.is_set():
             self._found(machine)
         return _ENDED.get(machine.state, ''), machine.state is MachineState.DELETED
