@@ -200,7 +200,7 @@ def test_a_provider_is_told_what_will_be_installed(launch, provider, monkeypatch
     made = provider.create
     monkeypatch.setattr(
         provider, 'create', lambda spec, request: requests.append(request) or made(spec, request))
-    monkeypatch.setattr('fogros2.bootstrap.dependencies', lambda spec, under: 'a' * 16)
+    monkeypatch.setattr('fogros2.bootstrap.dependencies', lambda spec, under, packages: 'a' * 16)
     monkeypatch.setattr(Launch, 'underlay', lambda self, workspace: None)
     create(launch)
     assert requests[0].dependencies == requests[0].tags['fogros2-dependencies'] == 'a' * 16
