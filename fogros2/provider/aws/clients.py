@@ -14,7 +14,7 @@ from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws import patience
-from fogros2.provider.aws.failures import translated
+from fogros2.provider.aws.failures import AwsError, GONE, translated
 
 T = TypeVar('T')
 
@@ -178,6 +178,14 @@ class Account:
             return answer
 
         return self._ask(ask, service, region, what, hasty)
+
+    def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
+        """Make a call of EC2 that deletes something; it may be gone already."""
+        try:
+            self.call('ec2', region, operation, what, **parameters)
+        except AwsError as error:
+            if error.code not in GONE:
+                raise
 
     def pages(
         self, service: str, region: str, operation: str, key: str, what: str,

@@ -90,7 +90,7 @@ def sweep(account: Account, region: str, attempt: str, gone: Collection[str] = (
         drop_groups(account, region, attempt)
     for address in left:
         if address.startswith('eipalloc-'):
-            _gone_is_fine(account, region, 'release_address', 'releasing an address',
+            account.remove(region, 'release_address', 'releasing an address',
                           AllocationId=address)
     if any(each.startswith('vol-') and each not in gone for each in left):
         _drop_volumes(account, region, attempt)
@@ -102,13 +102,13 @@ def _drop_volumes(account: Account, region: str, attempt: str) -> None:
         Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
                  {'Name': 'status', 'Values': ['available', 'error']}])['Volumes']
     for volume in volumes:
-        _gone_is_fine(account, region, 'delete_volume', 'deleting a disk',
+        account.remove(region, 'delete_volume', 'deleting a disk',
                       VolumeId=volume['VolumeId'])
 
 
 def drop_key(account: Account, region: str, attempt: str) -> None:
     """Delete the key of an attempt; there may be none."""
-    _gone_is_fine(account, region, 'delete_key_pair', 'deleting the login key',
+    account.remove(region, 'delete_key_pair', 'deleting the login key',
                   KeyName=instances.own_name(attempt))
 
 
@@ -133,7 +133,7 @@ def end_instances(account: Account, region: str, attempt: str) -> None:
             *instances.tag_filters({TAG_ATTEMPT: attempt}),
             {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}])['Reservations'])
     if found:
-        _gone_is_fine(account, region, 'terminate_instances', 'ending what was made',
+        account.remove(region, 'terminate_instances', 'ending what was made',
                       InstanceIds=[instance['InstanceId'] for instance in found])
 
 
@@ -161,11 +161,3 @@ def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
                                  'Values': [*instances.ALIVE, 'shutting-down']}])):
             left.pop(instances.tags_of(instance)[TAG_ATTEMPT], None)
     return left
-
-
-def _gone_is_fine(account: Account, region: str, operation: str, what: str, **words: Any) -> None:
-    try:
-        account.call('ec2', region, operation, what, **words)
-    except AwsError as error:
-        if code_of(error) not in GONE:
-            raise

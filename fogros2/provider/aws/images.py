@@ -13,7 +13,7 @@ from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError, code_of, GONE
+from fogros2.provider.aws.failures import AwsError, GONE
 from fogros2.provider.aws.instances import PROVIDER, tag_list, TAG_USER, tags_of
 from fogros2.provider.aws.options import Options
 
@@ -225,14 +225,6 @@ def delete(account: Account, image_id: str) -> None:
         Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},
                  {'Name': 'tag-key', 'Values': [TAG_BAKED]}])}
     if found:
-        _gone_is_fine(account, region, 'deregister_image', what, ImageId=identity)
+        account.remove(region, 'deregister_image', what, ImageId=identity)
     for snapshot in sorted(snapshots):
-        _gone_is_fine(account, region, 'delete_snapshot', what, SnapshotId=snapshot)
-
-
-def _gone_is_fine(account: Account, region: str, operation: str, what: str, **words: Any) -> None:
-    try:
-        account.call('ec2', region, operation, what, **words)
-    except AwsError as error:
-        if code_of(error) not in GONE:
-            raise
+        account.remove(region, 'delete_snapshot', what, SnapshotId=snapshot)
