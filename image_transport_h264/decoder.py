@@ -57,7 +57,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both mean that rclpy shuts down, in its own thread
+        pass  # rclpy shuts down already, in its own thread; do not do it twice
     finally:
         # A second Ctrl-C must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
