@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes and launch files to start from."""
+"""Example nodes and launch files."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes images on ``camera``: a synthetic scene, a video file, or a V4L2 device."""
+"""Publish images on ``camera``: a synthetic scene, a video file, or a V4L2 device."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ def synthetic(width: int, height: int, rate: float) -> Iterator[Pixels]:
 
 def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
     """
-    Yield the frames of a device (``/dev/video0``) or of a file, again from its start at its end.
+    Yield the frames of a device (``/dev/video0``), or of a file in an endless loop.
 
-    :raises RuntimeError: it can't be opened, or has no frame.
+    :param width: width of the frames in pixels, as ``height``.
+    :raises RuntimeError: the source cannot be opened, or has no frame.
     """
     device = Path(source).is_char_device()
     while True:
@@ -55,7 +56,7 @@ def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
 
 
 class Camera(Node):
-    """A camera; each image and its CameraInfo are stamped alike."""
+    """A camera; an image and its CameraInfo have the same stamp."""
 
     def __init__(self) -> None:
         super().__init__('camera')
@@ -78,12 +79,12 @@ class Camera(Node):
         self.create_timer(1 / rate, self.shoot)
 
     def shoot(self) -> None:
-        """Publish a frame; the next one is rendered when this one is out."""
+        """Publish a frame, then render the next one."""
         stamp = self.get_clock().now().to_msg()
         image = Image(height=self.next.shape[0], width=self.next.shape[1], encoding='bgr8',
                       step=3 * self.next.shape[1])
         image.header.stamp, image.header.frame_id = stamp, self.frame_id
-        # rclpy takes an array of bytes as it is; anything else it looks at byte by byte
+        # rclpy takes an array over as it is, and checks anything else byte by byte.
         image.data = array.array('B')
         image.data.frombytes(self.next.data.cast('B'))
         self.info.header = image.header
@@ -97,12 +98,12 @@ class Camera(Node):
 
 
 def main() -> None:
-    """Run until interrupted, or until ``count`` images are out."""
+    """Run until a signal, or until ``count`` images are published."""
     rclpy.init()
     try:
         rclpy.spin(Camera())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     except SystemExit:
         rclpy.try_shutdown()
         raise

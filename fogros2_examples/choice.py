@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch argument ``machine``: where cloud nodes of the example launch files run."""
+"""Declare the launch argument ``machine``: where the cloud nodes of the example launches run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from launch.substitutions import EqualsSubstitution, LaunchConfiguration
 
 from fogros2 import ContainerInstance, Node, SSHInstance
 
-#: What begins the names of the arguments for the second machine alone.
+#: Prefix of the arguments for the second machine.
 SECOND = 'second_'
 
 
@@ -23,11 +23,11 @@ def argument(name: str, value: str, description: str) -> DeclareLaunchArgument:
 
 def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchArgument]:
     """
-    Return the launch arguments that say where the machines are.
+    Return the launch arguments that choose the machines.
 
-    :param machine: what ``machine:=`` is unless said: container, ssh or local.
-    :param name: what the machine is called unless said.
-    :param second: the same of a second one; '' where there is none.
+    :param machine: default of ``machine:=``: container, ssh or local.
+    :param name: default name of the machine.
+    :param second: default name of the second machine; '': there is none.
     """
     found = [
         DeclareLaunchArgument(
@@ -55,10 +55,10 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
 
 def node(executable: str, *, which: str = '', **kwargs: Any) -> list[LaunchDescriptionEntity]:
     """
-    Return a node of this package on the machine that ``machine:=`` chooses, or here.
+    Return a node of this package on the machine that ``machine:=`` chooses, or on the robot.
 
     :param which: the machine: '' for the first, ``SECOND`` for the second.
-    :param kwargs: what launch_ros's Node takes besides.
+    :param kwargs: further arguments of launch_ros's Node.
     """
     def chosen(value: str) -> IfCondition:
         return IfCondition(EqualsSubstitution(LaunchConfiguration('machine'), value))

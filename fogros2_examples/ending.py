@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a launch does when a node that it is for has ended."""
+"""End a launch when a node has exited."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from launch.events.process import ProcessExited
 
 def ended(event: ProcessExited, context: LaunchContext) -> Optional[Shutdown]:
     """
-    End the launch; for a node's ``on_exit``. Shutdown alone would forget how the node ended.
+    Shut the launch down; for a node's ``on_exit``. Shutdown alone would lose the exit status.
 
-    :raises RuntimeError: the node failed; the launch's exit status is then 1.
+    :raises RuntimeError: the node failed, so the launch's exit status is 1.
     """
     if context.is_shutdown:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for features in the images on ``camera``, publishes them drawn in on ``annotated``."""
+"""Find features in the images on ``camera``, and publish them drawn on ``annotated``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sensor_msgs.msg import Image
 
 
 class ImageProcessor(Node):
-    """Finds corners; parameter ``features`` is the most it looks for in an image."""
+    """Find corners; parameter ``features`` is the maximum number per image."""
 
     def __init__(self) -> None:
         super().__init__('image_processor')
@@ -27,7 +27,7 @@ class ImageProcessor(Node):
         self.create_subscription(Image, 'camera', self.process, qos_profile_sensor_data)
 
     def process(self, image: Image) -> None:
-        """Publish the image with its features, under the stamp that it came with."""
+        """Publish the image with its features, with the same stamp."""
         if image.encoding != 'bgr8':
             self.get_logger().error(f'{image.encoding} images are not for me', once=True)
             return
@@ -59,4 +59,4 @@ def main() -> None:
     try:
         rclpy.spin(ImageProcessor())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints what it hears on ``chatter``; ends after ``count`` messages if that parameter is set."""
+"""Print the messages of ``chatter``; exit after ``count`` messages if that parameter is set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from std_msgs.msg import String
 
 
 class Listener(Node):
-    """Listens; parameter ``count`` is the number of messages after which to end, 0 for never."""
+    """The listener; parameter ``count`` is the number of messages before it exits, 0: no limit."""
 
     def __init__(self) -> None:
         super().__init__('listener')
@@ -27,12 +27,12 @@ class Listener(Node):
 
 
 def main() -> None:
-    """Run until interrupted, or until ``count`` messages were heard."""
+    """Run until a signal, or until ``count`` messages have arrived."""
     rclpy.init()
     try:
         rclpy.spin(Listener())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     except SystemExit:
         rclpy.try_shutdown()
         raise

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes made of simple solids, and rigid motions of them."""
+"""Build triangle meshes from simple solids, and move them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Floats = NDArray[numpy.float64]
 @dataclasses.dataclass(frozen=True)
 class Mesh:
     """
-    Triangles; seen from outside, each goes round counter-clockwise.
+    Triangles; seen from outside, the corners of each are in counter-clockwise order.
 
     :param vertices: array (n, 3), m.
     :param triangles: array (m, 3) of indices into ``vertices``.
@@ -27,18 +27,18 @@ class Mesh:
 
     @property
     def corners(self) -> Floats:
-        """The triangles' corners, array (m, 3, 3)."""
+        """The corners of the triangles, array (m, 3, 3)."""
         found: Floats = self.vertices[self.triangles]
         return found
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Mesh:
-        """Return it rotated by a matrix (3, 3), then moved."""
+        """Return the mesh rotated by a matrix (3, 3), then translated."""
         return Mesh(self.vertices @ numpy.asarray(rotation).T + numpy.asarray(translation),
                     self.triangles)
 
 
 def joined(meshes: Iterable[Mesh]) -> Mesh:
-    """Return several meshes as one; where they overlap, both surfaces stay."""
+    """Join meshes to one; overlapping surfaces stay."""
     vertices, triangles, count = [numpy.empty((0, 3))], [numpy.empty((0, 3), numpy.int32)], 0
     for mesh in meshes:
         vertices.append(mesh.vertices)
@@ -61,7 +61,7 @@ def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Mesh:
     """
     Return a solid of revolution about z, closed at both ends.
 
-    :param profile: (radius, z) from the lowest to the highest.
+    :param profile: pairs (radius, z), by increasing z.
     """
     angles = numpy.arange(sides) * 2 * math.pi / sides
     rings = [numpy.column_stack([radius * numpy.cos(angles), radius * numpy.sin(angles),
@@ -79,12 +79,12 @@ def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Mesh:
 
 
 def cylinder(radius: float, height: float, sides: int = 24) -> Mesh:
-    """Return a cylinder about z, its centre in the origin."""
+    """Return a cylinder about z with its centre in the origin."""
     return lathe([(radius, -height / 2), (radius, height / 2)], sides)
 
 
 def sphere(radius: float, sides: int = 24) -> Mesh:
-    """Return a ball, its centre in the origin."""
+    """Return a sphere with its centre in the origin."""
     angles = [math.pi * (i / (sides // 2) - 0.5) for i in range(1, sides // 2)]
     return lathe([(1e-6, -radius),
                   *((radius * math.cos(a), radius * math.sin(a)) for a in angles),
@@ -92,7 +92,7 @@ def sphere(radius: float, sides: int = 24) -> Mesh:
 
 
 def rotation(quaternion: ArrayLike) -> Floats:
-    """Return the matrix (3, 3) of a quaternion x, y, z, w of any length but 0."""
+    """Return the matrix (3, 3) of a quaternion x, y, z, w of any length except 0."""
     given = numpy.asarray(quaternion, float)
     x, y, z, w = given / numpy.linalg.norm(given)
     return numpy.array([
@@ -117,6 +117,6 @@ def quaternion(matrix: Floats) -> Floats:
 
 
 def turned(axis: Sequence[float], angle: float) -> Floats:
-    """Return the matrix of a turn by ``angle`` rad about an axis."""
+    """Return the matrix of a rotation by ``angle`` rad about an axis."""
     unit = numpy.asarray(axis, float) / numpy.linalg.norm(axis)
     return rotation([*(math.sin(angle / 2) * unit), math.cos(angle / 2)])

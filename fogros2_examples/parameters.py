@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of nodes that are looked at before anything is done with them."""
+"""Declare and validate parameters of nodes."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from typing import TypeVar
 from rclpy.node import Node
 
 Number = TypeVar('Number', int, float)
-#: What OpenCV, and matplotlib, draw into.
+#: Formats of pictures that OpenCV and matplotlib write.
 PICTURES = ('.png', '.jpg', '.jpeg')
 
 
 class BadParameter(ValueError):
-    """A parameter is none that a node can take; the text says which, and why."""
+    """A parameter is invalid; the text has its name and the reason."""
 
 
 def within(
     node: Node, name: str, default: Number, least: float, most: float = math.inf,
 ) -> Number:
     """
-    Declare a parameter and return its value, of the default's type.
+    Declare a numeric parameter, and return its value with the default's type.
 
-    :raises BadParameter: it is less, or more, or no number.
+    :raises BadParameter: the value is out of range.
     """
     value = node.declare_parameter(name, default).value
     if not least <= value <= most:
@@ -37,10 +37,10 @@ def within(
 
 def writable(node: Node, name: str, endings: Sequence[str] = ()) -> str:
     """
-    Declare a parameter that names a file to write; return it, '' for none.
+    Declare a parameter that names a file to write; return the name, '' for none.
 
-    :param endings: which names of such a file may have, any if there are none.
-    :raises BadParameter: it can't be written.
+    :param endings: allowed file extensions; empty: all.
+    :raises BadParameter: the file cannot be written.
     """
     text = str(node.declare_parameter(name, '').value)
     path = Path(text)

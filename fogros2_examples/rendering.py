@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures and depth images of triangle meshes, by a z-buffer; no graphics card is needed."""
+"""Render pictures and depth images of triangle meshes by a z-buffer, without a graphics card."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from fogros2_examples.meshes import Floats
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """
-    A pinhole camera; it looks along its z, its x goes right, its y down.
+    A pinhole camera; z is its viewing direction, x points right, y down.
 
-    :param rotation: matrix (3, 3) whose columns are its axes in the world.
-    :param centre: where it is, m.
-    :param focal: in pixels.
+    :param rotation: matrix (3, 3) whose columns are the camera's axes in the world.
+    :param centre: position of the camera, m.
+    :param focal: focal length in pixels.
     """
 
     width: int
@@ -28,7 +28,7 @@ class Camera:
     centre: Floats
 
     def seen(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return points (..., 3) as pixels (..., 2) with centres at whole numbers, and depths."""
+        """Project points (..., 3) to pixels (..., 2), with integer centres; also return depths."""
         there = (points - self.centre) @ self.rotation
         depth = there[..., 2]
         middle = numpy.array([(self.width - 1) / 2, (self.height - 1) / 2])
@@ -38,7 +38,7 @@ class Camera:
 
 def looking(at: ArrayLike, centre: ArrayLike, *, width: int, height: int, focal: float,
             up: ArrayLike = (0.0, 0.0, 1.0)) -> Camera:
-    """Return a camera at ``centre`` that looks at a point, ``up`` being up in its picture."""
+    """Return a camera at ``centre`` that looks at a point; ``up`` points up in its picture."""
     forward = numpy.asarray(at, float) - numpy.asarray(centre, float)
     forward /= numpy.linalg.norm(forward)
     right = numpy.cross(forward, numpy.asarray(up, float))
@@ -51,12 +51,12 @@ def looking(at: ArrayLike, centre: ArrayLike, *, width: int, height: int, focal:
 def drawn(camera: Camera, corners: Floats, nearest: float = 0.01,
           ) -> tuple[NDArray[numpy.float32], NDArray[numpy.int32]]:
     """
-    Return what a camera sees of triangles.
+    Render the depths and indices of triangles.
 
-    :param corners: array (n, 3, 3), m; a triangle with a corner nearer than ``nearest`` isn't
+    :param corners: array (n, 3, 3), m; triangles with a corner nearer than ``nearest`` are not
         drawn.
-    :return: depth along its axis in m, 0 where there is nothing, and the index of the triangle
-        there, -1 for none: two arrays (height, width).
+    :return: two arrays (height, width): depths along the camera's axis in m, 0 for none, and
+        indices of the visible triangles, -1 for none.
     """
     buffer = numpy.zeros((camera.height, camera.width), numpy.float64)  # 1 / depth
     index = numpy.full(buffer.shape, -1, numpy.int32)
@@ -75,7 +75,7 @@ def drawn(camera: Camera, corners: Floats, nearest: float = 0.01,
         y = numpy.arange(low[number, 1], high[number, 1] + 1)[:, None]
         u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
         v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
-        # 1 / depth is linear in the picture
+        # 1 / depth is linear in the picture.
         a, b, c = 1 / depths[number]
         inverse = a + u * (b - a) + v * (c - a)
         rows, columns = slice(y[0, 0], y[-1, 0] + 1), slice(x[0], x[-1] + 1)
@@ -91,26 +91,26 @@ def shaded(camera: Camera, corners: Floats, colours: Floats,
            background: ArrayLike = (255, 255, 255),
            ) -> tuple[NDArray[numpy.uint8], NDArray[numpy.float32]]:
     """
-    Return a picture of triangles, lit from above the camera, with a thin line round each thing.
+    Render triangles, lit from above the camera, with a thin line around each object.
 
-    :param colours: of the triangles, array (n, 3) of 0 to 255.
-    :return: array (height, width, 3), in the order of ``colours``; the depths as of ``drawn``.
+    :param colours: colours of the triangles, array (n, 3) of 0 to 255.
+    :return: array (height, width, 3), with the channels of ``colours``; the depths of ``drawn``.
     """
-    # four samples a pixel
+    # Four samples per pixel.
     fine = Camera(2 * camera.width, 2 * camera.height, 2 * camera.focal, camera.rotation,
                   camera.centre)
     depth, index = drawn(fine, corners)
     normals = numpy.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= numpy.maximum(numpy.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     light = camera.rotation @ numpy.array([-0.35, -0.55, -0.75])
-    # the side that is seen is the one that is lit
+    # Light the visible side.
     facing = numpy.sign(((camera.centre - corners[:, 0]) * normals).sum(axis=1))
     bright = 0.72 + 0.28 * numpy.clip(facing * (normals @ light), -0.7, 1)
     shades = numpy.concatenate([colours * bright[:, None], [background]])
     picture = shades[index]
     far = numpy.where(index >= 0, depth, depth.max() * 1.2)
     for axis in (0, 1):
-        # a step in depth that no slope explains is an edge of a thing
+        # A step in depth that no slope explains is the edge of an object.
         bend = numpy.abs(numpy.diff(1 / far, 2, axis=axis)) * numpy.take(
             far, range(1, far.shape[axis] - 1), axis=axis)
         rows = [slice(None), slice(None)]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A synthetic moving scene with the statistics of photographs; frame ``n`` is always the same.
+Render a synthetic moving scene with the statistics of photographs; frame ``n`` is reproducible.
 
 The picture is a "dead leaves" model (Lee, Mumford and Huang, IJCV 2001): opaque shapes whose sizes
-follow a power law, dropped over each other. It has what photographs have and noise has not:
-occlusion edges at all scales, a spectrum that falls with the frequency, flat and busy places.
-Each leaf carries a faint grain. A camera pans over it with a hand's shake, five objects cross the
-view at their own speeds, the exposure drifts, and the sensor adds noise.
+follow a power law, dropped over each other. Like photographs and unlike noise, it has occlusion
+edges at all scales, a spectrum that falls with the frequency, and flat and busy areas. Each leaf
+has a faint grain. A camera pans over the picture with a hand's shake, five objects cross the view
+at their own speeds, the exposure drifts, and the sensor adds noise.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ NOISE = 1.0
 
 class Scene:
     """
-    Renders frames.
+    Render frames.
 
-    :param width: in pixels, as ``height``.
-    :param rate: frames per second; motion is per second, whatever the rate.
+    :param width: width in pixels, as ``height``.
+    :param rate: frames per second; the speed of motion does not depend on it.
     """
 
     def __init__(self, width: int, height: int, rate: float = 30.0, seed: int = 1) -> None:
@@ -39,7 +39,7 @@ class Scene:
             raise ValueError(f'no scene of {width}x{height} at {rate} Hz')
         self.width, self.height, self.rate = width, height, rate
         random = numpy.random.default_rng(seed)
-        # with the height alone, so that a wide view shows more and not larger things
+        # Sizes depend only on the height, so that a wide view shows more and not larger objects.
         self._field = _leaves(random, math.ceil(width * FIELD) + 8, math.ceil(height * FIELD) + 8,
                               height)
         size = max(8, height // 4)
@@ -48,7 +48,7 @@ class Scene:
         self._speeds = random.uniform(0.05, 0.35, OBJECTS) * random.choice([-1, 1], OBJECTS)
         self._starts = random.uniform(0, 1, OBJECTS)
         self._rows = random.uniform(0.1, 0.8, OBJECTS)
-        # one tile of noise, shown at a place of its own each frame: as good, and cheap
+        # One tile of noise at a random position in each frame looks as good, and is cheap.
         tile = random.normal(0, NOISE, (height + 64, width + 64, 3))
         self._noise = numpy.round(tile).astype(numpy.int8)
 
@@ -64,13 +64,13 @@ class Scene:
         random = numpy.random.default_rng(number)
         y, x = random.integers(0, 64, 2)
         noise = self._noise[y:y + self.height, x:x + self.width]
-        # exposure and noise in one pass, saturating
+        # Exposure and noise in one saturating pass.
         gain = 1.0 + 0.03 * math.sin(seconds * 0.7)
         return numpy.asarray(cv2.addWeighted(
             image, gain, noise, 1.0, 0.0, dtype=cv2.CV_8U), numpy.uint8)
 
     def _view(self, seconds: float) -> NDArray[numpy.float64]:
-        """Return where the camera looks: a slow pan, a hand's shake, a little roll."""
+        """Return the camera's view: a slow pan, a hand's shake, and a little roll."""
         room_x = self.width * (FIELD - 1) / 2
         room_y = self.height * (FIELD - 1) / 2
         x = room_x * (1 + 0.8 * math.sin(seconds * 0.35)) + 1.5 * math.sin(seconds * 7.1)
@@ -94,11 +94,11 @@ class Scene:
 
 
 def _leaves(random: numpy.random.Generator, width: int, height: int, scale: int) -> Pixels:
-    """Drop leaves until the picture is full of them; sizes are relative to ``scale``."""
+    """Drop leaves until they cover the picture; sizes are relative to ``scale``."""
     image = numpy.full((height, width, 3), 110, numpy.uint8)
     smallest, largest = max(2.0, scale / 45), scale / 2.2
     area = width * height / scale ** 2
-    # radii by a power law of exponent -3, cut at both ends; large ones first, until they cover
+    # Radii follow a power law of exponent -3 between two limits; large leaves come first.
     ground = largest * random.uniform(0.35, 1.0, math.ceil(60 * area))
     u = random.uniform(0, 1, math.ceil(700 * area))
     radii = numpy.concatenate(
@@ -116,7 +116,7 @@ def _leaves(random: numpy.random.Generator, width: int, height: int, scale: int)
             corners = cv2.boxPoints((centre, (2.0 * axes[0], 2.0 * axes[1]),
                                      float(random.uniform(0, 180))))
             cv2.fillConvexPoly(image, corners.astype(numpy.int32), colour, cv2.LINE_AA)
-    # a lens is never sharper than its sensor
+    # A lens is never sharper than its sensor.
     soft = cv2.GaussianBlur(image, (0, 0), 0.9)
     grain = cv2.GaussianBlur(random.normal(0, 1, (height, width)), (0, 0), 1.2)
     grain *= 2.0 / grain.std()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes a greeting on ``chatter`` at once and then each second, saying where it runs."""
+"""Publish a greeting with the host's name on ``chatter``, at once and then every second."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from std_msgs.msg import String
 
 
 def own_address() -> str:
-    """Return the address this host would use towards others, '127.0.0.1' if it has none."""
+    """Return the address of this host towards other hosts, '127.0.0.1' if it has none."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            # connecting a datagram socket sends nothing; it only looks a route up
+            # connect() of a datagram socket sends nothing; it only looks up a route.
             probe.connect(('192.0.2.1', 9))
             return str(probe.getsockname()[0])
         except OSError:
@@ -27,7 +27,7 @@ def own_address() -> str:
 
 
 class Talker(Node):
-    """Greets; parameter ``period`` is in seconds."""
+    """Publish greetings; parameter ``period`` is in seconds."""
 
     def __init__(self) -> None:
         super().__init__('talker')
@@ -52,4 +52,4 @@ def main() -> None:
     try:
         rclpy.spin(Talker())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice

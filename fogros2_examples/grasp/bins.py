@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic bins of objects: what is in them, and what a depth camera over them sees."""
+"""Generate synthetic bins of objects, and the depth images of a camera above them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from fogros2_examples.meshes import box, cylinder, Floats, joined, lathe, Mesh, sphere, turned
 from fogros2_examples.rendering import Camera, drawn
 
-#: Side of the bin's floor, m; its walls are out of the camera's sight.
+#: Sides of the bin's floor, m; its walls are outside of the camera's view.
 SIZE = (0.46, 0.34)
-#: How high the camera is above the floor, m, and its focal length for each pixel of its width.
+#: Height of the camera above the floor, m, and its focal length per pixel of its width.
 HEIGHT, FOCAL = 0.7, 1.6
-#: Standard deviation of the sensor's noise, m, and the angle from which on it sees no surface.
+#: Standard deviation of the sensor's noise, m, and maximum angle of a visible surface.
 NOISE, STEEPEST = 0.0005, math.radians(84)
 
 
@@ -50,7 +50,7 @@ def _can(scale: float) -> Mesh:
     return cylinder(0.026 * scale, 0.075 * scale, 32)
 
 
-#: What is thrown into a bin.
+#: Kinds of objects in a bin.
 KINDS: tuple[Callable[[float], Mesh], ...] = (
     _brick, _can, _bottle, _dumbbell, _bracket, lambda scale: sphere(0.026 * scale))
 
@@ -58,9 +58,9 @@ KINDS: tuple[Callable[[float], Mesh], ...] = (
 @dataclasses.dataclass(frozen=True)
 class Bin:
     """
-    A bin; z is up, its floor is at 0, its middle in the origin.
+    A bin; z points up, and the origin is the middle of its floor.
 
-    :param objects: where they lie.
+    :param objects: the objects at their places.
     """
 
     objects: tuple[Mesh, ...]
@@ -68,19 +68,19 @@ class Bin:
 
     @property
     def corners(self) -> Floats:
-        """The corners of all triangles, those of the floor last, array (n, 3, 3)."""
+        """The corners of all triangles, with the floor's last, array (n, 3, 3)."""
         return joined([*self.objects, self.floor]).corners
 
 
 def thrown(seed: int, count: int = 9) -> Bin:
-    """Return a bin with objects; each has come down straight onto what lay below it."""
+    """Return a bin with objects; each object fell straight down onto the objects below it."""
     random = numpy.random.default_rng(seed)
     floor = box((-SIZE[0] / 2, -SIZE[1] / 2, -0.01), (SIZE[0] / 2, SIZE[1] / 2, 0))
     objects: list[Mesh] = []
     lying = [_solid(floor)]
     for _ in range(count):
         mesh = KINDS[int(random.integers(len(KINDS)))](float(random.uniform(0.85, 1.2)))
-        # things come to lie on a face more often than on an edge
+        # Objects rest on a face more often than on an edge.
         tilt = math.pi / 2 * int(random.integers(2)) + float(random.normal(0, 0.12))
         turn = turned((0, 0, 1), float(random.uniform(0, 2 * math.pi))) @ turned((1, 0, 0), tilt)
         x, y = random.uniform(-0.5, 0.5, 2) * (numpy.array(SIZE) - 0.14)
@@ -102,7 +102,7 @@ def _solid(mesh: Mesh) -> fcl.CollisionObject:
 
 
 def _resting(mesh: Mesh, lying: list[fcl.CollisionObject]) -> float:
-    """Return how far above the floor a mesh stops when it comes down."""
+    """Return the height above the floor at which a falling mesh stops."""
     falling = _solid(mesh)
 
     def touches(height: float) -> bool:
@@ -124,9 +124,9 @@ def camera(width: int = 640, height: int = 480) -> Camera:
 
 def depth_image(contents: Bin, eye: Camera, seed: int) -> NDArray[numpy.float32]:
     """
-    Return what a depth camera measures: m, 0 where it sees nothing.
+    Return a depth image in m, 0 for unknown.
 
-    It has noise, and is blind for surfaces that it sees nearly from their side.
+    The camera has noise, and does not see surfaces at grazing angles.
     """
     corners = contents.corners
     depth, index = drawn(eye, corners)

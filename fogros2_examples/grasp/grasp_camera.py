@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A depth camera over synthetic bins: has grasps planned in each and takes the time.
+Publish depth images of synthetic bins, and measure the time until the grasps arrive.
 
-Publishes ``depth`` and ``camera_info``; shows what it gets on ``picture`` and in a file.
+The node publishes ``depth`` and ``camera_info``. It shows the grasps on ``picture`` and in a file.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class GraspCamera(Node):
     """
     The camera.
 
-    Parameters: ``trials``, bins to show, 0 for ever more; ``seed`` of the first; ``encoding``,
-    16UC1 (mm) or 32FC1 (m); ``picture``, a PNG file to write, '' for none; ``figures``, a file to
-    which each trial's times go, as a line of JSON; ``wait`` in s, how long an answer may take.
+    Parameters: ``trials``, number of bins, 0 for no end; ``seed`` of the first bin; ``encoding``,
+    16UC1 (mm) or 32FC1 (m); ``picture``, a PNG file to write, '' for none; ``figures``, a file for
+    the times of each trial, as lines of JSON; ``wait``, time-out of an answer in s.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class GraspCamera(Node):
         self.create_subscription(DiagnosticStatus, 'grasp_status', self.hear, LATCHED)
 
     def hear(self, status: DiagnosticStatus) -> None:
-        """Keep how long the planner took."""
+        """Record the planner's time for an image."""
         self.ready = True
         told = {value.key: value.value for value in status.values}
         if 'stamp' in told:
@@ -79,16 +79,16 @@ class GraspCamera(Node):
             self.seconds[int(second), int(rest)] = float(told['seconds'])
 
     def answer(self, markers: MarkerArray) -> None:
-        """Keep grasps under the stamp of their image."""
+        """Record the grasps of an image by the image's stamp."""
         if markers.markers:
             self.answers[_key(markers.markers[0].header.stamp)] = markers
 
     def run(self) -> int:
-        """Return the exit status: 0 where every bin was answered with a grasp."""
+        """Show all bins, and return the exit status: 0 if each bin had a grasp."""
         if not self._until(lambda: self.ready, self.wait):
             self.get_logger().fatal(f'no grasp planner is there after {self.wait:g} s')
             return 2
-        # what carries the images may not be up when the planner is: the first don't count
+        # The transport of the images may start later than the planner: ignore the first images.
         first = self._bin(self.seed)
         if not any(self._asked(first, 5.0) is not None for _ in range(max(1, int(self.wait / 5)))):
             self.get_logger().fatal(f'no depth image was answered in {self.wait:g} s')
@@ -129,7 +129,7 @@ class GraspCamera(Node):
         return depth_image(thrown(seed), self.eye, seed)
 
     def _asked(self, depth: NDArray[numpy.float32], wait: float) -> Optional[tuple[int, int]]:
-        """Publish an image; return its stamp when grasps for it are there, None if they aren't."""
+        """Publish an image; return its stamp after its grasps arrived, None after ``wait`` s."""
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id='camera')
         key = _key(header.stamp)
         height, width = depth.shape
@@ -146,7 +146,7 @@ class GraspCamera(Node):
             data=array.array('B', image.tobytes())))
 
     def _until(self, true: Callable[[], bool], wait: float) -> bool:
-        """Handle messages until something is true; return whether it came to be in time."""
+        """Handle messages until ``true()`` is true; return False after ``wait`` seconds."""
         deadline = time.monotonic() + wait
         while not true():
             if time.monotonic() > deadline:
@@ -160,14 +160,14 @@ def _key(stamp: Time) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Run until all bins were shown; a parameter that is none ends it at once."""
+    """Show all bins; exit at once on an invalid parameter."""
     rclpy.init()
     try:
         raise SystemExit(GraspCamera().run())
     except BadParameter as error:
         raise SystemExit(f'grasp_camera: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     except SystemExit:
         rclpy.try_shutdown()
         raise

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Plans grasps of what a depth camera sees: image on ``depth``, ranked grasps on ``grasps``.
+Plan grasps from depth images: image on ``depth``, ranked grasps on ``grasps``.
 
-Each image is answered once, under its own stamp: poses on ``grasps`` (none where there is nothing
-to grasp), the same with qualities on ``grasp_markers``, and why on ``grasp_status``.
+The node answers each image once, with the image's stamp: poses on ``grasps`` (none if there is no
+grasp), poses with qualities on ``grasp_markers``, and the result on ``grasp_status``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fogros2_examples.grasp.antipodal import Grasp, Gripper, plan
 from fogros2_examples.grasp.messages import BadImage, depth_of, grasp_messages
 from fogros2_examples.grasp.surface import NothingThere, surface
 
-#: The last one is kept for those who come later.
+#: Keeps the last message for late subscribers.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -32,8 +32,8 @@ class GraspPlanner(Node):
     """
     The planner.
 
-    Parameters: ``samples``, pairs of points to look at; ``perturbed``, how many errors each is
-    tried under; ``count`` of grasps; ``friction`` and ``opening`` (m) of the gripper.
+    Parameters: ``samples``, pairs of points to try; ``perturbed``, perturbations of each grasp;
+    ``count``, maximum number of grasps; ``friction`` and ``opening`` (m) of the gripper.
     """
 
     def __init__(self) -> None:
@@ -54,14 +54,14 @@ class GraspPlanner(Node):
         self.tell(DiagnosticStatus.OK, 'waiting for depth images', {})
 
     def learn(self, info: CameraInfo) -> None:
-        """Keep what the camera says of itself; it may come after its first image."""
+        """Store the CameraInfo, which may arrive after the first image."""
         self.info = info
         if self.waiting is not None:
             image, self.waiting = self.waiting, None
             self.see(image)
 
     def see(self, image: Image) -> None:
-        """Answer an image."""
+        """Answer an image with grasps."""
         if self.info is None:
             self.waiting = image
             return
@@ -90,8 +90,8 @@ class GraspPlanner(Node):
         self.poses.publish(poses)
 
     def tell(self, level: bytes, message: str, figures: dict[str, str]) -> None:
-        """Say what happened, here and to others."""
-        # a line of its own for each: rclpy holds one to one severity
+        """Log a result, and publish it as status."""
+        # Separate calls, because rclpy allows only one severity per call site.
         if level == DiagnosticStatus.OK:
             self.get_logger().info(message)
         else:
@@ -107,4 +107,4 @@ def main() -> None:
     try:
         rclpy.spin(GraspPlanner())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice

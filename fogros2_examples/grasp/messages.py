@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images and grasps as messages."""
+"""Convert between depth images, grasps and messages."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from fogros2_examples.grasp.antipodal import Grasp
 
-#: Encodings of depth: type of a pixel, and m for each unit (REP 118).
+#: Encodings of depth: type of a pixel, and m per unit (REP 118).
 ENCODINGS = {'16UC1': ('u2', 0.001), 'mono16': ('u2', 0.001), '32FC1': ('f4', 1.0)}
 
 
 class BadImage(ValueError):
-    """An image is no depth image; the text says why."""
+    """An image is no depth image; the text has the reason."""
 
 
 def depth_of(image: Image) -> NDArray[numpy.float32]:
     """
-    Return the depths in an image, m, array (height, width); 0 or NaN where it has none.
+    Return the depths of an image, m, array (height, width); 0 or NaN means unknown.
 
-    :raises BadImage: its encoding is none for depth, or its data are not what its size says.
+    :raises BadImage: the encoding is none of depth, or the data do not fit the size.
     """
     if image.encoding not in ENCODINGS:
         raise BadImage(f"'{image.encoding}' is no encoding of depth: it takes "
@@ -45,7 +45,7 @@ def depth_of(image: Image) -> NDArray[numpy.float32]:
 
 
 def depth_message(depth: NDArray[numpy.float32], encoding: str, header: Header) -> Image:
-    """Return depths in m as an image."""
+    """Return depths in m as an image message."""
     kind, unit = ENCODINGS[encoding]
     values = depth / unit
     pixels = (numpy.rint(values) if kind == 'u2' else values).astype(f'<{kind}')
@@ -55,7 +55,7 @@ def depth_message(depth: NDArray[numpy.float32], encoding: str, header: Header) 
 
 
 def info_message(width: int, height: int, focal: float, header: Header) -> CameraInfo:
-    """Return the CameraInfo of a pinhole camera whose axis goes through its image's middle."""
+    """Return the CameraInfo of a pinhole camera with its axis in the middle of the image."""
     x, y = (width - 1) / 2, (height - 1) / 2
     info = CameraInfo(header=header, width=width, height=height, distortion_model='plumb_bob',
                       d=[0.0] * 5)
@@ -67,11 +67,11 @@ def info_message(width: int, height: int, focal: float, header: Header) -> Camer
 
 def grasp_messages(grasps: list[Grasp], header: Header) -> tuple[PoseArray, MarkerArray]:
     """
-    Return grasps in their order: as poses, and as markers with their qualities.
+    Return ranked grasps as poses, and as markers with their qualities.
 
-    A pose is between the finger tips, its x the line between the jaws, its z where the gripper
-    comes from to. A marker's ``id`` is the rank, its ``text`` the quality, its ``scale.x`` the
-    width in m; its line goes from contact to contact.
+    The position of a pose is between the finger tips. Its x axis is the line between the jaws, its
+    z axis the direction of approach. A marker's ``id`` is the rank, its ``text`` the quality, its
+    ``scale.x`` the width in m; its line connects the contacts.
     """
     poses = PoseArray(header=header)
     markers = MarkerArray(markers=[Marker(header=header, ns='grasps', action=Marker.DELETEALL)])
@@ -91,7 +91,7 @@ def grasp_messages(grasps: list[Grasp], header: Header) -> tuple[PoseArray, Mark
 
 
 def grasps_of(markers: MarkerArray) -> list[Grasp]:
-    """Return the grasps in the markers of ``grasp_messages``, in their order."""
+    """Return the grasps of markers of ``grasp_messages``, in the same order."""
     return [Grasp(numpy.array([m.pose.position.x, m.pose.position.y, m.pose.position.z]),
                   2 * math.atan2(m.pose.orientation.z, m.pose.orientation.w),
                   m.scale.x, float(m.text))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of grasps: on the depth image, each with its quality."""
+"""Draw grasps with their qualities into the depth image."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from fogros2_examples.grasp.antipodal import Grasp, Gripper
 def picture(depth: NDArray[numpy.float32], grasps: Sequence[Grasp], focal: float, title: str,
             most: int = 5) -> NDArray[numpy.uint8]:
     """
-    Return a depth image with the best grasps on it.
+    Return a depth image with the best grasps drawn into it.
 
-    :param depth: array (height, width), m; the camera's axis goes through its middle.
-    :param grasps: ranked; the first is drawn thicker, and the first ``most`` are drawn.
+    :param depth: array (height, width), m; the camera's axis is in its middle.
+    :param grasps: ranked grasps; the first ``most`` are drawn, the best one thicker.
     :return: array (height, width, 3) of BGR.
     """
     known = depth > 0
@@ -43,7 +43,7 @@ def picture(depth: NDArray[numpy.float32], grasps: Sequence[Grasp], focal: float
             _line(image, jaw - bar * across, jaw + bar * across, colour, thick + 2)
             _line(image, jaw, jaw + sign * 0.012 * scale * along, colour, thick)
         _line(image, at - half * along, at + half * along, colour, 1)
-        # beside the jaw on the right, where no line is
+        # Place the text beside the right jaw, where no line is.
         right = along if along[0] >= 0 else -along
         _words(image, f'{grasp.quality:.2f}',
                at + (half + 0.013 * scale) * right + numpy.array([3, 5]), colour,
@@ -53,7 +53,7 @@ def picture(depth: NDArray[numpy.float32], grasps: Sequence[Grasp], focal: float
 
 
 def beside(pictures: Sequence[NDArray[numpy.uint8]], columns: int = 5) -> NDArray[numpy.uint8]:
-    """Return pictures of one size in rows of up to so many, each three quarters as large."""
+    """Return pictures of one size in rows of up to ``columns``, at 75 % of their size."""
     small = [numpy.asarray(cv2.resize(one, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA),
                            numpy.uint8) for one in pictures]
     columns = min(columns, len(small))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth image says of the things below a camera: their heights on a square grid."""
+"""Convert a depth image to the heights of the objects below a camera, on a square grid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fogros2_examples.meshes import Floats
 
 #: Side of a cell of the grid, m.
 CELL = 0.0015
-#: Points that measure a depth; with fewer there is nothing to plan on.
+#: Minimum number of pixels with a depth.
 FEWEST = 500
 
 
@@ -21,7 +21,7 @@ _ROW = 1024
 
 
 class NothingThere(ValueError):
-    """A depth image has nothing to grasp in it; the text says why."""
+    """A depth image shows nothing to grasp; the text has the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Surface:
     Heights above the floor along the camera's axis.
 
     :param heights: array (rows, columns), m; row and column grow with the camera's y and x.
-    :param smooth: the same without the sensor's noise.
-    :param slopes: how ``smooth`` changes along x and y, m for each m: array (rows, columns, 2).
+    :param smooth: the heights without the sensor's noise.
+    :param slopes: slopes of ``smooth`` along x and y, m per m: array (rows, columns, 2).
     :param origin: x and y of the first cell's middle in the camera's frame, m.
     :param floor: depth of the floor, m.
     """
@@ -43,10 +43,10 @@ class Surface:
     floor: float
 
     def at(self, values: NDArray[numpy.float32], points: Floats) -> NDArray[numpy.float32]:
-        """Return values of the grid at points (..., 2) of the camera's frame, interpolated."""
+        """Interpolate values of the grid at points (..., 2) of the camera's frame."""
         cells = ((points - self.origin) / CELL).astype(numpy.float32)
         flat = cells.reshape(-1, 2)
-        # OpenCV takes 32767 rows and columns at the most
+        # OpenCV's limit is 32767 rows and columns.
         maps = numpy.resize(flat, (-(-len(flat) // _ROW), _ROW, 2))
         found = cv2.remap(values, maps[:, :, 0].copy(), maps[:, :, 1].copy(), cv2.INTER_LINEAR,
                           borderMode=cv2.BORDER_REPLICATE).reshape(-1, *values.shape[2:])
@@ -57,11 +57,11 @@ class Surface:
 def surface(depth: NDArray[numpy.float32], focal: tuple[float, float],
             middle: tuple[float, float]) -> Surface:
     """
-    Return the surface in a depth image.
+    Compute the surface of a depth image.
 
-    :param depth: array (height, width), m; what isn't finite or not above 0 is no measurement.
-    :param focal: in pixels, of x and y; ``middle`` is the pixel on the camera's axis.
-    :raises NothingThere: there are hardly any measurements.
+    :param depth: array (height, width), m; other than finite positive values mean unknown.
+    :param focal: focal lengths of x and y in pixels; ``middle`` is the pixel on the camera's axis.
+    :raises NothingThere: too few pixels have a depth, or the surface is too large.
     """
     known = numpy.isfinite(depth) & (depth > 0)
     if known.sum() < FEWEST:
@@ -76,12 +76,12 @@ def surface(depth: NDArray[numpy.float32], focal: tuple[float, float],
         raise NothingThere(f'it shows {CELL * shape[1]:.1f} m by {CELL * shape[0]:.1f} m: '
                            'that is no bin within reach')
     heights = numpy.full(shape, -1, numpy.float32)
-    # of what falls into a cell, the highest: the camera sees it first
+    # The camera sees the highest point of a cell.
     numpy.maximum.at(heights, (((y - low[1]) / CELL).astype(int),
                                ((x - low[0]) / CELL).astype(int)),
                      numpy.maximum(floor - z, 0).astype(numpy.float32))
     heights = _filled(heights)
-    # a median leaves edges where they are
+    # A median keeps edges in place.
     smooth = cv2.GaussianBlur(cv2.medianBlur(heights, 5), (0, 0), 0.8)
     slopes = numpy.dstack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3),
                            cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)]) / (8 * CELL)
@@ -90,7 +90,7 @@ def surface(depth: NDArray[numpy.float32], focal: tuple[float, float],
 
 
 def _floor(depths: Floats) -> float:
-    """Return the depth of the floor: the farthest that a fair share of all pixels have."""
+    """Return the depth of the floor: the largest depth that many pixels have."""
     counts, edges = numpy.histogram(depths, bins=numpy.arange(
         depths.min(), min(depths.max(), depths.min() + 5) + 0.008, 0.004))
     often = numpy.flatnonzero(counts >= 0.3 * counts.max())
@@ -100,13 +100,13 @@ def _floor(depths: Floats) -> float:
 
 
 def _filled(heights: NDArray[numpy.float32]) -> NDArray[numpy.float32]:
-    """Return heights with those that nothing was seen of: as low as the lowest beside them."""
+    """Fill cells without a height, with the lowest height beside them."""
     found = heights
     for _ in range(60):
         holes = found < 0
         if not holes.any():
             break
-        # what hides behind an edge lies lower than it
+        # A hidden surface behind an edge is lower than the edge.
         beside = cv2.erode(numpy.where(holes, numpy.float32(9), found), numpy.ones((3, 3)))
         found = numpy.where(holes & (beside < 9), beside, found)
     return numpy.maximum(found, 0).astype(numpy.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grasp planning: the planner where ``machine:=`` says, a depth camera over ten bins here."""
+"""Grasp planning: the planner on ``machine:=``, a depth camera over ten bins on the robot."""
 
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
@@ -11,7 +11,7 @@ from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
-    """Describe the two; ``trials:=`` and ``picture:=`` say how many bins, and what is shown."""
+    """Describe the nodes; ``trials:=`` is the number of bins, ``picture:=`` a file to write."""
     return FogROSLaunchDescription([
         DeclareLaunchArgument('machine', default_value='container',
                               choices=['robot', 'container', 'aws', 'kubernetes'],

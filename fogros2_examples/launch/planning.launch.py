@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion planning: the planner where ``machine:=`` says, who asks it here."""
+"""Motion planning: the planner on ``machine:=``, its client on the robot."""
 
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
@@ -11,7 +11,7 @@ from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
-    """Describe the two; ``environment:=`` and ``picture:=`` say what is planned and shown."""
+    """Describe the nodes; ``environment:=`` is the problem, ``picture:=`` a file to write."""
     return FogROSLaunchDescription([
         DeclareLaunchArgument('machine', default_value='container',
                               choices=['robot', 'container', 'aws', 'kubernetes'],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visual SLAM: the algorithm where ``machine:=`` says, the camera here."""
+"""Visual SLAM: the algorithm on ``machine:=``, the camera on the robot."""
 
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
@@ -11,7 +11,7 @@ from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
-    """Describe the two; a stereo camera in a synthetic room, unless told otherwise."""
+    """Describe the nodes; the default is a stereo camera in a synthetic room."""
     shown = {'dataset': ('', "a folder in TUM's RGB-D format, '' for the synthetic room"),
              'stereo': (True, 'whether the synthetic camera has two eyes, or sees depth'),
              'grey': (False, "whether its images are grey, as most stereo cameras' are"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ORB-SLAM2 or 3 from a container image of yours, in the place of the example's own SLAM."""
+"""ORB-SLAM2 or 3 from your own container image, instead of the example's own SLAM."""
 
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PythonExpression
@@ -11,7 +11,7 @@ from fogros2_examples.ending import ended
 
 
 def generate_launch_description():
-    """Describe the two; names are those of the usual ROS 2 wrapper of ORB-SLAM3."""
+    """Describe the nodes; default names are those of the usual ROS 2 wrapper of ORB-SLAM3."""
     asked = {'image': (None, 'with ROS 2 and ORB-SLAM, such as me/orb-slam3:jazzy'),
              'package': ('orbslam3', 'in the image'), 'executable': ('stereo', 'of that package'),
              'vocabulary': ('/ORB_SLAM3/Vocabulary/ORBvoc.txt', 'in the image'),
@@ -35,7 +35,7 @@ def generate_launch_description():
              (LaunchConfiguration('right'), '/camera/right/image'),
              (LaunchConfiguration('depth'), '/camera/depth'),
              (LaunchConfiguration('pose'), '/pose')]
-    # JPEG would spoil depth
+    # JPEG would damage depth images.
     deep = PythonExpression(
         ["'raw' if '", LaunchConfiguration('transport'), "' == 'raw' else 'h264'"])
     return FogROSLaunchDescription([
@@ -47,7 +47,7 @@ def generate_launch_description():
         *(DeclareLaunchArgument(
             name, default_value=None if value is None else str(value), description=what)
           for name, (value, what) in (asked | shown).items()),
-        # other machines run containers without being asked
+        # Other machines than containers can run containers by default.
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'mounts': LaunchConfiguration('mounts'),
             'containers': PythonExpression(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A talker in the nearest AWS region, on the cheapest instance that will do; a listener here."""
+"""A talker in the nearest AWS region, on the cheapest suitable instance; a listener here."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -9,7 +9,7 @@ from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    """Describe the pair; region and type are chosen when the launch is executed."""
+    """Describe the nodes; the launch chooses region and type when it runs."""
     machine = AWSCloudInstance(
         name=LaunchConfiguration('name'), region='nearest', ec2_instance_type='cheapest',
         min_cpu=LaunchConfiguration('min_cpu'), min_memory_gb=LaunchConfiguration('min_memory'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A talker on an EC2 instance that is made for it; a listener here."""
+"""A talker on a new EC2 instance; a listener here."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -9,7 +9,7 @@ from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    """Describe the pair; ``region:=eu-central-1 spot:=true`` says where and how."""
+    """Describe the nodes; ``region:=eu-central-1 spot:=true`` choose the kind of instance."""
     machine = AWSCloudInstance(
         name=LaunchConfiguration('name'), region=LaunchConfiguration('region'),
         ec2_instance_type=LaunchConfiguration('ec2_instance_type'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A talker on a machine of its own, a container on this computer; a listener here."""
+"""A talker on a container machine of this computer; a listener here."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -10,7 +10,7 @@ from fogros2_examples.choice import arguments, node
 
 
 def generate_launch_description():
-    """Describe the pair; ``count:=20`` ends it after 20 messages, ``machine:=local`` is here."""
+    """Describe the nodes; ``count:=20`` ends it after 20 messages, ``machine:=local`` is here."""
     return FogROSLaunchDescription([
         *arguments('container', 'talker-machine'),
         *node('talker'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A talker in a pod of the cluster that the kubeconfig names; a listener here."""
+"""A talker in a pod of the kubeconfig's cluster; a listener here."""
 
 from launch.actions import Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -10,7 +10,7 @@ from fogros2_examples.choice import argument
 
 
 def generate_launch_description():
-    """Describe the pair; ``count:=20`` ends it after 20 messages."""
+    """Describe the nodes; ``count:=20`` ends the launch after 20 messages."""
     pod = KubeInstance(
         name=LaunchConfiguration('name'), on_exit=LaunchConfiguration('on_exit'),
         container_image=LaunchConfiguration('image'), user=LaunchConfiguration('user'),

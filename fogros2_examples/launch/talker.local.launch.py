@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same talker and listener, both here: what the other launch files are compared with."""
+"""The same talker and listener, both here, to compare with the other launch files."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, Shutdown
@@ -8,7 +8,7 @@ from launch_ros.actions import Node
 
 
 def generate_launch_description():
-    """Describe the pair; ``count:=20`` ends it after 20 messages."""
+    """Describe the nodes; ``count:=20`` ends the launch after 20 messages."""
     return LaunchDescription([
         DeclareLaunchArgument('count', default_value='0',
                               description='messages after which the launch ends, 0 for never'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A talker on a computer that exists already, reached by SSH; a listener here."""
+"""A talker on an existing computer, reached by SSH; a listener here."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -10,7 +10,7 @@ from fogros2_examples.choice import arguments, node
 
 
 def generate_launch_description():
-    """Describe the pair; ``host:=planner.local user:=robot`` says which computer."""
+    """Describe the nodes; ``host:=planner.local user:=robot`` choose the computer."""
     return FogROSLaunchDescription([
         *arguments('ssh', 'ssh-machine'),
         *node('talker'),

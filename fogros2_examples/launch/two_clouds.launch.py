@@ -10,7 +10,7 @@ from fogros2_examples.choice import arguments, node, SECOND
 
 
 def generate_launch_description():
-    """Describe three hosts that talk to each other; ``count:=20`` ends it after 20 messages."""
+    """Describe the nodes on three hosts; ``count:=20`` ends the launch after 20 messages."""
     return FogROSLaunchDescription([
         *arguments('container', 'speaker', 'hearer'),
         *node('talker'),

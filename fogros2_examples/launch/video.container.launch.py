@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera here, image processing on a container machine; images cross as H.264, both ways."""
+"""A camera here, image processing on a container machine; both streams of images use H.264."""
 
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.substitutions import LaunchConfiguration

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion planning of rigid bodies: the planner's node, its client, and what both need."""
+"""Motion planning of rigid bodies: the planner's node, its client, and their code."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the problems of OMPL.app: a ``.cfg`` file, which names two mesh files beside it."""
+"""Read problems of OMPL.app: a ``.cfg`` file that names two mesh files beside it."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import numpy
 from fogros2_examples.meshes import Floats, joined, Mesh, quaternion, turned
 from fogros2_examples.planning.scene import Scene
 
-#: How Assimp, with which OMPL.app reads meshes, turns what a file calls up to its y.
+#: Rotation of a file's up axis to y by Assimp, with which OMPL.app reads meshes.
 _UPRIGHT = {'X_UP': numpy.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
             'Z_UP': numpy.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 
 
 class BadFile(ValueError):
-    """A file is no problem of a rigid body in space; the text says which, and what is wrong."""
+    """A file is no problem of a rigid body in space; the text has the file and the reason."""
 
 
 def loaded(path: Path) -> Scene:
     """
-    Return the problem in a file, in the file's own unit of length.
+    Read the problem of a file, in the file's unit of length.
 
-    :raises BadFile: it can't be read, lacks something, or a mesh can't.
+    :raises BadFile: the file or a mesh cannot be read, or a value is missing.
     """
-    # some have comments behind values, and name a planner twice
+    # Some files have comments after values, and define a planner twice.
     parser = configparser.ConfigParser(
         strict=False, interpolation=None, inline_comment_prefixes=('#', ';'))
     try:
         parser.read_string(path.read_text())
         problem = parser['problem']
-        # poses are those of the body's middle, as OMPL.app has it
+        # As in OMPL.app, a pose is the pose of the body's centre.
         body, walls = (_mesh(path.parent / problem[name].strip('"'), centred=name == 'robot')
                        for name in ('robot', 'world'))
         poses = [_pose(problem, name) for name in ('start', 'goal')]
@@ -55,7 +55,7 @@ def loaded(path: Path) -> Scene:
 
 
 def _pose(problem: configparser.SectionProxy, name: str) -> Floats:
-    """Return a pose: a position, and a turn about an axis in rad."""
+    """Parse a pose: a position, and a rotation about an axis in rad."""
     def number(key: str) -> float:
         return float(problem[f'{name}.{key}'])
 
@@ -66,7 +66,7 @@ def _pose(problem: configparser.SectionProxy, name: str) -> Floats:
 
 
 def _triangles(path: Path) -> tuple[Floats, Floats]:
-    """Return corners of triangles (n, 3, 3), and the vertices of which the file's mean is."""
+    """Return the triangles' corners (n, 3, 3), and the vertices for the mean of the file."""
     try:
         if path.suffix.lower() == '.dae':
             import collada
@@ -75,12 +75,12 @@ def _triangles(path: Path) -> tuple[Floats, Floats]:
             parts = [part.triangleset() if hasattr(part, 'triangleset') else part
                      for geometry in file.scene.objects('geometry')
                      for part in geometry.primitives()]
-            # the others are lines
+            # The other primitives are lines.
             parts = [part for part in parts if part.vertex_index is not None
                      and part.vertex_index.ndim == 2 and part.vertex_index.shape[1] == 3]
             triangles = numpy.concatenate(
                 [part.vertex[part.vertex_index] for part in parts] or [numpy.empty((0, 3, 3))])
-            # a corner counts once for each direction that its surface has there
+            # OMPL.app counts a corner once for each normal that its surface has there.
             normals = numpy.concatenate([
                 numpy.zeros((len(part.vertex_index), 3, 3)) if part.normal is None
                 else part.normal[part.normal_index] for part in parts] or [triangles])
@@ -98,7 +98,7 @@ def _triangles(path: Path) -> tuple[Floats, Floats]:
 
 
 def _mesh(path: Path, *, centred: bool) -> Mesh:
-    """Return a mesh; ``centred`` moves the mean of its vertices into the origin."""
+    """Read a mesh; ``centred`` moves the mean of its vertices to the origin."""
     if not path.is_file():
         raise BadFile(f'there is no {path}')
     try:

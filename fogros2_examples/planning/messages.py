@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes as markers, which viewers show and the planner reads; poses and paths as messages."""
+"""Convert scenes to markers, which viewers show and the planner reads; also poses and paths."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 from fogros2_examples.meshes import Floats, Mesh
 from fogros2_examples.planning.scene import Scene
 
-#: Colours of what a scene has, red, green, blue, opacity.
+#: Colours of the parts of a scene: red, green, blue, opacity.
 COLOURS = {'body': (0.85, 0.45, 0.15, 1.0), 'walls': (0.75, 0.77, 0.8, 0.9),
            'shell': (0.6, 0.6, 0.6, 0.15), 'bounds': (0.0, 0.0, 0.0, 0.0),
            'start': (0.2, 0.6, 0.3, 1.0), 'goal': (0.2, 0.4, 0.9, 1.0)}
 
 
 class BadScene(ValueError):
-    """Markers are no scene; the text says what is wrong."""
+    """Markers describe no scene; the text has the reason."""
 
 
 def pose_message(pose: Floats) -> Pose:
@@ -30,9 +30,9 @@ def pose_message(pose: Floats) -> Pose:
 
 def pose_of(message: Pose) -> Floats:
     """
-    Return the pose in a message.
+    Return the pose of a message.
 
-    :raises ValueError: it isn't finite, or its quaternion has no length.
+    :raises ValueError: the pose is not finite, or its quaternion is zero.
     """
     p, q = message.position, message.orientation
     pose = numpy.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
@@ -67,7 +67,7 @@ def mesh_marker(mesh: Mesh, name: str, number: int, scene: str, pose: Pose,
 
 
 def scene_message(scene: Scene) -> MarkerArray:
-    """Return a scene: a marker for each of its parts, the body at its start."""
+    """Return a scene as a marker for each of its parts, with the body at the start."""
     still = pose_message(numpy.array([0, 0, 0, 0, 0, 0, 1]))
     markers = [
         mesh_marker(scene.body, 'body', 0, scene.name, pose_message(scene.start),
@@ -90,9 +90,9 @@ def scene_message(scene: Scene) -> MarkerArray:
 
 def scene_of(message: MarkerArray) -> Scene:
     """
-    Return the scene in markers.
+    Return the scene of markers.
 
-    :raises BadScene: a part lacks, or its numbers are no triangles, bounds or pose.
+    :raises BadScene: a part is missing, or its triangles, bounds or pose are invalid.
     """
     parts: dict[str, Marker] = {marker.ns: marker for marker in message.markers}
     for name in COLOURS:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Plans motions of rigid bodies: service ``plan``, in the scene that comes on ``environment``.
+Plan motions of rigid bodies: service ``plan``, in the scene on ``environment``.
 
-What came of a plan is on ``planning_status``: the service's path can only be empty.
+The result of each plan is on ``planning_status``, because the path of a failure is only empty.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fogros2_examples.parameters import BadParameter, within
 from fogros2_examples.planning.messages import BadScene, path_message, pose_of, scene_of
 from fogros2_examples.planning.racing import Racer
 
-#: The last one is kept for those who come later.
+#: Keeps the last message for late subscribers.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 WHY = {'start': 'the start touches something, or is out of bounds',
        'goal': 'the goal touches something, or is out of bounds'}
@@ -32,9 +32,9 @@ class MotionPlanner(Node):
     """
     The planner.
 
-    Parameters: ``time`` in s, after which a plan is given up; ``workers``, how many searches run
-    at once, 0 for one on each core; ``planners``, OMPL's, which the searches take in turn;
-    ``seed`` of the first search, the others count on.
+    Parameters: ``time``, time-out of a plan in s; ``workers``, number of parallel searches, 0 for
+    one per core; ``planners``, names of OMPL's planners, which the searches use in turn; ``seed``
+    of the first search, increased by one for each further search.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class MotionPlanner(Node):
         self.create_service(GetPlan, 'plan', self.plan)
 
     def enter(self, markers: MarkerArray) -> None:
-        """Take a scene; one that is none leaves the last in its place."""
+        """Use a new scene; keep the last scene if the new one is invalid."""
         try:
             scene = scene_of(markers)
         except BadScene as error:
@@ -66,7 +66,7 @@ class MotionPlanner(Node):
             f'{len(scene.body.triangles)} of the body; {self.racer.workers} searches at once'))
 
     def plan(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
-        """Answer with a path, an empty one where there is none."""
+        """Answer with a path, or with an empty path if there is none."""
         wanted = request.start.header.frame_id
         if not self.scene or wanted != self.scene:
             self.tell(DiagnosticStatus.ERROR, 'plan', (
@@ -80,7 +80,7 @@ class MotionPlanner(Node):
             return response
         try:
             outcome = self.racer.plan(start, goal, seconds=self.seconds, seed=self.seed)
-            # who asks again wants another try
+            # A repeated request should search with other random numbers.
             self.seed += self.racer.workers
         except RuntimeError as error:
             self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
@@ -99,8 +99,8 @@ class MotionPlanner(Node):
 
     def tell(self, level: bytes, name: str, message: str,
              figures: dict[str, object] | None = None) -> None:
-        """Say what happened, here and to others."""
-        # a line of its own for each: rclpy holds one to one severity
+        """Log a result, and publish it as status."""
+        # Separate calls, because rclpy allows only one severity per call site.
         if level == DiagnosticStatus.OK:
             self.get_logger().info(message)
         else:
@@ -112,7 +112,7 @@ class MotionPlanner(Node):
 
 
 def main() -> None:
-    """Run until interrupted; a parameter that is none ends it at once."""
+    """Run until a signal; exit at once on an invalid parameter."""
     rclpy.init()
     try:
         node = MotionPlanner()
@@ -121,8 +121,8 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     finally:
-        # a second one must not keep the searches from being ended
+        # A second Ctrl-C must not interrupt the end of the searches.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         node.racer.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a motion: the body on its way through the walls."""
+"""Draw a motion: the body along its path through the walls."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ WALLS, FLOOR, LINE = (205.0, 200.0, 195.0), (238.0, 236.0, 232.0), (60, 40, 30)
 
 def between(path: Floats, step: float, turn: float = 0.1) -> Floats:
     """
-    Return a path with poses in between, at most ``step`` m and ``turn`` rad apart.
+    Interpolate a path, with poses at most ``step`` m and ``turn`` rad apart.
 
-    :param path: poses (n, 7); from one to the next is straight, and turns the shorter way.
+    :param path: poses (n, 7); between two of them, the body moves straight and turns the shorter
+        way.
     """
     poses = [path[0]]
     for begin, end in zip(path, path[1:]):
@@ -41,7 +42,7 @@ def between(path: Floats, step: float, turn: float = 0.1) -> Floats:
 
 
 def spaced(path: Floats, apart: float) -> Floats:
-    """Return poses of a path about ``apart`` m from each other, its first and last among them."""
+    """Return poses of a path about ``apart`` m apart, with its first and last one."""
     fine = between(path, apart / 20)
     way = numpy.concatenate([[0.0], numpy.cumsum(
         numpy.linalg.norm(numpy.diff(fine[:, :3], axis=0), axis=1))])
@@ -52,7 +53,7 @@ def spaced(path: Floats, apart: float) -> Floats:
 
 
 def camera_of(scene: Scene, width: int, height: int) -> Camera:
-    """Return a camera that sees all of a scene from above, at a slant."""
+    """Return a camera that sees the whole scene diagonally from above."""
     middle = (scene.low + scene.high) / 2
     size = float(numpy.linalg.norm(scene.high - scene.low))
     way = turned((0, 0, 1), -0.35) @ numpy.array([0.0, -0.62, 0.95])
@@ -64,20 +65,20 @@ def camera_of(scene: Scene, width: int, height: int) -> Camera:
 def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
             height: int = 750) -> NDArray[numpy.uint8]:
     """
-    Return the scene without its ceiling, the body along its path, and the path.
+    Draw the scene without its ceiling, the body along its path, and the path.
 
-    :param path: poses (n, 7), empty for none.
+    :param path: poses (n, 7), empty for no path.
     :return: array (height, width, 3) of BGR.
     """
     camera = camera_of(scene, width, height)
     shell = scene.shell.corners
-    # the floor alone: what lies below the bounds
+    # Draw only the floor: the triangles below the bounds.
     floor = shell[(shell[:, :, 2] <= scene.low[2] + 1e-6).all(axis=1)]
     walls = scene.walls.corners
     covers = _covers(scene, walls)
     parts = [walls[~covers], floor]
     colours = [numpy.tile(WALLS, (len(parts[0]), 1)), numpy.tile(FLOOR, (len(floor), 1))]
-    # 7 % of a room, whatever the unit
+    # 7 % of a room's diagonal, in any unit.
     apart = float(numpy.linalg.norm(scene.high - scene.low)) / 14
     poses = spaced(path, apart) if len(path) else numpy.array([scene.start, scene.goal])
     for number, pose in enumerate(poses):
@@ -87,7 +88,7 @@ def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
         colours.append(numpy.tile((1 - share) * FIRST + share * LAST, (len(body), 1)))
     image, depth = shaded(camera, numpy.concatenate(parts), numpy.concatenate(colours))
     if covers.any():
-        # ceilings between storeys are seen, and seen through
+        # Ceilings between storeys are drawn half transparent.
         parts.append(walls[covers])
         colours.append(numpy.tile(WALLS, (int(covers.sum()), 1)))
         over, _ = shaded(camera, numpy.concatenate(parts), numpy.concatenate(colours))
@@ -105,14 +106,14 @@ def picture(scene: Scene, path: Floats, title: str, *, width: int = 1000,
 
 
 def _covers(scene: Scene, corners: Floats) -> NDArray[numpy.bool_]:
-    """Return which triangles are floors of upper storeys, or ceilings: level, high up, wide."""
+    """Return which triangles are ceilings or upper floors: level, high above the floor, wide."""
     normals = numpy.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = numpy.linalg.norm(normals, axis=1) / 2
     extent = scene.high - scene.low
     level = numpy.abs(normals[:, 2]) > 1.98 * area
     lowest = corners[:, :, 2].min(axis=1)
     found = numpy.asarray(level & (lowest > scene.low[2] + 0.2 * extent[2]), bool)
-    # the tops of walls are level too, and cover little
+    # The tops of walls are level too, but cover a small area.
     heights = numpy.rint(lowest / extent[2] * 1000)
     for height in numpy.unique(heights[found]):
         same = found & (heights == height)
@@ -123,7 +124,7 @@ def _covers(scene: Scene, corners: Floats) -> NDArray[numpy.bool_]:
 
 def _draw_way(image: NDArray[numpy.uint8], depth: NDArray[numpy.float32], camera: Camera,
               points: Floats, thick: float) -> None:
-    """Draw a line through points (n, 3), pale where things are ``thick`` before it."""
+    """Draw a line through points (n, 3), pale where objects are ``thick`` m in front of it."""
     pixels, depths = camera.seen(points)
     corners = numpy.round(pixels * 16).astype(numpy.int32)
     limits = [camera.width - 1, camera.height - 1]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Has motions planned and takes the time: puts a scene on ``environment``, calls ``plan``.
+Request motion plans, and measure their time: publish a scene on ``environment``, call ``plan``.
 
-Shows what it got: the path on ``path``, the body along it on ``motion``, a picture of it on
-``picture`` and in a file.
+The node shows the result: the path on ``path``, the body along the path on ``motion``, and a
+picture on ``picture`` and in a file.
 """
 
 from __future__ import annotations
@@ -49,11 +49,10 @@ class PlanningClient(Node):
     """
     The client.
 
-    Parameters: ``environment``, 'apartment', 'cubicles', or a file of OMPL.app's (``.cfg``);
-    ``count`` of plans, 0 for ever more; ``picture``, a PNG file to write, '' for none; ``time`` in
-    s, after which the planner gives up; ``wait`` in s, how much longer than that its answer may
-    take, and how long it may take to come up; ``figures``, a file to which each plan's times go,
-    as a line of JSON.
+    Parameters: ``environment``, 'apartment', 'cubicles', or a file of OMPL.app (``.cfg``);
+    ``count``, number of plans, 0 for no end; ``picture``, a PNG file to write, '' for none;
+    ``time``, time-out of a plan in s; ``wait``, further time-out of the answer and of the
+    planner's start in s; ``figures``, a file for the times of each plan, as lines of JSON.
     """
 
     def __init__(self) -> None:
@@ -73,11 +72,11 @@ class PlanningClient(Node):
         self.planner = self.create_client(GetPlan, 'plan')
 
     def hear(self, status: DiagnosticStatus) -> None:
-        """Keep what the planner says of itself."""
+        """Store the planner's status."""
         self.told = status
 
     def run(self) -> int:
-        """Return the exit status: 0 where all plans were found."""
+        """Request all plans, and return the exit status: 0 if all paths were found."""
         try:
             scene = loaded(File(self.environment)) if self.environment.endswith('.cfg') else (
                 MADE[self.environment]())
@@ -135,7 +134,7 @@ class PlanningClient(Node):
         return path
 
     def _show(self, scene: Scene, path: Floats) -> bool:
-        """Publish a path and its pictures; return whether it could be drawn into the file."""
+        """Publish a path and its pictures; return False if the file could not be written."""
         apart = float(numpy.linalg.norm(scene.high - scene.low)) / 14
         self.motions.publish(MarkerArray(markers=[
             mesh_marker(scene.body, 'motion', number, scene.name, pose_message(pose),
@@ -153,7 +152,7 @@ class PlanningClient(Node):
         return True
 
     def _until(self, true: Callable[[], bool], wait: float = 0.0) -> bool:
-        """Handle messages until something is true; return whether it came to be in time."""
+        """Handle messages until ``true()`` is true; return False after ``wait`` seconds."""
         deadline = time.monotonic() + (wait or self.wait)
         while not true():
             if time.monotonic() > deadline:
@@ -163,14 +162,14 @@ class PlanningClient(Node):
 
 
 def main() -> None:
-    """Run until all plans are there; a parameter that is none ends it at once."""
+    """Request all plans; exit at once on an invalid parameter."""
     rclpy.init()
     try:
         raise SystemExit(PlanningClient().run())
     except BadParameter as error:
         raise SystemExit(f'planning_client: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     except SystemExit:
         rclpy.try_shutdown()
         raise

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks the worker, a process of its own, for motions."""
+"""Request motions from the worker process."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from fogros2_examples.planning.scene import Scene
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 class Racer:
     """
-    Plans in one scene at a time.
+    Plan in one scene at a time, in a worker process.
 
-    :param workers: searches at once; 0 for one on each core.
-    :param planners: names of OMPL's; the searches take them in turn.
+    :param workers: number of parallel searches; 0: one per core.
+    :param planners: names of OMPL's planners, which the searches use in turn.
     """
 
     def __init__(self, workers: int = 0, planners: Sequence[str] = ('RRTConnect',)) -> None:
@@ -44,7 +44,7 @@ class Racer:
         """
         Plan in this scene from now on.
 
-        :raises RuntimeError: the worker has ended; the next call has a new one.
+        :raises RuntimeError: the worker has ended; the next call starts a new one.
         """
         self._scene = None
         self._ask({'scene': worker.encoded(scene)})
@@ -53,10 +53,11 @@ class Racer:
     def plan(self, start: Floats, goal: Floats, *, seconds: float,
              seed: int = 1) -> dict[str, Any]:
         """
-        Return what ``search.Outcome`` has, the path as lists; the first motion found wins.
+        Return the fields of ``search.Outcome``, the path as lists; the first motion found wins.
 
-        :param seed: of the first search; the others count on.
-        :raises RuntimeError: the worker has ended; the next call has a new one.
+        :param seconds: time-out.
+        :param seed: seed of the first search, increased by one for each further search.
+        :raises RuntimeError: the worker has ended; the next call starts a new one.
         """
         return self._ask({
             'start': start.tolist(), 'goal': goal.tolist(), 'seconds': seconds,
@@ -64,9 +65,9 @@ class Racer:
             'planners': self.planners})
 
     def close(self) -> None:
-        """End the worker."""
+        """Stop the worker."""
         assert self._process.stdin is not None and self._process.stdout is not None
-        with contextlib.suppress(OSError):  # it may be gone, with words to it not read
+        with contextlib.suppress(OSError):  # the worker may have ended before it read a question
             self._process.stdin.close()
         try:
             self._process.wait(5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a motion is planned in: the body that moves, what stands around it, start and goal."""
+"""Describe a motion planning problem: the moving body, its surroundings, start and goal."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Scene:
     """
     One problem.
 
-    :param body: in its own frame, whose origin is what the bounds hold.
-    :param walls: what it must not touch.
-    :param shell: floor and ceiling: not to be touched either, and in the way of a picture.
-    :param low: lower bounds of the position, m, as ``high``.
-    :param start: pose x, y, z, qx, qy, qz, qw, as ``goal``.
+    :param body: the body in its own frame; the bounds apply to the frame's origin.
+    :param walls: obstacles.
+    :param shell: floor and ceiling: also obstacles, but they hide the scene in pictures.
+    :param low: lower bounds of the position, m; ``high`` are the upper ones.
+    :param start: pose x, y, z, qx, qy, qz, qw; ``goal`` likewise.
     """
 
     name: str
@@ -42,13 +42,13 @@ def pose(x: float, y: float, z: float, *, yaw: float = 0.0, pitch: float = 0.0) 
     return numpy.array([x, y, z, *quaternion(turn)])
 
 
-#: Thickness of the walls of rooms, and what is left of them above a door, m.
+#: Thickness and height of the walls of rooms, and height of a door, m.
 WALL, STOREY, DOOR = 0.15, 2.6, 2.1
 
 
 def _wall(begin: tuple[float, float], end: tuple[float, float], doors: tuple[float, ...] = (),
           width: float = 1.1, low: float = 0.0, high: float = STOREY) -> Mesh:
-    """Return a wall along x or y; ``doors`` are the distances of their middles from its begin."""
+    """Return a wall along x or y; ``doors`` are distances of door centres from its begin."""
     axis = 0 if begin[1] == end[1] else 1
     along, across = begin[axis], begin[1 - axis]
 
@@ -69,9 +69,9 @@ def _wall(begin: tuple[float, float], end: tuple[float, float], doors: tuple[flo
 
 def apartment() -> Scene:
     """
-    Return an apartment of six rooms, through whose doors an upright piano has to go.
+    Return an apartment of six rooms, with an upright piano to move through its doors.
 
-    It is 1.2 m long, 1 m high and 0.45 m deep; a door is 1.1 m wide.
+    The piano is 1.2 m long, 1 m high and 0.45 m deep; a door is 1.1 m wide.
     """
     walls = joined([
         _wall((0, 0), (10, 0)), _wall((0, 8), (10, 8)),
@@ -79,7 +79,7 @@ def apartment() -> Scene:
         _wall((3.4, 0), (3.4, 3.0), (2.2,)), _wall((6.8, 0), (6.8, 3.0), (0.9,)),
         _wall((0, 3.0), (10, 3.0), (2.2, 8.6)), _wall((0, 5.0), (10, 5.0), (1.4, 5.2)),
         _wall((3.4, 5.0), (3.4, 8), (1.8,)), _wall((6.8, 5.0), (6.8, 8), (1.0,)),
-        # furniture: a bed, a table, cupboards, a kitchen's counter, a bench, a desk
+        # furniture: a bed, a table, cupboards, a kitchen counter, a bench, a desk
         box((7.6, 6.9, 0), (9.9, 7.9, 0.55)), box((4.3, 6.7, 0.68), (5.9, 7.4, 0.74)),
         *(box((x, y, 0), (x + 0.06, y + 0.06, 0.68)) for x in (4.32, 5.82) for y in (6.72, 7.32)),
         box((0.1, 7.3, 0), (2.0, 7.9, 1.9)), box((0.1, 0.1, 0), (0.6, 1.2, 2.1)),
@@ -96,15 +96,15 @@ def apartment() -> Scene:
                  pose(1.6, 1.4, 0.6), pose(8.8, 5.6, 0.6, yaw=numpy.pi))
 
 
-#: Height of an office's storey, of the walls between its desks, and how thick its floor is, m.
+#: Height of a storey, height of the walls of cubicles, thickness of the floor, m.
 OFFICE, CUBICLE, SLAB = 2.4, 1.5, 0.2
 
 
 def cubicles() -> Scene:
     """
-    Return two storeys full of cubicles; an L of 1.2 m by 0.8 m goes from one to the other.
+    Return two storeys of cubicles, with an L of 1.2 m by 0.8 m to move between them.
 
-    The way is a hole in the floor between them, in the far corner.
+    The only way is a hole in the floor between the storeys, in the far corner.
     """
     size, hole = 12.0, (8.4, 8.4, 11.4, 11.4)
     top = OFFICE + SLAB
@@ -141,5 +141,5 @@ def cubicles() -> Scene:
                  pose(1.3, 0.6, 0.5), pose(1.6, 0.9, top + 0.6, yaw=numpy.pi / 2))
 
 
-#: Problems that are made here, by name.
+#: Built-in problems, by name.
 MADE = {'apartment': apartment, 'cubicles': cubicles}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One search for a motion: OMPL asks, FCL answers whether the body touches anything."""
+"""Search for a motion: OMPL searches, FCL detects collisions of the body."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import ompl.util
 from fogros2_examples.meshes import Floats, joined, Mesh, rotation
 from fogros2_examples.planning.scene import Scene
 
-#: Planners of OMPL's that plan between two poses.
+#: OMPL's planners between two poses.
 PLANNERS = ('RRTConnect', 'LBKPIECE1', 'KPIECE1', 'RRT', 'BKPIECE1')
-#: How far a point of the body goes between two checks by the body's way, and by its turn: as a
-#: share of the diagonal of the bounds.
+#: Maximum motion of a point of the body between two collision checks, by translation and by
+#: rotation, as a share of the diagonal of the bounds.
 RESOLUTION = 0.002
 End = Literal['found', 'start', 'goal', 'time']
 Numbers = Union[Floats, tuple[float, ...]]
@@ -28,15 +28,15 @@ Numbers = Union[Floats, tuple[float, ...]]
 @dataclasses.dataclass(frozen=True)
 class Outcome:
     """
-    What came of a search.
+    The result of a search.
 
-    :param end: 'found'; 'start' or 'goal': the body touches something there, or is out of bounds;
-        'time': no way was found in it.
-    :param path: poses (n, 7) as in Scene, from start to goal; empty where none was found. From
-        one to the next the body moves straight and turns the shorter way, both evenly.
-    :param length: of the path, m.
-    :param checks: how often it was looked whether the body touches anything.
-    :param seconds: what the search took.
+    :param end: 'found'; 'start' or 'goal': that pose collides or is out of bounds; 'time': the
+        time-out was over.
+    :param path: poses (n, 7) as in Scene, from start to goal; empty unless found. Between two
+        poses, the body moves straight and turns the shorter way, both at a constant rate.
+    :param length: length of the path, m.
+    :param checks: number of collision checks.
+    :param seconds: duration of the search.
     """
 
     end: End
@@ -47,7 +47,7 @@ class Outcome:
 
 
 class Space:
-    """The poses of a scene's body; holds what a search needs, made once."""
+    """The space of poses of a scene's body, with the data that searches share."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -64,8 +64,8 @@ class Space:
             bounds.setHigh(axis, float(scene.high[axis]))
         self.states.setBounds(bounds)
         self.states.setLongestValidSegmentFraction(RESOLUTION)
-        # OMPL takes the same share of the largest turn, of half the angle: as if the body were as
-        # large as the room, and so several times finer than what it takes for the way
+        # OMPL takes the same share of the largest rotation (of half the angle). That assumes a
+        # body as large as the room, and is several times finer than the steps of translation.
         step = RESOLUTION * float(numpy.linalg.norm(scene.high - scene.low))
         radius = float(numpy.linalg.norm(scene.body.vertices, axis=1).max())
         turns = self.states.getSubspace(1)
@@ -74,24 +74,24 @@ class Space:
         self._low, self._high = scene.low.tolist(), scene.high.tolist()
 
     def touches(self, position: Numbers, turn: Numbers) -> bool:
-        """Return whether the body touches anything; ``turn`` is a matrix or w, x, y, z."""
+        """Return whether the body collides; ``turn`` is a matrix or a quaternion w, x, y, z."""
         self.checks += 1
         self._body.setTransform(fcl.Transform(turn, position))
         return bool(fcl.collide(self._body, self._walls, self._request, fcl.CollisionResult()))
 
     def free(self, pose: Floats) -> bool:
-        """Return whether a pose is within bounds and touches nothing."""
+        """Return whether a pose is within bounds and without collision."""
         inside = (pose[:3] >= self.scene.low).all() and (pose[:3] <= self.scene.high).all()
         return bool(inside) and not self.touches(pose[:3], rotation(pose[3:]))
 
     def search(self, start: Floats, goal: Floats, *, seconds: float, seed: int = 1,
                planner: str = PLANNERS[0]) -> Outcome:
         """
-        Look for a motion.
+        Search for a motion.
 
-        :param seconds: after which it is given up.
-        :param seed: the same one finds the same motion. OMPL takes it once in a process: a second
-            search there goes on with the first one's random numbers.
+        :param seconds: time-out.
+        :param seed: seed of the random numbers; the same seed finds the same motion. OMPL accepts
+            a seed once per process: a second search continues the first one's random numbers.
         """
         begin, self.checks = time.monotonic(), 0
 
@@ -122,7 +122,7 @@ class Space:
             return ended('time')
         found = setup.getSolutionPath()
         simplifier = ompl.geometric.PathSimplifier(space)
-        # in steps, not in time, so that a seed always finds the same
+        # Limited by steps instead of time, so that a seed always finds the same path.
         simplifier.reduceVertices(found)
         simplifier.collapseCloseVertices(found)
         simplifier.partialShortcutPath(found)
@@ -130,7 +130,7 @@ class Space:
         return ended('found', numpy.array([_pose(state) for state in found.getStates()]))
 
     def _valid(self, state: Any) -> bool:
-        # in numbers: arrays of three would take as long as FCL does
+        # Plain numbers, because arrays of three would take as long as FCL.
         turn, x, y, z = state.rotation(), state.getX(), state.getY(), state.getZ()
         (west, south, low), (east, north, high) = self._low, self._high
         return (west <= x <= east and south <= y <= north and low <= z <= high

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Races searches against each other, each in a process and so on a core of its own; a program.
+Run searches in parallel processes, one per core, and return the first result; a program.
 
-It reads JSON lines: ``{"scene": ...}`` as ``encoded`` makes it, answered when the scene is ready,
-and ``{"start", "goal", "seconds", "seeds", "planners"}``, answered with the best outcome. Threads
-wouldn't do: OMPL asks Python at each step whether the body touches anything, and one thread at a
-time runs Python. A process is forked for each search, as OMPL takes a seed once in its life, and
-finds the scene ready. Nothing else runs here that a fork would break.
+It reads JSON lines. It answers ``{"scene": ...}`` (of ``encoded``) when the scene is ready, and
+``{"start", "goal", "seconds", "seeds", "planners"}`` with the best outcome. Threads would not
+help: OMPL calls Python at each step for a collision check, and only one thread at a time runs
+Python. The program forks a process for each search, because OMPL accepts a seed once per process;
+the child has the scene already. Nothing else runs in this program that a fork would break.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def encoded(scene: Scene) -> dict[str, Any]:
-    """Return a scene as JSON has it."""
+    """Return a scene as JSON values."""
     def plain(value: Any) -> Any:
         if isinstance(value, Mesh):
             return {'vertices': value.vertices.tolist(), 'triangles': value.triangles.tolist()}
@@ -41,7 +41,7 @@ def encoded(scene: Scene) -> dict[str, Any]:
 
 
 def decoded(given: Mapping[str, Any]) -> Scene:
-    """Return the scene of ``encoded``."""
+    """Return the scene of ``encoded``'s values."""
     def mesh(value: Mapping[str, Any]) -> Mesh:
         return Mesh(numpy.array(value['vertices'], float).reshape(-1, 3),
                     numpy.array(value['triangles'], numpy.int32).reshape(-1, 3))
@@ -54,11 +54,11 @@ def decoded(given: Mapping[str, Any]) -> Scene:
 
 def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
     """
-    Return the first motion that a search finds, or why none did.
+    Run a search per seed; return the first motion found, or a reason if none was found.
 
-    :raises SystemExit: the caller has gone; the searches are ended.
-    :param asked: ``start``, ``goal``, ``seconds``; of ``seeds`` each is a search, by the planner
-        of ``planners`` whose turn it is.
+    :raises SystemExit: the caller is gone; all searches were killed.
+    :param asked: ``start``, ``goal``, ``seconds``, ``seeds`` and ``planners``; the searches use
+        the planners in turn.
     """
     from fogros2_examples.planning.search import Outcome
 
@@ -78,7 +78,7 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
         while pipes and (best is None or best.end == 'time'):
             ready = select.select([*pipes, sys.stdin.fileno()], [], [])[0]
             if sys.stdin.fileno() in ready:
-                # nobody asks before the answer: who asked has gone
+                # The caller sends nothing before the answer: its end of the pipe is closed.
                 raise SystemExit
             for read in ready:
                 data = os.read(read, 1 << 16)
@@ -105,19 +105,19 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
 
 def _search(space: Space, write: int, start: Any, goal: Any, seconds: float, seed: int,
             planner: str) -> None:
-    """Search in a process of its own, and end it."""
+    """Search in a child process, and exit it."""
     outcome = space.search(start, goal, seconds=seconds, seed=seed, planner=planner)
     with os.fdopen(write, 'w') as out:
         json.dump({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}, out)
-    # the bindings would print a page about what they had not freed
+    # The bindings would print a page about objects that they did not free.
     os._exit(0)
 
 
 def main() -> None:
-    """Answer line by line until there are no more."""
+    """Answer questions until standard input ends."""
     from fogros2_examples.planning.search import Space
 
-    # a Ctrl-C in a terminal goes to all; who started this one closes its input
+    # Ctrl-C in a terminal reaches all processes; the caller closes this one's standard input.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     space: Optional[Space] = None
     with contextlib.suppress(BrokenPipeError, SystemExit):

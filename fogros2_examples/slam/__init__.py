@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visual SLAM from a stereo or RGB-D camera: algorithm, nodes, a synthetic room, measurement."""
+"""Visual SLAM from a stereo or RGB-D camera: algorithm, nodes, synthetic room, evaluation."""

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The robot's side of the SLAM example: a camera that also measures what comes back.
+The robot's side of the SLAM example: a camera that measures SLAM's answers.
 
-Publishes ``camera/image`` and ``camera/depth``, or ``camera/right/image``, each with its camera
-info, all stamped alike; takes ``pose`` and ``path``. A round trip is the time from the
-publication of a frame to the pose that bears its stamp. With ``wait`` a frame waits for the pose
-of the one before (of the one ``ahead`` before it), though not for ever: who is slow is seen to be
-slow, and doesn't get lost.
-At the end it says how long those took and how good the poses were, and draws the trajectory.
+The node publishes ``camera/image`` with ``camera/depth`` or ``camera/right/image``, and their
+camera infos, all with the same stamp. It subscribes to ``pose`` and ``path``. A round trip is the
+time from the publication of a frame to the pose with its stamp. With ``wait``, a frame waits for
+the pose of the previous frame (of the one ``ahead`` frames before), up to a time-out. So a slow
+SLAM is measured as slow, and does not lose track.
+At the end, the node reports round trips and accuracy, and draws the trajectory.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from fogros2_examples.slam.geometry import Array
 from fogros2_examples.slam.sources import Pixels, Shot
 from fogros2_examples.slam.tum import DatasetError
 
-#: Seconds for the last poses, and the path, to come back.
+#: Time-out of the last poses and of the path, in seconds.
 PATIENCE = 5.0
-#: Poses from which an error can be computed.
+#: Minimum number of poses for an error.
 FEWEST = 3
-#: Pixels: ORB looks for corners 31 from an image's edge; no codec takes more.
+#: Limits of the size in pixels: ORB needs a margin of 31, codecs accept no larger images.
 NARROWEST, WIDEST = 64, 4096
-#: Of the synthetic room, which is rendered before it is shown.
+#: Memory limit of the synthetic frames, which are rendered in advance.
 BYTES = 4 << 30
-#: Frames a second.
+#: Frames per second.
 SLOWEST, FASTEST = 0.01, 1000
 
 
 class SlamCamera(Node):
-    """Shows frames, collects answers; ``ended`` when both are done."""
+    """Publish frames, collect the answers; ``ended`` is set when both are complete."""
 
     def __init__(self) -> None:
         super().__init__('slam_camera')
@@ -77,7 +77,7 @@ class SlamCamera(Node):
         self.reader = ThreadPoolExecutor(1)
         self.next: Future[Optional[Shot]] = self._read()
         self.ended = False
-        #: By stamp: when a frame was sent, where it was taken, when and as what its pose came.
+        #: By stamp: time of publication, true pose, time of the answer, and its pose.
         self.sent: dict[int, float] = {}
         self.truth: dict[int, Array] = {}
         self.answered: dict[int, float] = {}
@@ -99,11 +99,11 @@ class SlamCamera(Node):
                                f'{self.source.camera.height} at {rate:g} Hz')
 
     def _read(self) -> Future[Optional[Shot]]:
-        # beside the executor, which has answers to take the time of
+        # In a thread, because the executor has to measure the arrival of answers.
         return self.reader.submit(lambda: next(self.source.shots, None))
 
     def _shoot(self) -> None:
-        """Publish a frame, once there is somebody to see it; after the last, wait for answers."""
+        """Publish a frame if there is a subscriber; after the last frame, wait for answers."""
         if not self.sent and not self.images.get_subscription_count():
             return
         if self.deadline < math.inf:
@@ -115,7 +115,7 @@ class SlamCamera(Node):
             if before not in self.answered and time.perf_counter() - when < PATIENCE / 2:
                 return
         if not self.next.done():
-            return  # the disk is slower than the rate
+            return  # the disk is slower than the frame rate
         shot = self.next.result()
         if shot is None:
             self.deadline = time.monotonic() + PATIENCE
@@ -161,14 +161,14 @@ class SlamCamera(Node):
         self.final = {stamp: messages.matrix(pose) for stamp, pose in poses if stamp in self.sent}
 
     def close(self) -> None:
-        """End the reading thread."""
+        """Stop the reading thread."""
         self.reader.shutdown(cancel_futures=True)
 
     def report(self) -> int:
         """
-        Say what was measured, write it to ``results``, draw ``picture``; return the exit status.
+        Log the measurement, write it to ``results``, draw ``picture``; return the exit status.
 
-        :raises OSError: a file can't be written.
+        :raises OSError: a file cannot be written.
         """
         log = self.get_logger()
         trips = numpy.array([when - self.sent[stamp] for stamp, when in self.answered.items()])
@@ -187,13 +187,13 @@ class SlamCamera(Node):
             Path(self.results).write_text(json.dumps({
                 'sent': len(self.sent), 'round_trips': [float(trip) for trip in trips],
                 'computing': [self.computed.get(stamp, math.nan) for stamp in self.answered],
-                # when each came, seconds after the first
+                # time of arrival, seconds after the first one
                 'came': [when - next(iter(self.answered.values()))
                          for when in self.answered.values()],
                 **{f'{name}_{error}': getattr(one, error)
                    for name, one in (('live', live), ('final', final)) if one is not None
                    for error in ('ate', 'rpe')}}))
-        # another SLAM in this one's place may tell no path
+        # Another SLAM algorithm may publish no path.
         drawn = live if final is None else final
         if self.picture and drawn is not None:
             from fogros2_examples.slam.picture import draw
@@ -214,7 +214,7 @@ class SlamCamera(Node):
 
 
 def main() -> None:
-    """Run until all frames are answered, or interrupted; what it can't do ends it at once."""
+    """Run until all frames are answered or a signal arrives; exit at once on an invalid input."""
     rclpy.init()
     try:
         node = SlamCamera()
@@ -227,6 +227,6 @@ def main() -> None:
     except (DatasetError, OSError) as error:
         raise SystemExit(f'slam_camera: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     finally:
         node.close()

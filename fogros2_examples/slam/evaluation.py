@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How good an estimated trajectory is, by ``evo``: the two errors that papers on SLAM give.
+Evaluate an estimated trajectory by ``evo``: the two usual errors of papers on SLAM.
 
-ATE is the root mean square of the distances after the best rigid alignment, RPE that of the
-translation's error over each metre of the way (Sturm et al., IROS 2012).
+ATE is the root mean square of the distances after the best rigid alignment. RPE is the root mean
+square of the translation's error over each metre of the trajectory (Sturm et al., IROS 2012).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy
 
 from fogros2_examples.slam.geometry import Array
 
-#: Metres of way over which RPE is taken.
+#: Length of the segments of RPE, m.
 WAY = 1.0
 
 
@@ -25,9 +25,9 @@ class Accuracy:
     """
     Errors of a trajectory, metres.
 
-    :param rpe: nan where the way is shorter than a metre.
-    :param aligned: (N, 3), the estimated places where they fit best; ``truth`` (N, 3).
-    :param errors: (N,).
+    :param rpe: nan if the trajectory is shorter than a metre.
+    :param aligned: (N, 3), the estimated positions after the alignment; ``truth`` (N, 3).
+    :param errors: (N,), distance of each position.
     """
 
     ate: float
@@ -39,9 +39,9 @@ class Accuracy:
 
 def accuracy(truth: Sequence[Array], estimate: Sequence[Array]) -> Accuracy:
     """
-    Return how far poses are from those that were true at the same times.
+    Compare estimated poses with the true poses at the same times.
 
-    :param truth: N poses (4, 4), at least 3; ``estimate`` as many.
+    :param truth: N poses (4, 4), at least 3; ``estimate`` has as many.
     """
     from evo.core.filters import FilterException
     from evo.core.metrics import APE, PoseRelation, RPE, StatisticsType, Unit

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The front end: ORB features (Rublee et al., ICCV 2011) spread over the image, and their depths.
+Extract ORB features (Rublee et al., ICCV 2011), spread over the image, with their depths.
 
-Depths come from a depth image or from the right image of a stereo pair. There each feature is
-followed along its row by pyramidal Lucas-Kanade, there and back: to a fraction of a pixel, and as
-well in images that a video codec has smoothed.
+Depths come from a depth image, or from the right image of a stereo pair. Pyramidal Lucas-Kanade
+tracks each feature along its row to the right image and back. This has subpixel accuracy, and also
+works in images that a video codec has smoothed.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from numpy.typing import NDArray
 from fogros2_examples.slam.geometry import Array, Camera
 
 Pixels = NDArray[numpy.uint8]
-#: Corners fainter than this are not looked for; fainter ones are where there are no others.
+#: FAST thresholds: the usual one, and one for images with too few corners.
 FAINT, FAINTEST = 20, 7
 SCALE, LEVELS = 1.2, 8
-#: The image is divided into so many columns and rows, each of which gives its best features.
+#: Columns and rows of cells; each cell contributes its best features.
 CELLS = (10, 8)
-#: Depths that are used, metres; what is nearer or farther counts as unknown.
+#: Usable depths in metres; nearer and farther ones count as unknown.
 NEAREST, FARTHEST = 0.2, 8.0
-#: A match in the right image may be this far from its row, pixels.
+#: Maximum distance of a match in the right image from its row, pixels.
 OFF_ROW = 1.5
-#: Of the search there: what is compared, pixels, and how often the images are halved.
+#: Lucas-Kanade: window in pixels, and number of halvings of the images.
 WINDOW, COARSEST = (15, 15), 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Features:
     """
-    What was found in an image; N features.
+    The features of an image; N features.
 
     :param pixels: (N, 2).
-    :param octaves: (N,), of the pyramid; a feature's place is known to SCALE ** octave pixels.
+    :param octaves: (N,), levels of the pyramid; a position is accurate to SCALE ** octave pixels.
     :param descriptors: (N, 32).
-    :param depths: (N,), metres, nan where unknown.
+    :param depths: (N,), metres, nan for unknown.
     """
 
     pixels: Array
@@ -54,20 +54,20 @@ class Features:
 
     @property
     def deep(self) -> NDArray[numpy.bool_]:
-        """Which have a depth."""
+        """Which features have a depth."""
         return numpy.isfinite(self.depths)
 
     def chosen(self, which: NDArray[numpy.int64]) -> Features:
-        """Return some of them, by index."""
+        """Return a selection of the features, by index."""
         return Features(self.pixels[which], self.octaves[which], self.descriptors[which],
                         self.depths[which])
 
 
 class Extractor:
     """
-    Finds features.
+    Extract features from images.
 
-    :param count: the most that an image gives.
+    :param count: maximum number of features per image.
     """
 
     def __init__(self, camera: Camera, count: int = 1000) -> None:
@@ -92,7 +92,7 @@ class Extractor:
             numpy.asarray(descriptors, numpy.uint8), numpy.full(len(chosen), numpy.nan))
 
     def _spread(self, found: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
-        """Return the best of each cell, no more than the count."""
+        """Return the best features of each cell, at most ``count`` in total."""
         places = numpy.array([point.pt for point in found]).reshape(-1, 2)
         strength = numpy.array([point.response for point in found])
         columns, rows = CELLS
@@ -101,15 +101,15 @@ class Extractor:
         order = numpy.lexsort((-strength, cell))
         begins = numpy.searchsorted(cell[order], cell[order])
         rank = numpy.arange(len(order)) - begins
-        # first the best of each cell, then the second best of each, and so on
+        # First the best of each cell, then the second best of each, and so on.
         return [found[index] for index in order[numpy.argsort(rank, kind='stable')][:self._count]]
 
 
 def with_depth(features: Features, image: NDArray[numpy.generic], camera: Camera) -> Features:
     """
-    Return features with depths from a depth image.
+    Return features with depths of a depth image.
 
-    :param image: (height, width), metres as float, or millimetres as integer; 0 or nan is unknown.
+    :param image: (height, width), metres as float or millimetres as integer; 0 or nan: unknown.
     """
     columns, rows = numpy.round(features.pixels).astype(int).T
     depths = image[numpy.clip(rows, 0, camera.height - 1),
@@ -120,7 +120,7 @@ def with_depth(features: Features, image: NDArray[numpy.generic], camera: Camera
 
 
 def with_pair(features: Features, left: Pixels, right: Pixels, camera: Camera) -> Features:
-    """Return features of the left image with depths from the right one."""
+    """Return features of the left image, with depths from the right image."""
     if not len(features):
         return features
     begin = features.pixels.astype(numpy.float32)
@@ -128,7 +128,7 @@ def with_pair(features: Features, left: Pixels, right: Pixels, camera: Camera) -
         cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)}
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         left, right, begin, begin.copy(), maxLevel=COARSEST, **options)
-    # the way back is known but for a pixel, if it is the right one
+    # For a correct match, tracking back ends within a pixel of the start.
     back, again, _ = cv2.calcOpticalFlowPyrLK(
         right, left, there, begin.copy(), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         **options)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The pinhole camera and rigid transforms.
+Model the pinhole camera and rigid transforms.
 
-A pose is an array (4, 4) that takes points of the camera to the world's; the camera looks along
-its z, its y points down (REP 103's optical frame). Lengths are metres, image points pixels.
+A pose is an array (4, 4) that transforms points from the camera's frame to the world's. The camera
+looks along its z, its y points down (REP 103's optical frame). Lengths are metres, image points
+are pixels.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ class Camera:
     """
     A rectified camera without distortion.
 
-    :param baseline: to the right camera, metres. With a depth image there is none: then it is
-        what weighs depth against pixels, as in ORB-SLAM2 (Mur-Artal and Tardos, 2017).
+    :param baseline: distance to the right camera, metres. With a depth image, it is a virtual one
+        that weighs depth against pixels, as in ORB-SLAM2 (Mur-Artal and Tardos, 2017).
     """
 
     width: int
@@ -36,11 +37,11 @@ class Camera:
 
     @property
     def matrix(self) -> Array:
-        """Return K, (3, 3)."""
+        """The matrix K, (3, 3)."""
         return numpy.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, points: Array) -> Array:
-        """Return where points (N, 3) of the camera are in the image, (N, 2); z must be > 0."""
+        """Project points (N, 3) of the camera to pixels (N, 2); z must be > 0."""
         z = points[:, 2]
         return numpy.stack([self.fx * points[:, 0] / z + self.cx,
                             self.fy * points[:, 1] / z + self.cy], 1)
@@ -52,7 +53,7 @@ class Camera:
 
 
 def inverse(pose: Array) -> Array:
-    """Return the pose the other way round."""
+    """Return the inverse of a pose."""
     back = numpy.eye(4)
     back[:3, :3] = pose[:3, :3].T
     back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -60,7 +61,7 @@ def inverse(pose: Array) -> Array:
 
 
 def moved(pose: Array, points: Array) -> Array:
-    """Return points (N, 3) taken through a pose."""
+    """Transform points (N, 3) by a pose."""
     return numpy.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -73,7 +74,7 @@ def from_vectors(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def angle(pose: Array) -> float:
-    """Return by how much a pose turns, radians."""
+    """Return the angle of a pose's rotation, radians."""
     cosine = (numpy.trace(pose[:3, :3]) - 1) / 2
     return float(numpy.arccos(numpy.clip(cosine, -1.0, 1.0)))
 
@@ -99,7 +100,7 @@ def from_quaternion(translation: Array, q: Array) -> Array:
     """
     Return the pose of a translation (3,) and a quaternion (x, y, z, w).
 
-    :raises ValueError: it has no direction.
+    :raises ValueError: the length of the quaternion is far from 1.
     """
     length = float(numpy.linalg.norm(q))
     if not 0.5 < length < 2.0:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The map: keyframes with the points they see, and the pose graph that holds them together.
+Store the map: keyframes with their points, and the pose graph that connects the keyframes.
 
-A point belongs to the keyframe that saw it first and is kept in its camera's frame: when the graph
-moves keyframes, their points go with them. GTSAM optimises the graph.
+A point belongs to the keyframe that saw it first, in that camera's frame. If the graph moves
+keyframes, their points move too. GTSAM optimises the graph.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from fogros2_examples.slam.features import Features
 from fogros2_examples.slam.geometry import angle, Array, Camera, inverse, moved
 from fogros2_examples.slam.pose import solve
 
-#: How well one keyframe is known from another: radians, metres.
+#: Standard deviation of the pose of one keyframe relative to another: radians, metres.
 TURN, SHIFT = 0.004, 0.008
-#: Descriptors by which a keyframe is recognised, and those of its that have to be found again.
+#: Descriptors to recognise a keyframe by, and how many of them must match.
 TELLING, VOTES = 250, 20
-#: Points that a keyframe has in common with another place of the map, to be at that place.
+#: Minimum number of common points to recognise a place.
 AGREEING = 40
-#: Keyframes that are too near in time to be a place that one comes back to.
+#: Number of preceding keyframes that are too recent to be a revisited place.
 RECENT = 8
-#: Measurements whose mean a point is at the most, so that it can still give way.
+#: Maximum weight of a point, in measurements, so that it can still move.
 MOST = 20
-#: Keyframes whose points are looked for at a time.
+#: Number of keyframes whose points are tracked at once.
 LOCAL = 12
 
 
@@ -39,11 +39,10 @@ LOCAL = 12
 class Keyframe:
     """
     A frame that is part of the map.
-
-    :param points: (N, 3), of its features, in its camera's frame; nan without a depth.
-    :param own: (N,), those that no keyframe before had.
-    :param weights: (N,), of the measurements that the points are the means of.
-    :param telling: indices of the features by which it is recognised.
+    :param points: (N, 3), points of its features in its camera's frame; nan without a depth.
+    :param own: (N,), whether a point belongs to this keyframe and to no earlier one.
+    :param weights: (N,), weights of the measurements in the mean of each point.
+    :param telling: indices of the features to recognise the keyframe by.
     """
 
     number: int
@@ -62,9 +61,9 @@ class Points:
     """
     Points of the map, M of them.
 
-    :param places: (M, 3), of the world.
+    :param places: (M, 3), positions in the world.
     :param descriptors: (M, 32).
-    :param keyframes: (M,), the number of that which they belong to; ``rows`` (M,), which of its.
+    :param keyframes: (M,), numbers of the keyframes; ``rows`` (M,), indices of their features.
     """
 
     places: Array
@@ -74,25 +73,25 @@ class Points:
 
 
 class Map:
-    """Keyframes, in the order in which they came."""
+    """Keyframes in the order of their creation, and the pose graph."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self.keyframes: list[Keyframe] = []
-        #: Places that were recognised so far.
+        #: Number of revisited places so far.
         self.loops = 0
         self._factors = gtsam.NonlinearFactorGraph()
         self._noise = gtsam.noiseModel.Diagonal.Sigmas(numpy.array([TURN] * 3 + [SHIFT] * 3))
-        # one wrong recognition must not bend the whole map
+        # A robust model, so that one wrong recognition does not bend the whole map.
         self._wary = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Cauchy.Create(3.0), self._noise)
 
     def add(self, stamp: int, pose: Array, features: Features, known: NDArray[numpy.bool_],
             reference: Optional[Keyframe] = None) -> Keyframe:
         """
-        Return a new keyframe, linked to the reference.
+        Create a keyframe, linked to the reference.
 
-        :param known: (N,), features that are points of other keyframes.
+        :param known: (N,), whether a feature is a point of another keyframe.
         """
         points = self._camera.lift(features.pixels, features.depths)
         deep = numpy.flatnonzero(features.deep)
@@ -114,7 +113,7 @@ class Map:
         two.links.add(one.number)
 
     def around(self, keyframe: Keyframe) -> list[Keyframe]:
-        """Return a keyframe and those linked to it, the nearest first, not more than ``LOCAL``."""
+        """Return a keyframe and its neighbours in the graph, nearest first, at most ``LOCAL``."""
         found, edge = {keyframe.number: None}, [keyframe.number]
         while edge and len(found) < LOCAL:
             edge = [other for number in edge for other in sorted(
@@ -124,7 +123,7 @@ class Map:
 
     @staticmethod
     def points(keyframes: list[Keyframe]) -> Points:
-        """Return the points that keyframes have of their own."""
+        """Return the points that belong to keyframes."""
         return Points(
             numpy.concatenate([moved(k.pose, k.points[k.own]) for k in keyframes]),
             numpy.concatenate([k.features.descriptors[k.own] for k in keyframes]),
@@ -134,10 +133,10 @@ class Map:
     def refine(self, points: Points, which: NDArray[numpy.int64], places: Array,
                depths: Array) -> None:
         """
-        Take a frame's measurements of points into their means.
+        Update the means of points by a frame's measurements.
 
-        :param which: (K,), indices of points that were seen; ``places`` (K, 3), of the world.
-        :param depths: (K,), at which they were seen.
+        :param which: (K,), indices of the measured points; ``places`` (K, 3), in the world.
+        :param depths: (K,), depths of the measurements.
         """
         for number in numpy.unique(points.keyframes[which]):
             keyframe = self.keyframes[number]
@@ -163,14 +162,14 @@ class Map:
         return [candidates[i] for i in best if votes[i] >= VOTES]
 
     def seen_from(self, keyframe: Keyframe, features: Features) -> Optional[Array]:
-        """Return the pose relative to a keyframe from which its points look so, None if none."""
+        """Return a frame's pose relative to a keyframe, None if too few points match."""
         deep = numpy.flatnonzero(keyframe.features.deep)
         one, two = matching.match(keyframe.features.descriptors[deep], features.descriptors)
         solution = solve(self._camera, keyframe.points[deep[one]], features.chosen(two), AGREEING)
         return None if solution is None else solution.pose
 
     def recognise(self, keyframe: Keyframe) -> bool:
-        """Link a keyframe to a place seen long before, if this is one; return whether it is."""
+        """Link a keyframe to a place that was seen long before; return False if there is none."""
         besides = {k.number for k in self.around(keyframe)} | set(
             range(keyframe.number - RECENT, keyframe.number + 1))
         for place in self.similar(keyframe.features, besides, 2):
@@ -192,11 +191,11 @@ class Map:
 
 
 def weight(depths: Array) -> Array:
-    """Return what measurements at depths weigh: their error grows with the square of it."""
+    """Return the weights of measurements; the error grows with the square of the depth."""
     return numpy.asarray(depths ** -4.0)
 
 
 def apart(one: Array, two: Array) -> float:
-    """Return how far two poses are apart; 1 is a reason for a keyframe: 25 cm, or 12 degrees."""
+    """Return the distance of two poses; a new keyframe is due from 1 on: 25 cm, or 12 degrees."""
     between = inverse(one) @ two
     return max(float(numpy.linalg.norm(between[:3, 3])) / 0.25, angle(between) / 0.21)

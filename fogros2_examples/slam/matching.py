@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which features are the same: by descriptor, and by place where one is known."""
+"""Match features by their descriptors, and by their positions if these are known."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from fogros2_examples.slam.geometry import Array
 
 Pixels = NDArray[numpy.uint8]
 Indices = NDArray[numpy.int64]
-#: Bits of 256 in which two descriptors of one thing may differ.
+#: Maximum number of different bits (of 256) in the descriptors of a match.
 ALIKE = 64
-#: The best must be so much better than the second best.
+#: Maximum ratio of the best distance to the second best one.
 RATIO = 0.8
-#: Ones in a number; NumPy counts them itself from 2.0 on, Ubuntu 24.04 has 1.26.
+#: Number of ones in a number; NumPy has this from 2.0 on, but Ubuntu 24.04 has 1.26.
 _ONES = numpy.array([bin(number).count('1') for number in range(1 << 16)], numpy.uint8)
 
 
 def match(one: Pixels, two: Pixels) -> tuple[Indices, Indices]:
     """
-    Return pairs as two arrays of indices, each index at most once.
+    Match descriptors; return pairs as two arrays of indices, each index at most once.
 
     :param one: descriptors (N, 32); ``two`` (M, 32).
     """
@@ -36,15 +36,16 @@ def match(one: Pixels, two: Pixels) -> tuple[Indices, Indices]:
 def match_near(one: Pixels, places: Array, two: Pixels, others: Array,
                radius: float) -> tuple[Indices, Indices]:
     """
-    Return pairs as ``match`` does, of those that are near each other in the image.
+    Match descriptors of features that are near each other in the image; see ``match``.
 
-    :param places: pixels (N, 2) of the first ones; ``others`` (M, 2) of the second.
+    :param places: pixels (N, 2) of the first features; ``others`` (M, 2) of the second ones.
+    :param radius: maximum distance in pixels, along rows and columns.
     """
     order = numpy.argsort(others[:, 0])
     columns = others[order, 0]
     begin = numpy.searchsorted(columns, places[:, 0] - radius)
     count = numpy.searchsorted(columns, places[:, 0] + radius) - begin
-    # each of one with each of two whose column is near
+    # All pairs with a near column.
     first = numpy.repeat(numpy.arange(len(places)), count)
     offset = numpy.arange(len(first)) - numpy.repeat(numpy.cumsum(count) - count, count)
     second = order[begin[first] + offset]
@@ -55,7 +56,7 @@ def match_near(one: Pixels, places: Array, two: Pixels, others: Array,
     ranked = numpy.lexsort((distance, first))
     first, second, distance = first[ranked], second[ranked], distance[ranked]
     best = numpy.flatnonzero(numpy.diff(first, prepend=-1))
-    # the next in rank, if it is of the same one
+    # The second best candidate of the same feature, if there is one.
     rival = numpy.where(numpy.append(first, -1)[best + 1] == first[best],
                         numpy.append(distance, 0)[best + 1], 256)
     best = best[distance[best] < RATIO * rival]
@@ -63,7 +64,7 @@ def match_near(one: Pixels, places: Array, two: Pixels, others: Array,
 
 
 def _chosen(one: Indices, two: Indices, distance: Indices) -> tuple[Indices, Indices]:
-    """Return the alike, and of those that chose one and the same, the nearest."""
+    """Keep pairs with similar descriptors; of pairs with one target, keep the best one."""
     order = numpy.argsort(distance, kind='stable')
     order = order[distance[order] <= ALIKE]
     _, first = numpy.unique(two[order], return_index=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages from and to what the algorithm has."""
+"""Convert between ROS messages and the data of the algorithm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
 
 Pixels = NDArray[numpy.uint8]
-#: How many bytes a pixel has, and how it becomes grey; None is grey already.
+#: Bytes of a pixel, and its conversion to grey; None: already grey.
 _COLOURS = {'bgr8': (3, cv2.COLOR_BGR2GRAY), 'rgb8': (3, cv2.COLOR_RGB2GRAY),
             'bgra8': (4, cv2.COLOR_BGRA2GRAY), 'rgba8': (4, cv2.COLOR_RGBA2GRAY),
             'mono8': (1, None), '8UC1': (1, None)}
@@ -25,9 +25,9 @@ _DEPTHS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 
 def grey(image: Image) -> Pixels:
     """
-    Return an image's brightness, (height, width).
+    Return the brightness of an image, (height, width).
 
-    :raises ValueError: its encoding is none that has one, or it contradicts itself.
+    :raises ValueError: the encoding has no brightness, or the fields contradict each other.
     """
     if image.encoding not in _COLOURS:
         raise ValueError(f"an image as '{image.encoding}': {', '.join(_COLOURS)} are for me")
@@ -43,7 +43,7 @@ def depth(image: Image) -> NDArray[numpy.generic]:
     """
     Return a depth image, (height, width): millimetres as integer, or metres as float.
 
-    :raises ValueError: as above.
+    :raises ValueError: the encoding is none of depth, or the fields contradict each other.
     """
     if image.encoding not in _DEPTHS:
         raise ValueError(f"depth as '{image.encoding}': {', '.join(_DEPTHS)} are for me")
@@ -61,7 +61,7 @@ def _rows(image: Image, size: int) -> Pixels:
 
 def image(header: Header, pixels: NDArray[numpy.generic], encoding: str) -> Image:
     """Return a message of an array (height, width) or (height, width, channels)."""
-    # rclpy takes an array of bytes as it is; anything else it looks at byte by byte
+    # rclpy takes an array over as it is, and checks anything else byte by byte.
     return Image(
         header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
         step=pixels[0].nbytes, data=array.array('B', pixels.tobytes()))
@@ -69,10 +69,10 @@ def image(header: Header, pixels: NDArray[numpy.generic], encoding: str) -> Imag
 
 def camera(info: CameraInfo, right: bool) -> Camera:
     """
-    Return the camera that a rectified image's info describes.
+    Return the camera that the info of a rectified image describes.
 
-    :param right: it is the right one of a pair, which knows the baseline.
-    :raises ValueError: it describes none, or a right one without a baseline.
+    :param right: whether this is the right camera of a pair, whose info has the baseline.
+    :raises ValueError: the info has no focal length, or a right camera's info has no baseline.
     """
     p = info.p
     if p[0] <= 0 or p[5] <= 0:
@@ -112,12 +112,12 @@ def matrix(pose: Pose) -> Array:
 
 
 def nanoseconds(stamp: Time) -> int:
-    """Return a stamp as a number."""
+    """Convert a stamp to nanoseconds."""
     return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
 
 
 def time(nanoseconds: int) -> Time:
-    """Return a number as a stamp."""
+    """Convert nanoseconds to a stamp."""
     return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Visual SLAM as a node.
+Run visual SLAM as a node.
 
-Takes ``camera/image`` with ``camera/camera_info``, and with the same stamps either
-``camera/depth`` or ``camera/right/image`` with its ``camera_info``: whichever comes. Publishes,
-under the stamp of the image, ``pose`` and ``/tf``, and ``computing``, the time that it took;
-``slam_state``; and, as the map grows,
-``path`` and the cloud ``map_points``. World and camera are called ``map`` and the image's frame.
+The node subscribes to ``camera/image`` with ``camera/camera_info``. For depths it takes either
+``camera/depth``, or ``camera/right/image`` with its ``camera_info``, with the same stamps. With
+the stamp of the image it publishes ``pose``, ``/tf``, and ``computing``, the computing time. It
+also publishes ``slam_state``, and, as the map grows, ``path`` and the point cloud ``map_points``.
+The world's frame is ``map``; the camera's frame is the image's.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ from fogros2_examples.slam.tracking import Slam, State, Tracked
 
 try:
     from tf2_msgs.msg import TFMessage
-except ImportError:  # it is no part of the smallest ROS 2
+except ImportError:  # it is not part of the smallest ROS 2
     TFMessage = None
 
-#: The newest alone: who is slow is to be late for one image, not for all.
+#: Only the newest images, so that a slow node is late by one image instead of many.
 NEWEST = QoSProfile(depth=2)
-#: Who comes late gets the last one.
+#: Keeps the last message for late subscribers.
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-#: Images that wait for their other half, and those without one after which that is said.
+#: Images to keep until a frame's other image arrives, and images without one until a warning.
 WAITING, ALONE = 8, 30
 
 
 class SlamNode(Node):
     """
-    Parameters: ``features`` per image, ``map_frame``.
+    The SLAM node.
 
-    ``best_effort``: for cameras that publish so; of a large image too much is lost otherwise.
+    Parameters: ``features`` per image; ``map_frame``; ``best_effort``, for cameras that publish
+    with best effort.
     """
 
     def __init__(self) -> None:
@@ -102,7 +103,7 @@ class SlamNode(Node):
         return take
 
     def _process(self, image: Image, other: str, second: Image) -> None:
-        """Track a frame and tell where it was; then put it into the map."""
+        """Track a frame and publish its pose, then add the frame to the map."""
         begin = time.perf_counter()
         try:
             slam = self._algorithm(other)
@@ -114,7 +115,7 @@ class SlamNode(Node):
                 **({'right': messages.grey(second)} if other == 'right'
                    else {'depth': messages.depth(second)}))
         except ValueError as error:
-            # what a driver sends is no reason to end: the next one may be better
+            # An invalid message of a driver must not end the node: the next one may be valid.
             started = self.slam is not None and self.slam.state is not State.STARTING
             self._say(State.LOST if started else State.STARTING, str(error))
             return
@@ -125,7 +126,7 @@ class SlamNode(Node):
         self.frame = image.header.frame_id
 
     def _algorithm(self, other: str) -> Optional[Slam]:
-        """Return the algorithm, made for this camera; None while that isn't known."""
+        """Return the algorithm for this camera, None while the camera is unknown."""
         if self.slam is None:
             needed = other if other == 'right' else 'image'
             if 'image' not in self.infos or needed not in self.infos:
@@ -150,8 +151,8 @@ class SlamNode(Node):
             self.transforms.publish(TFMessage(transforms=[transform]))
 
     def _say(self, state: State, why: str) -> None:
-        """Publish and log the state, where it isn't the same as before."""
-        # numbers change with each image
+        """Publish and log the state if it changed."""
+        # Ignore numbers, which change with each image.
         said = f'{state.value}: {why}' if why else state.value
         kind = ''.join(letter for letter in said if not letter.isdigit())
         if kind != self.said:
@@ -163,7 +164,7 @@ class SlamNode(Node):
                 self.get_logger().info(said)
 
     def _show_map(self) -> None:
-        """Publish path and points where they changed; points to those alone who look at them."""
+        """Publish path and points if they changed; points only if there is a subscriber."""
         if not self.changed or self.slam is None:
             return
         self.changed = False
@@ -190,4 +191,4 @@ def main() -> None:
     try:
         rclpy.spin(SlamNode())
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # the signal shuts rclpy down, in a thread of its own: a second one may be in its way
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice

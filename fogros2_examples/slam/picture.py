@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture that papers have: the trajectory against ground truth."""
+"""Draw the trajectory against ground truth, as in papers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def draw(path: Path, result: Accuracy, trips: Sequence[float], furnished: bool) 
     """
     Draw a trajectory from above, its error, and the round trips.
 
-    :param path: of the picture; its ending says of what format.
-    :param trips: milliseconds, of each frame.
-    :param furnished: draw the synthetic room around it.
+    :param path: file of the picture; its extension is the format.
+    :param trips: round trip of each frame in milliseconds.
+    :param furnished: whether to draw the synthetic room too.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
@@ -31,7 +31,7 @@ def draw(path: Path, result: Accuracy, trips: Sequence[float], furnished: bool) 
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
     plan = figure.add_subplot(grid[:, 0])
-    # the two axes in which it moves most: a room from above, whatever is up in a dataset
+    # The two axes with the largest motion: a view from above, whatever axis is up in a dataset.
     spread = numpy.argsort(-numpy.ptp(result.truth, axis=0))
     a, b = (0, 1) if furnished else sorted(int(axis) for axis in spread[:2])
     if furnished:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Where a camera is, from points whose places are known (PnP).
+Compute the pose of a camera from points with known positions (PnP).
 
-RANSAC throws out what is wrong; then robust Gauss-Newton on all three measurements of a feature:
-its column and row, and the column in the right image, which is its depth (Mur-Artal and Tardos,
-ORB-SLAM2, IEEE T-RO 2017, motion-only bundle adjustment).
+RANSAC removes outliers. Robust Gauss-Newton then uses the three measurements of each feature:
+column, row, and column in the right image, which is the depth (Mur-Artal and Tardos, ORB-SLAM2,
+IEEE T-RO 2017, motion-only bundle adjustment).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fogros2_examples.slam.features import Features, SCALE
 from fogros2_examples.slam.geometry import Array, Camera, from_vectors, inverse, moved
 
-#: Pixels by which RANSAC lets a point be elsewhere.
+#: Maximum reprojection error in RANSAC, pixels.
 LOOSE = 4.0
 #: Chi-square, 95 %, of two and of three measurements; Huber's limit is its root.
 TWO, THREE = 5.99, 7.81
@@ -28,10 +28,10 @@ TWO, THREE = 5.99, 7.81
 @dataclasses.dataclass(frozen=True)
 class Solution:
     """
-    A pose and how it is supported.
+    A pose and the points that agree with it.
 
     :param pose: (4, 4), of the camera.
-    :param inliers: (N,), of the points that were given.
+    :param inliers: (N,), whether a given point agrees.
     """
 
     pose: Array
@@ -39,18 +39,18 @@ class Solution:
 
     @property
     def support(self) -> int:
-        """How many points agree."""
+        """Number of points that agree."""
         return int(self.inliers.sum())
 
 
 def solve(camera: Camera, points: Array, features: Features, least: int,
           guess: Optional[Array] = None) -> Optional[Solution]:
     """
-    Return where the camera is, None where fewer than ``least`` points agree.
+    Return the camera's pose, None if fewer than ``least`` points agree.
 
-    :param points: (N, 3), of the world.
-    :param features: the same N things in the image.
-    :param guess: a pose nearby, if one is known.
+    :param points: (N, 3), in the world.
+    :param features: the same N points in the image.
+    :param guess: an approximate pose, if one is known.
     """
     if len(points) < max(6, least):
         return None
@@ -70,7 +70,7 @@ def solve(camera: Camera, points: Array, features: Features, least: int,
 
 
 def refined(camera: Camera, points: Array, features: Features, pose: Array) -> Solution:
-    """Return the pose that fits best, from one nearby; outliers count less, then not at all."""
+    """Return the best pose near a given one; outliers get less weight, and finally none."""
     world = inverse(pose)
     deep = features.deep
     scale = camera.fx * camera.baseline
@@ -86,7 +86,7 @@ def refined(camera: Camera, points: Array, features: Features, pose: Array) -> S
         errors = numpy.stack([u - features.pixels[:, 0], v - features.pixels[:, 1],
                               numpy.where(deep, u - scale / z - right, 0.0)], 1)
         chi = weights * (errors ** 2).sum(1)
-        # first all with little weight for what is off, in the end without what is still off
+        # First keep all points, with little weight for outliers; later remove the outliers.
         inliers = ahead & (chi < limit) if turn >= 4 else ahead
         if turn == 9 or inliers.sum() < 6:
             break
@@ -98,7 +98,7 @@ def refined(camera: Camera, points: Array, features: Features, pose: Array) -> S
             numpy.stack([zero, camera.fy / z, -camera.fy * y / z ** 2], 1),
             numpy.stack([camera.fx / z, zero, (scale - camera.fx * x) / z ** 2], 1)
             * deep[:, None]], 1)
-        # a small motion of the camera's frame: turn, then shift
+        # Derivatives by a small motion of the camera's frame: rotation, then translation.
         by_turn = numpy.stack([
             numpy.stack([zero, -seen[:, 2], seen[:, 1]], 1),
             numpy.stack([seen[:, 2], zero, -seen[:, 0]], 1),

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A synthetic room: what a camera sees of it from any pose, and how far away it is.
+Render a synthetic room, and its depth, from any pose.
 
-A box of 6 by 5 by 2.7 metres with furniture, itself boxes; x and y lie in the floor, z points up.
-Each pixel's ray is cut with the boxes (slabs; Kay and Kajiya, 1986) and looked up in a texture of
-the size that fits its distance. The sensor adds noise: to the image, and to depth as measured for
-Kinects (Nguyen, Izadi and Lovell, 3DIMPVT 2012), which see nothing beyond 6 metres.
+The room is a box of 6 by 5 by 2.7 metres with furniture of boxes. x and y lie in the floor, z
+points up. Each pixel's ray is intersected with the boxes (slabs; Kay and Kajiya, 1986), and looked
+up in a texture whose resolution fits the distance. The sensor adds noise to the image. It adds
+noise to the depth as measured for Kinects (Nguyen, Izadi and Lovell, 3DIMPVT 2012), which see
+nothing beyond 6 metres.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from fogros2_examples.slam.geometry import Array, Camera
 Pixels = NDArray[numpy.uint8]
 Floats = NDArray[numpy.float32]
 SIZE = (6.0, 5.0, 2.7)
-#: Furniture: lower and upper corner, metres, and what its sides look like.
+#: Furniture: lower and upper corner, metres, and the look of its sides.
 FURNITURE = (
     ((0.0, 1.2, 0.0), (0.35, 2.9, 2.0), 'books'),
     ((4.6, 4.3, 0.0), (6.0, 5.0, 0.9), 'planks'),
@@ -32,7 +33,7 @@ FURNITURE = (
     ((2.0, 4.5, 0.0), (3.4, 5.0, 1.1), 'poster'),
     ((2.75, 2.25, 0.0), (3.25, 2.75, 0.7), 'planks'),
 )
-#: Metres per texel of the finest texture, and how many times it is halved.
+#: Metres per texel of the finest texture, and number of resolutions.
 TEXEL, LEVELS = 0.004, 3
 FAR = 6.0
 #: Standard deviation of the image's noise, in levels of 255.
@@ -47,10 +48,9 @@ def camera(width: int = 640, height: int = 480) -> Camera:
 
 def trajectory(count: int, lap: int = 174) -> list[Array]:
     """
-    Return the poses of a hand-held camera: around the room's middle, and on, so that it comes
-    back to where it has been.
+    Return the poses of a hand-held camera that circles the room and revisits places.
 
-    :param lap: poses for once around.
+    :param lap: number of poses per circle.
     """
     poses = []
     for number in range(count):
@@ -75,10 +75,10 @@ def trajectory(count: int, lap: int = 174) -> list[Array]:
 
 class Room:
     """
-    Renders.
+    Render images of the room.
 
-    :param camera: its baseline is that of the right image.
-    :param seed: of textures and noise; frame ``n`` from a pose is always the same.
+    :param camera: the camera; its baseline is that of the right image.
+    :param seed: seed of textures and noise; frame ``n`` from a pose is always the same.
     """
 
     def __init__(self, camera: Camera, seed: int = 1) -> None:
@@ -93,12 +93,12 @@ class Room:
         self._seed = seed
 
     def colour_and_depth(self, pose: Array, number: int) -> tuple[Pixels, NDArray[numpy.uint16]]:
-        """Return an image (height, width, 3) of BGR and depth (height, width), millimetres."""
+        """Return an image (height, width, 3) of BGR and depths (height, width) in millimetres."""
         random = numpy.random.default_rng((self._seed, number, 0))
         image, depth = self.exact(pose)
         spread = 0.0012 + 0.0019 * (depth - 0.4) ** 2
         noisy = depth + spread * random.standard_normal(depth.shape, numpy.float32)
-        # what lies between two surfaces belongs to neither
+        # A pixel between two surfaces has no valid depth.
         edge = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, numpy.ones((3, 3), numpy.uint8)) > 0.15
         noisy[edge | (depth > FAR)] = 0.0
         return self._grainy(image, random), numpy.round(1000 * noisy).astype(numpy.uint16)
@@ -114,7 +114,7 @@ class Room:
     def exact(self, pose: Array) -> tuple[Pixels, Floats]:
         """Return image and depth, metres, without noise."""
         rays = self._rays @ pose[:3, :3].T.astype(numpy.float32)
-        # along an axis: so far that it is never met
+        # Avoid division by zero; a ray along an axis then meets its planes very far away.
         rays[numpy.abs(rays) < 1e-7] = 1e-7
         origin = pose[:3, 3].astype(numpy.float32)
         steps = 1 / rays
@@ -129,7 +129,7 @@ class Room:
 
     def _cut(self, number: int, low: Array, high: Array, pose: Array, rays: Floats,
              steps: Floats, depth: Floats, face: NDArray[numpy.int64]) -> None:
-        """Put a box before what is behind it."""
+        """Draw a box in front of everything behind it."""
         rows, columns = self._window(low, high, pose)
         near, far = None, None
         part = (rows, columns)
@@ -148,11 +148,11 @@ class Room:
         hit = (near < far) & (near > 0.05) & (near < depth[part])
         ahead = numpy.take_along_axis(rays[part], side[..., None], 2)[..., 0] > 0
         depth[part][hit] = near[hit]
-        # seen from outside: who looks along an axis meets the lower side
+        # A box is seen from outside: a ray in the direction of an axis hits the lower side.
         face[part][hit] = (6 * number + 2 * side + ~ahead)[hit]
 
     def _window(self, low: Array, high: Array, pose: Array) -> tuple[slice, slice]:
-        """Return the rows and columns in which a box can be seen."""
+        """Return the rows and columns in which a box may be visible."""
         corners = numpy.array(numpy.meshgrid(*zip(low, high))).reshape(3, -1).T
         seen = (corners - pose[:3, 3]) @ pose[:3, :3]
         if (seen[:, 2] < 0.1).any():
@@ -172,7 +172,7 @@ class Room:
         up = numpy.where(axis == 2, points[1], points[2])
         x = (across - self._low[face, 0]) / TEXEL
         y = (self._low[face, 1] - up) / TEXEL + self._rows[face]
-        # texels that a pixel covers, more where the surface is seen at a slant
+        # Texels per pixel, more where the surface is seen at a slant.
         slant = numpy.abs(numpy.take_along_axis(rays, axis[..., None], 2)[..., 0]) / self._lengths
         size = depth / (self.camera.fx * TEXEL * numpy.maximum(slant, 0.2))
         level = numpy.clip(numpy.round(numpy.log2(size)), 0, LEVELS - 1)
@@ -192,7 +192,7 @@ class Room:
         return numpy.clip(image + noise + 0.5, 0, 255).astype(numpy.uint8)
 
     def _paint(self, random: numpy.random.Generator) -> None:
-        """Make all faces' textures, one below the other in an atlas."""
+        """Create the textures of all faces, one below the other in an atlas."""
         sheets, rows, lows = [], [], []
         top = 0
         for low, high, look in self._boxes:
@@ -202,8 +202,8 @@ class Room:
                 width, height = (math.ceil((high[a] - low[a]) / TEXEL) for a in (u, v))
                 sheet = _surface(random, look, number, height, width)
                 if number in ((1, 2) if look == 'room' else (0, 3)):
-                    sheet = sheet[:, ::-1]  # else one would read it from behind
-                # neighbours must not shine through where a coarse texel covers both
+                    sheet = sheet[:, ::-1]  # otherwise the text would be mirrored
+                # A margin, because a coarse texel may cover two neighbouring textures.
                 sheets.append(cv2.copyMakeBorder(sheet, 0, 16 - height % 8, 0, 0,
                                                  cv2.BORDER_REPLICATE))
                 rows.append(top)
@@ -223,7 +223,7 @@ class Room:
 
 def _surface(random: numpy.random.Generator, look: str, number: int, height: int,
              width: int) -> Pixels:
-    """Return the texture of a box's side; the last two are its floor or bottom, and its top."""
+    """Return the texture of a box's side; the last two sides are its bottom and its top."""
     if look == 'room':
         if number == 4:
             return textures.planks(random, height, width, 30)

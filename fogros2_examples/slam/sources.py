@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the camera of the SLAM example shows: a TUM RGB-D folder, or the synthetic room."""
+"""Provide the frames of the SLAM example's camera: a TUM RGB-D folder, or the synthetic room."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Pixels = NDArray[numpy.uint8]
 @dataclasses.dataclass(frozen=True)
 class Shot:
     """
-    What the camera took at once.
+    The images of one frame.
 
     :param image: (height, width, 3) of BGR, the left one of a pair.
-    :param depth: (height, width), millimetres; or ``right``, as ``image``.
-    :param truth: where the camera was, if that is known.
+    :param depth: (height, width), millimetres; or ``right``, like ``image``.
+    :param truth: pose of the camera, if it is known.
     """
 
     image: Pixels
@@ -36,10 +36,10 @@ class Shot:
 @dataclasses.dataclass(frozen=True)
 class Source:
     """
-    A camera and what it takes.
+    A camera and its frames.
 
-    :param shots: to be read once.
-    :param count: how many there are.
+    :param shots: the frames, an iterator.
+    :param count: number of frames.
     """
 
     camera: Camera
@@ -48,7 +48,7 @@ class Source:
 
 
 def synthetic(width: int, height: int, count: int, stereo: bool, seed: int = 1) -> Source:
-    """Return a walk through the synthetic room, rendered before this returns."""
+    """Return a walk through the synthetic room; all frames are rendered in advance."""
     camera = room.camera(width, height)
     made = room.Room(camera, seed)
     shots = []
@@ -64,10 +64,10 @@ def synthetic(width: int, height: int, count: int, stereo: bool, seed: int = 1) 
 
 def dataset(folder: Path, count: int = 0) -> Source:
     """
-    Return a TUM RGB-D folder, its images read as they are asked for.
+    Return the frames of a TUM RGB-D folder; images are read on demand.
 
-    :param count: the most images, 0 for all.
-    :raises DatasetError: it is none; as ``shots`` do where an image is missing.
+    :param count: maximum number of images, 0: all.
+    :raises DatasetError: the folder is invalid; ``shots`` raises it for a missing image.
     """
     found = tum.read(folder)
     pairs = found.pairs[:count or None]

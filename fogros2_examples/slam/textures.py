@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Procedural surfaces for the synthetic room: detail at all scales, and plain places too."""
+"""Generate surfaces for the synthetic room, with detail at all scales and plain areas."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WORDS = ('FOG', 'ROS 2', 'SLAM', 'EXIT', 'Lab 4', 'Jazzy', '42', 'north', 'B-17'
 
 
 def grain(random: Random, height: int, width: int, strength: float) -> NDArray[numpy.float32]:
-    """Return noise whose octaves weigh alike, (height, width, 1), as offsets around 0."""
+    """Return noise with equally strong octaves, (height, width, 1), as offsets around 0."""
     total = numpy.zeros((height, width), numpy.float32)
     size = 1
     while size < max(height, width) / 2:
@@ -27,17 +27,17 @@ def grain(random: Random, height: int, width: int, strength: float) -> NDArray[n
 
 
 def tint(random: Random) -> NDArray[numpy.float64]:
-    """Return a colour as printed or painted things have them: hardly one is a pure red."""
+    """Return a colour of printed or painted objects, rarely a pure one."""
     return numpy.clip(random.uniform(20, 235) + random.normal(0, 22, 3), 5, 250)
 
 
 def plaster(random: Random, height: int, width: int, colour: tuple[int, int, int]) -> Pixels:
-    """Return a painted wall: nearly plain."""
+    """Return a nearly plain painted wall."""
     return _made(numpy.array(colour, float) + grain(random, height, width, 5.0))
 
 
 def planks(random: Random, height: int, width: int, board: int) -> Pixels:
-    """Return boards of wood, ``board`` pixels wide, of random lengths."""
+    """Return wooden boards, ``board`` pixels wide, of random lengths."""
     image = numpy.zeros((height, width, 3))
     for top in range(0, height, board):
         left = -int(random.integers(0, 8 * board))
@@ -54,7 +54,7 @@ def planks(random: Random, height: int, width: int, board: int) -> Pixels:
 
 
 def books(random: Random, height: int, width: int, shelf: int) -> Pixels:
-    """Return a book case, its shelves ``shelf`` pixels apart."""
+    """Return a bookcase with shelves ``shelf`` pixels apart."""
     image = numpy.full((height, width, 3), 40.0)
     for bottom in range(shelf, height + shelf, shelf):
         left = 3
@@ -72,7 +72,7 @@ def books(random: Random, height: int, width: int, shelf: int) -> Pixels:
 
 
 def poster(random: Random, height: int, width: int) -> Pixels:
-    """Return a picture: shapes whose sizes follow a power law, over each other, and a word."""
+    """Return a picture of overlapping shapes, whose sizes follow a power law, with a word."""
     image = numpy.full((height, width, 3), 200, numpy.uint8)
     for radius in sorted(0.4 * width / random.uniform(1, 40, 90), reverse=True):
         centre = (int(random.uniform(0, width)), int(random.uniform(0, height)))
@@ -105,6 +105,6 @@ def hang(random: Random, wall: Pixels, count: int, smallest: int, largest: int) 
 
 
 def _made(image: NDArray[numpy.floating[Any]]) -> Pixels:
-    # no lens is sharper than its sensor
+    # No lens is sharper than its sensor.
     soft = cv2.GaussianBlur(numpy.clip(image, 0, 255), (0, 0), 0.7)
     return numpy.asarray(soft, numpy.uint8)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Visual SLAM: where the camera is, frame by frame, and the map it makes on the way.
+Track the camera frame by frame, and build the map: visual SLAM.
 
-``Slam.track`` answers as soon as the pose is known; ``Slam.extend`` then adds to the map what the
-frame shows, so that nobody waits for that.
+``Slam.track`` returns as soon as the pose is known. ``Slam.extend`` then adds the frame to the
+map, so that the pose need not wait for that.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from fogros2_examples.slam.mapping import apart, Keyframe, Map
 from fogros2_examples.slam.pose import solve
 
 Pixels = NDArray[numpy.uint8]
-#: Points that have to agree on a pose.
+#: Minimum number of points that agree on a pose.
 LEAST = 20
-#: Features with a depth that a keyframe has to have.
+#: Minimum number of features with a depth in a keyframe.
 DEEP = 60
-#: Pixels around where a point is expected, and around where it was when that fails.
+#: Search radius in pixels around a point's predicted position, and around its last one.
 RADIUS, WIDE = 20.0, 80.0
 
 
 class State(enum.Enum):
-    """What is known of the camera's place."""
+    """How well the camera's position is known."""
 
     STARTING = 'starting'
     TRACKING = 'tracking'
@@ -42,11 +42,11 @@ class State(enum.Enum):
 @dataclasses.dataclass(frozen=True)
 class Tracked:
     """
-    What a frame told.
+    The result of a frame.
 
     :param pose: (4, 4), None unless tracking.
-    :param why: what is in the way, unless tracking.
-    :param known: (N,), features that are points of the map.
+    :param why: reason why there is no pose, '' while tracking.
+    :param known: (N,), whether a feature is a point of the map.
     """
 
     stamp: int
@@ -61,7 +61,7 @@ class Slam:
     """
     Simultaneous localisation and mapping; the first frame's camera is the world's origin.
 
-    :param features: looked for in each image.
+    :param features: maximum number of features per image.
     """
 
     def __init__(self, camera: Camera, features: int = 1000) -> None:
@@ -70,7 +70,7 @@ class Slam:
         self.state = State.STARTING
         self._extractor = front.Extractor(camera, features)
         self._reference: Optional[Keyframe] = None
-        #: Relative to the reference, so that it moves with the map.
+        #: Pose of the last frame relative to the reference, so that it moves with the map.
         self._last = numpy.eye(4)
         self._track: list[tuple[int, Keyframe, Array]] = []
         self._motion = numpy.eye(4)
@@ -78,13 +78,13 @@ class Slam:
     def track(self, stamp: int, grey: Pixels, *, depth: Optional[NDArray[numpy.generic]] = None,
               right: Optional[Pixels] = None) -> Tracked:
         """
-        Return where the camera was when it took a frame.
+        Compute the pose of a frame.
 
         :param stamp: nanoseconds.
-        :param grey: (height, width), of the left camera where there are two.
-        :param depth: of the same size, metres as float or millimetres as integer.
-        :param right: the right image, in place of depth.
-        :raises ValueError: images of other sizes than the camera's.
+        :param grey: (height, width), the left image of a stereo pair.
+        :param depth: depth image of the same size, metres as float or millimetres as integer.
+        :param right: the right image, instead of depth.
+        :raises ValueError: an image has another size than the camera's.
         """
         size = (self.camera.height, self.camera.width)
         for image in (grey, depth, right):
@@ -109,11 +109,11 @@ class Slam:
         return tracked
 
     def trajectory(self) -> list[tuple[int, Array]]:
-        """Return stamps and poses of all frames tracked, as the map has them by now."""
+        """Return stamps and poses of all tracked frames, by the current map."""
         return [(stamp, keyframe.pose @ pose) for stamp, keyframe, pose in self._track]
 
     def extend(self, tracked: Tracked) -> bool:
-        """Make a keyframe of a frame that shows new things; return whether the map changed."""
+        """Make a keyframe of a frame with new content; return whether the map changed."""
         reference = self._reference
         if tracked.pose is None or reference is None or tracked.features.deep.sum() < DEEP or (
                 min(apart(k.pose, tracked.pose) for k in self.map.around(reference)) < 1
@@ -135,11 +135,11 @@ class Slam:
         self._reference = self.map.add(stamp, numpy.eye(4), found, none)
         self.state = State.TRACKING
         self._track.append((stamp, self._reference, self._last))
-        # it is a keyframe already
+        # The frame is a keyframe already, so all its features are known.
         return Tracked(stamp, State.TRACKING, found, numpy.eye(4), known=~none)
 
     def _follow(self, stamp: int, found: Features) -> Optional[Tracked]:
-        """Look for the points around the last place, where they should be now."""
+        """Search for the points near their predicted positions, then near their last ones."""
         assert self._reference is not None
         last = self._reference.pose @ self._last
         for guess, radius in ((last @ self._motion, RADIUS), (last, WIDE)):
@@ -150,7 +150,7 @@ class Slam:
         return None
 
     def _find(self, stamp: int, found: Features) -> Optional[Tracked]:
-        """Look for the place among all that were ever seen."""
+        """Search for the camera's place among all keyframes."""
         for place in self.map.similar(found, set(), 3):
             between = self.map.seen_from(place, found)
             if between is not None:
@@ -160,7 +160,7 @@ class Slam:
         return None
 
     def _at(self, stamp: int, found: Features, guess: Array, radius: float) -> Optional[Tracked]:
-        """Return where the camera is, given where it should be nearly."""
+        """Compute the camera's pose from an approximate one."""
         assert self._reference is not None
         around = self.map.around(self._reference)
         points = self.map.points(around)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Folders in the TUM RGB-D format (Sturm et al., IROS 2012).
+Read and write folders in the TUM RGB-D format (Sturm et al., IROS 2012).
 
-``rgb.txt`` and ``depth.txt`` list images by time, ``groundtruth.txt`` poses as time, place and
-quaternion; depth is PNG of 16 bits, 5000 a metre. What the format doesn't have is the camera: it
-is what ``camera.txt`` says (``fx fy cx cy``, and ``k1 k2 p1 p2 k3`` of Brown's model where there
-is distortion), else TUM's own where the folder's name says which (freiburg1 to 3), else a
-Kinect's. What is distorted is straightened as it is read.
+``rgb.txt`` and ``depth.txt`` list images by time. ``groundtruth.txt`` lists poses as time,
+position and quaternion. Depth is PNG with 16 bits, 5000 per metre. The format does not contain the
+camera. It comes from the optional file ``camera.txt`` (``fx fy cx cy``, and ``k1 k2 p1 p2 k3`` of
+Brown's model for distorted images). Otherwise it is TUM's own if the folder's name contains
+freiburg1 to 3, else a Kinect's. Distorted images are rectified when they are read.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
 
 Pixels = NDArray[numpy.uint8]
-#: Units of depth in a metre.
+#: Units of depth per metre.
 SCALE = 5000
-#: Seconds between an image and the depth, or the pose, that belong to it.
+#: Maximum difference in seconds between an image and its depth or pose.
 APART = 0.02
-#: From TUM's page; of the third camera the images are straight.
+#: From TUM's page; the third camera's images are already rectified.
 _CAMERAS: dict[str, tuple[float, ...]] = {
     'freiburg1': (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     'freiburg2': (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
@@ -36,7 +36,7 @@ _KINECT = (525.0, 525.0, 319.5, 239.5)
 
 
 class DatasetError(ValueError):
-    """A folder isn't what it should be; says where."""
+    """A folder is invalid; the text has the file and line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +55,11 @@ class Line:
 @dataclasses.dataclass(frozen=True)
 class Dataset:
     """
-    What a folder has.
+    The content of a folder.
 
-    :param distortion: k1, k2, p1, p2, k3 of the images in the folder, empty where there is none.
+    :param distortion: k1, k2, p1, p2, k3 of the images in the folder; empty for no distortion.
     :param pairs: image and depth, by time.
-    :param truth: poses by time, empty where there are none.
+    :param truth: poses by time; empty if unknown.
     """
 
     folder: Path
@@ -72,9 +72,9 @@ class Dataset:
         """
         Yield time, image (height, width, 3) of BGR, and depth (height, width), millimetres.
 
-        Both as a camera without distortion sees them, black and unknown where that sees more.
+        Both are rectified; pixels outside of the original image are black or of unknown depth.
 
-        :raises DatasetError: a file is missing, or no image of this size.
+        :raises DatasetError: a file is missing, or an image has another size.
         """
         maps = cv2.initUndistortRectifyMap(
             self.camera.matrix, numpy.array(self.distortion), None, self.camera.matrix,
@@ -91,16 +91,16 @@ class Dataset:
                                    'first image')
             if maps:
                 colours = cv2.remap(colours, *maps, cv2.INTER_LINEAR)
-                # between two depths there is nothing
+                # Depths must not be interpolated between two surfaces.
                 depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
             yield image.time, colours, (depth.astype(int) * 1000 // SCALE).astype(numpy.uint16)
 
 
 def read(folder: Path) -> Dataset:
     """
-    Return what is in a folder; images are read later.
+    Read the lists of a folder; images are read later.
 
-    :raises DatasetError: it is none of this format.
+    :raises DatasetError: the folder does not have this format.
     """
     images, depths = (_lines(folder / name, 1) for name in ('rgb.txt', 'depth.txt'))
     pairs = _associated(images, depths)
@@ -123,7 +123,7 @@ def read(folder: Path) -> Dataset:
 def write(folder: Path, camera: Camera,
           frames: Iterable[tuple[float, Pixels, NDArray[numpy.uint16]]],
           truth: Iterable[tuple[float, Array]]) -> None:
-    """Write a folder; frames as ``Dataset.frames`` yields them."""
+    """Write a folder; ``frames`` are as in ``Dataset.frames``."""
     for name in ('rgb', 'depth'):
         (folder / name).mkdir(parents=True, exist_ok=True)
     times = []
@@ -141,7 +141,7 @@ def write(folder: Path, camera: Camera,
 
 
 def _lines(path: Path, words: int) -> list[Line]:
-    """Return the lines of a list, in the order of their times."""
+    """Return the lines of a list, sorted by time."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
@@ -171,7 +171,7 @@ def _number(word: str, where: str) -> float:
 
 
 def _associated(images: list[Line], depths: list[Line]) -> list[tuple[Line, Line]]:
-    """Return each image with the depth nearest in time, each depth once."""
+    """Return each image with the depth nearest in time; each depth belongs to one image."""
     times = numpy.array([line.time for line in depths])
     pairs: list[tuple[Line, Line]] = []
     taken = -1
@@ -191,7 +191,7 @@ def _image(folder: Path, line: Line, how: int) -> NDArray[Any]:
 
 
 def _camera(folder: Path) -> tuple[float, ...]:
-    """Return fx, fy, cx, cy, and the distortion where there is any."""
+    """Return fx, fy, cx, cy, and the distortion if there is any."""
     values = next((c for name, c in _CAMERAS.items() if name in folder.resolve().name), _KINECT)
     path = folder / 'camera.txt'
     if path.exists():
