@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Fakes and contracts, for the tests of those who write plugins, and for ours.
+Fakes and contracts for the tests of plugin authors, and for our own tests.
 
-A provider's author subclasses :class:`ProviderContract`, gives it a ``make`` method, and pytest
-runs the contract against the real thing; likewise :class:`ShellContract`. The fakes pass the same
-suites, so a test that uses them holds for the real ones.
+A provider's author subclasses :class:`ProviderContract` and writes its method ``make``; pytest
+then runs the contract against the provider. :class:`ShellContract` works the same way. The fakes
+pass the same contracts, so tests with fakes are valid for real plugins.
 """
 
 from fogros2.testing.fakes import FakeClock, FakeProvider, FakeShell, FakeStream

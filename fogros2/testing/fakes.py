@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A provider and a shell that remember what they were asked, and do nothing."""
+"""Fake a clock, a provider, a stream and a shell, which record calls and have no effect."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ from fogros2.model import (
 from fogros2.provider import Provider
 from fogros2.shell import Stream
 
-#: Where every fake machine is; TEST-NET-2, nobody's address.
+#: Endpoint of every fake machine, in TEST-NET-2, which is never assigned.
 FAKE_ENDPOINT = Endpoint('fake', '198.51.100.1', user='fog')
 
 
 class FakeClock:
-    """A clock that a test moves; calls as ``time.monotonic`` does."""
+    """A clock that a test advances; calling it returns the time, as ``time.monotonic`` does."""
 
     def __init__(self, now: float = 0.0) -> None:
         self.now = now
 
     def __call__(self) -> float:
-        """Return the time (s)."""
+        """Return the time in seconds."""
         return self.now
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         self.now += seconds
 
 
@@ -62,14 +62,14 @@ class FakeProvider(Provider):
     """
     A provider whose machines are entries of a dictionary.
 
-    :param polls: how often ``describe`` says that a new machine isn't running yet.
-    :param shell: endpoint of every machine that runs.
-    :param failures: per method name the error that its next call raises.
-    :param prices: US dollars an hour of each size that costs money; 'cheapest' stands for the one
-        that costs least.
+    :param polls: number of ``describe`` calls for which a new machine is pending.
+    :param shell: endpoint of every running machine.
+    :param failures: by method name, the error that the next call of the method raises.
+    :param prices: US dollars per hour by size; 'cheapest' stands for the size with the lowest
+        price.
 
-    Attributes that a test may set: ``allowed``, per machine and TCP port who is let in;
-    ``address``, the robot's; ``host_keys``, per machine the key that was pinned.
+    Attributes for tests: ``allowed``, allowed sources by machine and TCP port; ``address``, the
+    robot's address; ``host_keys``, pinned key by machine.
     """
 
     name: ClassVar[str] = 'fake'
@@ -95,7 +95,7 @@ class FakeProvider(Provider):
         self._waits: dict[str, int] = {}
 
     def check(self, spec: MachineSpec) -> None:
-        """Refuse every option but 'size'."""
+        """Refuse every option except 'size'."""
         self._called('check')
         for name in spec.options:
             if name != 'size':
@@ -103,7 +103,7 @@ class FakeProvider(Provider):
                                          "did you mean 'size'?")
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
-        """Choose the size that costs least for 'cheapest'."""
+        """Resolve 'cheapest' to the size with the lowest price."""
         self._called('resolve')
         if spec.options.get('size') != 'cheapest':
             return spec
@@ -111,11 +111,11 @@ class FakeProvider(Provider):
         return dataclasses.replace(spec, options={**spec.options, 'size': size})
 
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
-        """Return the price of a size."""
+        """Return the price of the machine's size."""
         return self.prices.get(str(spec.options.get('size')))
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Make an entry."""
+        """Create a machine."""
         self.check(spec)
         with self._lock:
             self._called('create')
@@ -132,7 +132,7 @@ class FakeProvider(Provider):
             return machine_id
 
     def describe(self, machine_id: str) -> Machine:
-        """Return an entry; a pending machine comes up meanwhile."""
+        """Return a machine; count down a pending one's polls until it runs."""
         with self._lock:
             self._called('describe')
             machine = self._found(machine_id)
@@ -150,27 +150,27 @@ class FakeProvider(Provider):
             return machine
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        """Return the entries that carry all of ``tags``."""
+        """Return the machines that have all of ``tags``."""
         with self._lock:
             self._called('find')
             return [m for m in self._machines.values() if tags.items() <= m.tags.items()]
 
     def destroy(self, machine_id: str) -> None:
-        """Drop an entry."""
+        """Delete a machine."""
         with self._lock:
             self._called('destroy')
             self._machines.pop(machine_id, None)
             self._tokens = {t: i for t, i in self._tokens.items() if i != machine_id}
 
     def stop(self, machine_id: str) -> None:
-        """Mark an entry as stopped."""
+        """Stop a machine."""
         with self._lock:
             self._called('stop')
             self._machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.STOPPED, shell=None)
 
     def start(self, machine_id: str) -> None:
-        """Let a stopped entry come up again."""
+        """Start a stopped machine."""
         with self._lock:
             self._called('start')
             self._machines[machine_id] = dataclasses.replace(
@@ -185,14 +185,14 @@ class FakeProvider(Provider):
         return self.address
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
-        """Note who is let in."""
+        """Record the allowed sources."""
         if not self.firewall:
             super().allow(machine_id, port, sources)
         self._called('allow')
         self.allowed[machine_id, port] = list(sources)
 
     def pin(self, machine_id: str, host_key: str) -> None:
-        """Note the key."""
+        """Record the host key."""
         if not self.one_time_host_key:
             super().pin(machine_id, host_key)
         self._called('pin')
@@ -211,9 +211,9 @@ class FakeProvider(Provider):
 
 class FakeStream:
     """
-    Both ends of a program that a test plays.
+    The stream of a program that a test plays.
 
-    ``sent`` has what was written to it; ``say`` is what it prints.
+    ``sent`` is the input that the program received; ``say`` prints a line of output.
     """
 
     def __init__(self, *, echo: bool = False) -> None:
@@ -227,7 +227,7 @@ class FakeStream:
         self._lines.put(line)
 
     def write(self, data: bytes) -> None:
-        """Take what the program is sent."""
+        """Send input to the program."""
         if self._closed.is_set():
             raise ConnectError('the stream is closed')
         self.sent += data
@@ -236,14 +236,14 @@ class FakeStream:
                 self.say(line)
 
     def readline(self) -> bytes:
-        """Return the next line, b'' at the end."""
+        """Return the next line of output, b'' at the end."""
         line = self._lines.get()
         if not line:
             self._lines.put(b'')  # for the next reader
         return line
 
     def close(self) -> None:
-        """End it."""
+        """Close the stream."""
         self._closed.set()
         self._lines.put(b'')
 
@@ -253,13 +253,13 @@ Handler = Callable[[Command], Result]
 
 class FakeShell:
     """
-    A shell to nowhere: it remembers what it was asked to do, and keeps files in a dictionary.
+    A shell without a machine: it records commands, and keeps files in a dictionary.
 
-    It knows a few programs (true, false, echo, cat, sleep, printenv, id, stat, seq), so that it
-    passes the same contract as real shells; ``handlers`` answer for others.
+    It implements a few programs (true, false, echo, cat, sleep, printenv, id, stat, seq), so that
+    it passes the contract of real shells.
 
-    :param handlers: per program name what answers a command.
-    :param streams: what ``open`` returns, one after the other; then one that echoes.
+    :param handlers: by program name, a function that returns the result of a command.
+    :param streams: streams that ``open`` returns, in this order; later ones echo their input.
     """
 
     def __init__(
@@ -287,7 +287,7 @@ class FakeShell:
         cancel: Optional[threading.Event] = None,
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
-        """Answer a command from a handler; unknown ones fail as a shell's would."""
+        """Answer a command by a handler; unknown programs fail as in a real shell."""
         with self._lock:
             self.commands.append(command)
         what = command.what or command.argv[0]
@@ -329,7 +329,7 @@ class FakeShell:
         return _said(f'{self.files[path][1]:o}\n')
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Keep a file."""
+        """Store a file."""
         with self._lock:
             self.files[target] = (data, mode)
 
@@ -338,7 +338,7 @@ class FakeShell:
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Keep a folder's files; patterns are matched as names and as paths, no more."""
+        """Store a folder's files; patterns match names and whole paths only."""
         if not source.is_dir():
             raise WorkspaceError(f'{source} is no folder that could be sent')
         kept = {}
@@ -367,11 +367,11 @@ class FakeShell:
             return self._streams.pop(0) if self._streams else FakeStream(echo=True)
 
     def interactive(self, command: Optional[Command] = None) -> int:
-        """Return 0."""
+        """Do nothing, and return 0."""
         return 0
 
     def close(self) -> None:
-        """Count."""
+        """Count the calls in ``closed``."""
         self.closed += 1
 
 

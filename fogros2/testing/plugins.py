@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plugins that are there for the time of a test."""
+"""Install plugins for the duration of a test."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from fogros2.provider import Provider
 
 def install(folder: Path, group: str, name: str, program: str, attribute: str) -> str:
     """
-    Write a distribution with one entry point; return the PYTHONPATH by which it is found.
+    Write a distribution with one entry point; return the PYTHONPATH that includes it.
 
-    Launches that a test starts find it there, too.
+    Processes that a test starts with this PYTHONPATH find the plugin too.
 
     :param folder: an empty folder.
-    :param group: such as ``fogros2.provider``.
-    :param name: of the plugin.
-    :param program: its module's text.
-    :param attribute: the class in it.
+    :param group: entry-point group, such as ``fogros2.provider``.
+    :param name: name of the plugin.
+    :param program: source text of the plugin's module.
+    :param attribute: name of the class in the module.
     """
     module = f'fogt_{name}'
     about = folder / f'{module}-0.dist-info'
@@ -42,9 +42,9 @@ def instead(
     patch: pytest.MonkeyPatch, group: str, known: Mapping[str, Union[type[Any], FogError]],
 ) -> None:
     """
-    Have a group hold these plugins and no others, in this process.
+    Replace all plugins of a group in this process.
 
-    :param known: by name, the class, or the error with which it can't be loaded.
+    :param known: by name, the class, or the error that loading it raises.
     """
     names, load = plugin_system.names, plugin_system.load
 
@@ -62,25 +62,25 @@ def instead(
 
 
 class MemoryProvider(Provider):
-    """A provider whose machines a test puts into a dictionary of the class."""
+    """A provider whose machines a test writes to the dictionary ``machines`` of the class."""
 
     machines: dict[str, Machine]
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Refuse: what there is, the test has put there."""
+        """Refuse, because the test creates the machines."""
         raise ProviderError(f"'{spec.name}' can't be made: the test makes its machines itself")
 
     def describe(self, machine_id: str) -> Machine:
-        """Return the one of that id."""
+        """Return a machine by its id."""
         if machine_id not in self.machines:
             raise MachineNotFound(machine_id)
         return self.machines[machine_id]
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        """Return those that have the tags."""
+        """Return the machines that have the tags."""
         return [machine for machine in self.machines.values()
                 if tags.items() <= machine.tags.items()]
 
     def destroy(self, machine_id: str) -> None:
-        """Forget it."""
+        """Forget a machine."""
         self.machines.pop(machine_id, None)

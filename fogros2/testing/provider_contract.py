@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every provider has to do, as tests."""
+"""The contract of every provider, as tests."""
 
 # ruff: noqa: D102 - a test says in its name what it holds
 
@@ -27,13 +27,13 @@ from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_NAME
 from fogros2.testing.shell_contract import raised
 
-#: A key whose private half nobody has; providers look whether it is one.
+#: A public key without a known private key; providers check its format.
 PUBLIC_KEY = ('ssh-ed25519 '
               'AAAAC3NzaC1lZDI1NTE5AAAAILTdX1OUsetUy/jyOuvKiGOBNBXDpA+BhuJy7Gz4ifrw test')
 
 
 def request_for(spec: MachineSpec, *, token: Optional[str] = None, **tags: str) -> CreateRequest:
-    """Return a request as the core makes it, for a machine that nobody logs in to."""
+    """Return a request like the core's, for a machine without logins."""
     return CreateRequest(
         token=token or str(uuid.uuid4()), authorized_key=PUBLIC_KEY,
         tags={TAG_NAME: spec.name, **tags}, vpn_port=51820)
@@ -41,21 +41,21 @@ def request_for(spec: MachineSpec, *, token: Optional[str] = None, **tags: str) 
 
 class ProviderContract:
     """
-    What every provider has to do; subclass it, and let pytest collect the subclass.
+    The contract of every provider; pytest collects its subclasses.
 
-    What depends on a class attribute (``owned``, ``firewall``, ...) is asked of providers with it.
+    Tests of optional features depend on a class attribute (``owned``, ``firewall``, ...).
     """
 
-    #: Seconds until a machine can be reached, and until one is gone.
+    #: Seconds until a machine is reachable, and until a deleted machine is gone.
     patience: ClassVar[float] = 60.0
 
     def make(self) -> tuple[Provider, dict[str, Any]]:
-        """Return a provider and the options of the machines to try it with."""
+        """Return a provider, and the options of machines for the tests."""
         raise LookupError(f'{type(self).__name__} has to say what it tests: write make()')
 
     @contextlib.contextmanager
     def machine(self, **tags: str) -> Iterator[tuple[Provider, MachineSpec, CreateRequest, str]]:
-        """Yield a new machine; it is gone afterwards."""
+        """Yield a new machine, and delete it afterwards."""
         provider, options = self.make()
         spec = MachineSpec(f't{secrets.token_hex(3)}', provider.name, options)
         request = request_for(spec, **tags)
@@ -66,7 +66,7 @@ class ProviderContract:
             provider.destroy(machine_id)
 
     def reached(self, provider: Provider, machine_id: str, name: str = 'it') -> Machine:
-        """Return a machine as soon as it can be reached."""
+        """Wait until a machine is reachable, and return it."""
         return provider.reachable(
             machine_id, name=name, timeout=self.patience, cancel=threading.Event())
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every shell has to do, as tests."""
+"""The contract of every shell, as tests."""
 
 # ruff: noqa: D102 - a test says in its name what it holds
 
@@ -24,18 +24,18 @@ from fogros2.shell import Shell
 
 
 class ShellContract:
-    """What every shell has to do; subclass it, and let pytest collect the subclass."""
+    """The contract of every shell; pytest collects its subclasses."""
 
     #: Whether the login user may become root without a password.
     sudo: ClassVar[bool] = True
 
     def make(self, folder: Path) -> tuple[Shell, str]:
-        """Return a shell, and an empty folder's path there; ``folder`` is one here."""
+        """Return a shell, and the path of an empty folder there; ``folder`` is a local folder."""
         raise LookupError(f'{type(self).__name__} has to say what it tests: write make()')
 
     @contextlib.contextmanager
     def connected(self, folder: Path) -> Iterator[tuple[Shell, str]]:
-        """Yield what ``make`` returns; the connection is dropped afterwards."""
+        """Yield what ``make`` returns, and close the shell afterwards."""
         shell, there = self.make(folder)
         try:
             yield shell, there
@@ -43,7 +43,7 @@ class ShellContract:
             shell.close()
 
     def read(self, shell: Shell, path: str) -> str:
-        """Return a file's content."""
+        """Return the content of a file on the shell's machine."""
         return shell.run(Command(('cat', path)), timeout=30.0).stdout
 
     def test_a_command_s_output_and_status_come_back(self, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ class ShellContract:
 
 
 def raised(kind: type[FogError], call: Callable[[], object]) -> FogError:
-    """Return the error that a call has to raise."""
+    """Return the error of type ``kind`` that a call must raise."""
     try:
         value = call()
     except kind as error:
