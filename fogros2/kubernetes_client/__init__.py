@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The client of a cluster's API server, for the shell and the provider of pods.
+The client of a Kubernetes API server, for the shell and the provider of pods.
 
-``configuration`` reads the kubeconfig, ``answers`` parses answers and errors, ``watch`` follows
-objects, ``api`` makes the requests.
+``configuration`` reads the kubeconfig, ``answers`` parses responses and errors, ``watch`` watches
+objects, ``api`` sends requests.
 """
 
 from fogros2.kubernetes_client.answers import ApiError, items, path, selector, Unreachable

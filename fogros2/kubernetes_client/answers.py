@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an API server answers, and how it is asked for it: errors, paths, lists."""
+"""Parse the responses of an API server: errors and lists; build paths and selectors."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from fogros2.errors import ProviderError
 
 class ApiError(ProviderError):
     """
-    The API server refused.
+    The API server refused a request.
 
-    :param status: of HTTP: 403, 404, 409, 422, ...
-    :param reason: in one word: Forbidden, NotFound, AlreadyExists, Invalid, ...
-    :param details: what the answer's ``details`` hold, such as causes.
+    :param status: HTTP status: 403, 404, 409, 422, ...
+    :param reason: the API's reason: Forbidden, NotFound, AlreadyExists, Invalid, ...
+    :param details: ``details`` of the response, such as causes.
     """
 
     def __init__(
@@ -30,17 +30,17 @@ class ApiError(ProviderError):
 
 
 class Unreachable(ProviderError):
-    """The API server doesn't answer."""
+    """The API server does not answer."""
 
 
 def http_errors() -> tuple[type[BaseException], ...]:
-    """Return what a connection that breaks may raise."""
+    """Return the types of errors that a broken connection may raise."""
     import urllib3
     return (urllib3.exceptions.HTTPError, OSError)
 
 
 def parsed(data: bytes) -> dict[str, Any]:
-    """Return an answer's object, an empty one for what is none."""
+    """Parse a response's JSON object; return an empty one if it is invalid."""
     try:
         found = json.loads(data)
     except ValueError:
@@ -49,7 +49,7 @@ def parsed(data: bytes) -> dict[str, Any]:
 
 
 def refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
-    """Return the error that an answer with a status of 400 and above tells of."""
+    """Return the error for a response with a status of 400 and above."""
     message = str(answer.get('message') or data[:300].decode(errors='replace')
                   or f'HTTP status {status}')
     hint = 'the kubeconfig holds credentials that the cluster does not take: log in again' \
@@ -59,13 +59,13 @@ def refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
 
 
 def selector(labels: Mapping[str, str]) -> str:
-    """Return labels as a query's ``labelSelector``."""
+    """Return labels as the ``labelSelector`` of a query."""
     return ','.join(f'{key}={value}' if value else key for key, value in labels.items())
 
 
 def path(kind: str, namespace: str = '', name: str = '', *rest: str) -> str:
     """
-    Return the path of objects of a kind, in all namespaces if none is named.
+    Return the path of objects of a kind; without ``namespace``, in all namespaces.
 
     >>> path('jobs', 'robots', 'talker')
     '/apis/batch/v1/namespaces/robots/jobs/talker'

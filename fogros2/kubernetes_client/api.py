@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A cluster's API server, as the kubeconfig describes it: requests, watches, exec's WebSocket.
+Send requests to a cluster's API server, watch objects, and open the WebSocket of exec.
 
-The official client reads the kubeconfig, gets and renews the credentials and sets TLS up. Requests
-are made by path and answered in JSON: its classes for every kind of object take most of a second
-to load, and none of them is needed.
+The official client reads the kubeconfig, gets and renews credentials, and sets TLS up. This module
+sends requests by path and parses the JSON responses itself, because the client's classes for all
+kinds of objects take most of a second to load.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ T = TypeVar('T')
 #: Query parameters; a list repeats the name.
 Query = Mapping[str, Any]
 
-#: Seconds in which a connection to the API server has to stand.
+#: Time-out of a connection to the API server, in seconds.
 CONNECT = 5.0
-#: Seconds that one request may take.
+#: Time-out of one request, in seconds.
 ANSWER = 30.0
-#: Seconds for which an API server that restarts is waited for.
+#: Seconds to wait for an API server that restarts.
 PATIENCE = 30.0
-#: Seconds after a restart in which an API server may not know yet what it allows whom.
+#: Seconds after a restart in which an API server may not have loaded its permissions yet.
 DOUBT = 15.0
 
 
@@ -52,13 +52,13 @@ class Api:
     """
     The API server of one context; thread-safe.
 
-    :param context: name of a context of the kubeconfig; '' for the current one.
-    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    :param context: name of a context of the kubeconfig; '': the current one.
+    :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
 
     def __init__(self, context: str = '') -> None:
         self.context, self.namespace, self._client = kubeconfig.load(context)
-        #: Requests made so far, for the figures.
+        #: Number of requests so far, for measurements.
         self.calls = 0
         self._lost = -DOUBT
 
@@ -68,7 +68,7 @@ class Api:
         return str(self._client.configuration.host)
 
     def headers(self) -> dict[str, str]:
-        """Return what authenticates a request; renews what has run out."""
+        """Return the headers that authenticate a request; renew expired credentials."""
         found: dict[str, str] = {}
         for each in self._client.configuration.auth_settings().values():
             if each['in'] == 'header' and each['value']:
@@ -83,12 +83,12 @@ class Api:
         cancel: Optional[threading.Event] = None, **query: Any,
     ) -> dict[str, Any]:
         """
-        Make a request and return the answer.
+        Send a request, and return the response's JSON object.
 
-        :param patience: seconds for which an API server that doesn't answer is asked again.
-        :param doubt: seconds for which one that says that we may not is.
-        :raises ApiError: it refused.
-        :raises Unreachable: it doesn't answer.
+        :param patience: seconds for which to retry while the API server does not answer.
+        :param doubt: seconds for which to retry after status 403 (Forbidden).
+        :raises ApiError: the API server refused.
+        :raises Unreachable: the API server does not answer.
         :raises Cancelled: ``cancel`` was set, and no answer came soon after.
         """
         last: list[ProviderError] = []
@@ -115,12 +115,12 @@ class Api:
             raise last[0] from error
 
     def passing(self, error: ApiError) -> bool:
-        """Return whether a refusal may be one of an API server that has just begun again."""
+        """Return whether the cause of an error may be a restart of the API server."""
         return error.status in (429, 500, 502, 503, 504) or (
             error.status == 403 and time.monotonic() - self._lost < DOUBT)
 
     def lost(self) -> None:
-        """Note that a connection to the API server was lost, or none can be had."""
+        """Record that a connection to the API server was lost or could not be opened."""
         self._lost = time.monotonic()
 
     def _once(
@@ -144,10 +144,10 @@ class Api:
         read: Optional[float],
     ) -> Any:
         """
-        Make a request, and return urllib3's response with its body unread.
+        Send a request, and return urllib3's response with an unread body.
 
-        :param read: seconds of silence that are borne, None for any.
-        :raises Unreachable: no answer began.
+        :param read: time-out of silence in seconds; None: no time-out.
+        :raises Unreachable: no response began.
         """
         import urllib3
 
@@ -187,10 +187,11 @@ class Api:
         """
         Watch objects until ``look`` returns something other than None, and return that.
 
-        :param look: gets ADDED, MODIFIED or DELETED and the object; what is there already comes
-            as ADDED, unless ``resourceVersion`` says where to begin.
-        :param again: asked first when a watch was lost and is begun anew, from what is there then.
-        :param tick: asked a few times a second, for what has a deadline of its own.
+        :param look: callback with ADDED, MODIFIED or DELETED and the object. Existing objects come
+            as ADDED, unless ``resourceVersion`` names a start.
+        :param again: called before a lost watch is restarted, to check the current state; a
+            result other than None ends the watch.
+        :param tick: called a few times per second, for deadlines of the caller; as ``again``.
         :raises DeadlineExceeded: after ``timeout`` seconds.
         :raises Cancelled: ``cancel`` was set.
         """
@@ -222,10 +223,11 @@ class Api:
 
     def websocket(self, path: str, query: Query, *, timeout: float) -> websocket.WebSocket:
         """
-        Open a WebSocket for a pod's ``exec``.
+        Open a WebSocket to a pod's ``exec``.
 
-        :raises ApiError: refused, or no such pod.
-        :raises Unreachable: the API server doesn't answer.
+        :param timeout: time-out in seconds.
+        :raises ApiError: the API server refused, or there is no such pod.
+        :raises Unreachable: the API server does not answer.
         """
         import websocket
 
@@ -256,10 +258,10 @@ class Api:
         self, path: str, container: str, command: Sequence[str], *, timeout: float,
     ) -> None:
         """
-        Run a command in a pod, and wait for its first word or its end, so many seconds at most.
+        Run a command in a pod; wait at most ``timeout`` seconds for its first output or its end.
 
-        :raises ApiError: refused, or no such pod.
-        :raises Unreachable: the API server doesn't answer.
+        :raises ApiError: the API server refused, or there is no such pod.
+        :raises Unreachable: the API server does not answer.
         """
         import websocket
 
@@ -277,25 +279,25 @@ _apis_lock = threading.Lock()
 
 def connect(context: str = '') -> Api:
     """
-    Return the API server of a context of the kubeconfig, '' for the current one.
+    Return the API server of a context of the kubeconfig; '' is the current context.
 
-    All who name the same one share its connections.
+    Callers with the same context share one object and its connections.
 
-    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
     kubeconfig = os.environ.get('KUBECONFIG', '')
     with _apis_lock:
         found = _apis.get((context, kubeconfig))
         if found is None:
             found = Api(context)
-            # by its name as well, if it was asked for as the current one
+            # Also store the current context by its name, so that both share one object.
             found = _apis.setdefault((found.context, kubeconfig), found)
             _apis[context, kubeconfig] = found
         return found
 
 
 def _tls(configuration: Any) -> dict[str, Any]:
-    """Return how the WebSocket checks the API server, the same way as the requests."""
+    """Return the TLS options of the WebSocket, equal to those of the requests."""
     import ssl
     options: dict[str, Any] = {'cert_reqs': ssl.CERT_NONE, 'check_hostname': False}
     if configuration.verify_ssl:

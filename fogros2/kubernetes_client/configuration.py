@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The kubeconfig, read by the official client, which also gets and renews the credentials.
+Read the kubeconfig by the official client, which also gets and renews the credentials.
 
-The client is loaded here alone, and when it is needed.
+Only this module loads the client, and only when it is needed.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from typing import Any
 
 from fogros2.errors import PrerequisiteError
 
-#: Token, certificate and namespace of a pod that may use the API itself.
+#: Token, certificate and namespace of a pod that may use the API.
 _IN_CLUSTER = Path('/var/run/secrets/kubernetes.io/serviceaccount')
 
 
 def kubeconfig_files() -> list[Path]:
-    """Return the files that the kubeconfig is made of, those that exist."""
+    """Return the existing files that the kubeconfig consists of."""
     names = os.environ.get('KUBECONFIG') or '~/.kube/config'
     paths = [Path(name).expanduser() for name in names.split(os.pathsep) if name]
     return [path for path in paths if path.is_file()]
 
 
 def configured() -> bool:
-    """Return whether there is a kubeconfig, or this is a pod that may use the API."""
+    """Return whether there is a kubeconfig, or this pod may use the API."""
     return bool(kubeconfig_files()) or (_IN_CLUSTER / 'token').is_file()
 
 
 def load(context: str) -> tuple[str, str, Any]:
     """
-    Return a context's name, its namespace and a client of the SDK.
+    Load a context; return its name, its namespace and a client of the SDK.
 
-    :raises PrerequisiteError: no kubeconfig, no such context, or its credentials can't be had.
+    :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
     try:
         import kubernetes.client
@@ -64,7 +64,7 @@ def load(context: str) -> tuple[str, str, Any]:
         entry = next(each for each in contexts if each['name'] == name)
         settings = type.__call__(kubernetes.client.Configuration)
         config.load_kube_config(files, context=name, client_configuration=settings)
-        # a connection for each of many machines that come up at once
+        # One connection for each of many machines that start at once.
         settings.connection_pool_maxsize = 64
         client = kubernetes.client.ApiClient(settings)
         _check_plugin(str(entry['context'].get('user', '')), settings)
@@ -77,11 +77,11 @@ def load(context: str) -> tuple[str, str, Any]:
 
 def _check_plugin(user: str, settings: Any) -> None:
     """
-    Look whether the program that a kubeconfig names has given credentials.
+    Check that the kubeconfig's credential plugin returned credentials.
 
-    The client goes on without, as nobody, and every request would be refused.
+    Without credentials, the client continues anonymously, and the API refuses every request.
 
-    :raises PrerequisiteError: it hasn't.
+    :raises PrerequisiteError: the plugin returned no credentials.
     """
     if settings.auth_settings() or settings.cert_file:
         return
@@ -98,8 +98,8 @@ def _check_plugin(user: str, settings: Any) -> None:
 
 
 def words(error: BaseException) -> str:
-    """Return the innermost reason of a chain of the client's errors, in one line."""
+    """Return the innermost reason of a chain of the client's errors, as one line."""
     reason: object = getattr(error, 'reason', None) or error
     text = ' '.join(str(reason).split())
-    # urllib3 puts its object in front
+    # urllib3 puts the representation of its object before the reason.
     return text.rpartition('>: ')[2] or text or type(error).__name__

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A watch of the API server's objects."""
+"""Watch objects of the API server."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from typing import Any, Optional, Protocol
 
 from fogros2.kubernetes_client.answers import ApiError, http_errors, parsed, refusal, Unreachable
 
-#: Seconds of silence after which a watch is begun anew: its connection may be gone.
+#: Seconds of silence after which a watch is restarted, because its connection may be dead.
 SILENCE = 240.0
 
 
 class Server(Protocol):
-    """The API server, as a watch needs it."""
+    """The part of the API server's interface that a watch needs."""
 
     def send(
         self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Mapping[str, Any],
         read: Optional[float], /,
     ) -> Any:
-        """Make a request and return urllib3's response, its body unread."""
+        """Send a request, and return urllib3's response with an unread body."""
 
     def passing(self, error: ApiError, /) -> bool:
-        """Return whether a refusal may be one of an API server that has just begun again."""
+        """Return whether the cause of an error may be a restart of the API server."""
 
     def lost(self) -> None:
-        """Note that a connection was lost."""
+        """Record that a connection was lost."""
 
 
 class Watch:
     """
-    One watch: a thread asks and reads its lines, so that a waiting caller can be cancelled.
+    One watch; its thread sends the request and reads the lines, so that callers can be cancelled.
 
-    An API server that takes the connection and says nothing holds up that thread alone.
+    An API server that accepts the connection and sends nothing blocks only that thread.
     """
 
     def __init__(self, api: Server, path: str, query: Mapping[str, Any]) -> None:
@@ -59,7 +59,7 @@ class Watch:
         elif response is not None:
             self._read(api, response)
         else:
-            # an API server that restarts is asked ten times a second
+            # Limits the retries during a restart of the API server to ten per second.
             threading.Event().wait(0.1)
         self._events.put(('CLOSED', {}))
 
@@ -89,13 +89,13 @@ class Watch:
                     if 'type' in event:
                         self._events.put((event['type'], event.get('object') or {}))
         if not self._ended:
-            api.lost()  # or the API server has had enough of us, which does no harm
+            api.lost()  # or the API server closed the watch regularly; this call is then harmless
 
     def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:
         """
-        Return the next event, None if none came in time.
+        Return the next event, None after ``timeout`` seconds.
 
-        :raises ApiError: the watch was refused.
+        :raises ApiError: the API server refused the watch.
         """
         try:
             event = self._events.get(timeout=timeout)
@@ -113,7 +113,7 @@ class Watch:
             self._ended = True
             response, self._response = self._response, None
         if response is None:
-            return  # it has ended, or its thread still asks, and closes it
+            return  # the watch has ended, or its thread will close the response
         with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
             _wake(response)
         self._thread.join(2.0)
@@ -121,11 +121,11 @@ class Watch:
 
 
 def _wake(response: Any) -> None:
-    """Have the thread that reads a response find its end; a close would wait for that thread."""
+    """Wake the thread that reads a response; close() would wait for that thread."""
     if hasattr(response, 'shutdown'):
         response.shutdown()
         return
-    # urllib3 before 2.3, as Debian 12 and Ubuntu 24.04 have it
+    # urllib3 before 2.3, as in Debian 12 and Ubuntu 24.04
     held = getattr(response.connection, 'sock', None)
     if held is None:
         held = response._fp.fp.raw._sock
