@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch extension; the names meant for launch files are those of :mod:`fogros2`."""
+"""Extend launch with machines; launch files import the public names from :mod:`fogros2`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that carry streams: encoders and decoders, beside the launch file's own."""
+"""Run the republishers of streams, encoders and decoders, as processes of the launch."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _PLACES = {'share': FindPackageShare, 'prefix': FindPackagePrefix}
 
 class Carrier(ExecuteProcess):
     """
-    A process that carries a stream.
+    A process that republishes a stream, encoded or decoded.
 
-    A process action but no :class:`launch_ros.actions.Node`: namespaces, remappings and
-    parameters that a group sets for its nodes aren't meant for it.
+    It is a process action and not a :class:`launch_ros.actions.Node`: the namespaces, remappings
+    and parameters that a group sets for its nodes must not change it.
     """
 
     def __init__(self, spec: NodeSpec) -> None:
@@ -31,22 +31,22 @@ class Carrier(ExecuteProcess):
         if spec.package:
             command.insert(0, [ExecutableInPackage(
                 package=spec.package, executable=spec.executable)])
-        environment: dict[Any, Any] = {  # launch's type is a union that a dict can't match
+        environment: dict[Any, Any] = {  # a dict does not match launch's union type
             key: _word(value) for key, value in spec.environment.items()}
         super().__init__(
             cmd=command, name=spec.name, additional_env=environment, respawn=spec.respawn,
             respawn_delay=spec.respawn_delay, sigterm_timeout=str(spec.sigterm_timeout),
             sigkill_timeout=str(spec.sigkill_timeout))
-        #: The id by which its stream knows it.
+        #: The id of its node in the stream.
         self.node = spec.id
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
-        """Return none: a launch whose own processes have all ended has no use for this one."""
+        """Return None: this process must not keep the launch alive when all others have ended."""
         return None
 
 
 class RobotCarrier(Carrier):
-    """A carrier on the robot; it starts when the machine at the other end is up."""
+    """A republisher on the robot; it starts when the machine at the other end is up."""
 
     def __init__(self, spec: NodeSpec, up: asyncio.Future[bool]) -> None:
         super().__init__(spec)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which processes a launch has: launch itself keeps no list."""
+"""List the processes of a launch; launch itself keeps no list."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from launch.events.process import ShutdownProcess
 
 
 class _Census(ShutdownProcess):
-    """Asks every process action for itself; shuts none of them down."""
+    """Collect every process action; shut down none."""
 
     def __init__(self, found: list[ExecuteLocal]) -> None:
         def note(action: ExecuteLocal) -> bool:
             found.append(action)
-            return False  # not meant for this one
+            return False  # this process is not to be shut down
 
         super().__init__(process_matcher=note)
 
 
 def processes(context: LaunchContext) -> list[ExecuteLocal]:
     """
-    Return every process action that was executed, the robot's own too.
+    Return every process action that was executed, the robot's own included.
 
-    Each has a handler that asks an event's matcher about the action; this one notes it and says
-    no. Handled here and not by the event queue, so that the answer is there at once.
+    Each process action has a handler that asks an event's matcher about the action. The matcher
+    of this event notes the action and does not match. The function calls the handlers itself,
+    because the event queue would deliver the answer later.
     """
     found: list[ExecuteLocal] = []
     census = _Census(found)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Where and on what to run, found out when the launch is executed.
+Choose a region, an image or an instance type when the launch is executed.
 
-Each function returns launch Substitutions and asks nobody; a machine that has one among its
-options asks in a thread, as it comes up. The exception is ``nearest_aws_region_now``.
+Each function returns launch substitutions and makes no request. A machine with such an option
+makes the requests in a thread, when it comes up. The exception is ``nearest_aws_region_now``.
 
-The names and keywords of FogROS2's package ``utils`` are among them, which it calls
-``region_ami_selection`` and ``ec2_instance_type_selection``.
+The names and keywords of FogROS2's package ``utils`` are among them (there
+``region_ami_selection`` and ``ec2_instance_type_selection``).
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
     from launch import SomeSubstitutionsType
 
-#: Argument that stands for the region which answers first.
+#: The value that stands for the region with the fastest response.
 NEAREST = 'nearest'
 
 
 class Choice(Substitution):
     """
-    A value that somebody is asked for when the launch is executed, once.
+    A value that is requested when the launch is executed, once.
 
-    :param what: what it is, for people.
-    :param ask: returns it for ``arguments`` when these are resolved; may take seconds.
+    :param what: description of the value, for messages.
+    :param ask: returns the value for the resolved ``arguments``; may take seconds.
     """
 
     def __init__(self, what: str, ask: Callable[..., str], arguments: Mapping[str, Any]) -> None:
@@ -47,20 +47,20 @@ class Choice(Substitution):
         self._lock = threading.Lock()
 
     def describe(self) -> str:
-        """Return what it will be."""
+        """Return the description of the value."""
         return self._what
 
     def __repr__(self) -> str:
         return f'<{self._what}>'
 
     def later(self, context: LaunchContext) -> words.Later:
-        """Return what asks, in a thread; the arguments are resolved now."""
+        """Resolve the arguments; return the function that requests the value, for a thread."""
         resolved = {
             key: words.resolve_later(context, value) for key, value in self._arguments.items()}
         return functools.partial(self._once, resolved)
 
     def perform(self, context: LaunchContext) -> str:
-        """Ask, and wait for the answer; a machine's options don't come this way."""
+        """Request the value and wait for it; options of machines use :meth:`later` instead."""
         return self.later(context)()
 
     def _once(self, arguments: Mapping[str, Any]) -> str:
@@ -72,23 +72,23 @@ class Choice(Substitution):
 
 def find_nearest_aws_region(regions: Optional[Sequence[SomeSubstitutionsType]] = None) -> Choice:
     """
-    Return the AWS region that a connection reaches first.
+    Choose the AWS region to which a connection opens fastest.
 
-    :param regions: those to choose among; None for all that every account may use.
+    :param regions: candidates; None for all regions that every account may use.
     """
     return Choice('the nearest AWS region', _nearest, {'regions': words.items(regions)})
 
 
 def nearest_aws_region_now(regions: Optional[Sequence[str]] = None) -> str:
     """
-    Return the AWS region that a connection reaches first as a text, and ask for it at once.
+    Measure now, and return the AWS region to which a connection opens fastest, as a string.
 
-    This is the one function that asks when it is called, so ``ros2 launch -s`` measures too,
-    which takes up to five seconds. Where a value of a machine depends on the region, a mapping
-    needs no such call: see :class:`~fogros2.AWSCloudInstance`.
+    This is the only function that makes requests when it is called. So ``ros2 launch -s`` also
+    measures, for up to five seconds. Where another value of a machine depends on the region, a
+    mapping needs no such call: see :class:`~fogros2.AWSCloudInstance`.
 
-    :param regions: those to choose among; None for all that every account may use.
-    :raises ProviderError: no region answers, and this computer's place on the globe is unknown.
+    :param regions: candidates; None for all regions that every account may use.
+    :raises ProviderError: no region answers, and this computer's location is unknown.
     """
     return _nearest(regions)
 
@@ -97,7 +97,7 @@ def find_nearest_region_and_ami(
     regions: Mapping[str, Mapping[str, str]],
 ) -> tuple[Choice, Choice]:
     """
-    Return the nearest of some regions and the image given for it, as FogROS2 has it.
+    Choose the nearest of some regions, and the image that is given for it.
 
     :param regions: by region, such as ``{'us-west-1': {'ami_image': 'ami-0123'}}``.
     """
@@ -116,16 +116,16 @@ def find_cheapest_ec2_instance_type(
     max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
 ) -> Choice:
     """
-    Return the cheapest type of EC2 instance in a region that has what is asked for.
+    Choose the cheapest EC2 instance type of a region that meets the requirements.
 
-    With FogROS2's keywords, or none, it has exactly so many cores and threads as FogROS2 looks
-    for; with those that AWSCloudInstance has it has at least what they say.
+    With FogROS2's keywords, or with none, the type has exactly the cores and threads that FogROS2
+    looks for. With the keywords of AWSCloudInstance, their values are minimums.
 
     :param region_name: such as 'eu-central-1', or 'nearest'.
-    :param cpu_architecture: FogROS2's: 'x86_64' unless said.
-    :param default_cores: FogROS2's: 2 unless said.
-    :param default_threads_per_core: FogROS2's: 1 unless said.
-    :param gpu: whether it has one, how many, or part of the name.
+    :param cpu_architecture: keyword of FogROS2; default 'x86_64'.
+    :param default_cores: keyword of FogROS2; default 2.
+    :param default_threads_per_core: keyword of FogROS2; default 1.
+    :param gpu: True for any GPU, the number of GPUs, or part of the GPU's name.
     :raises ConfigurationError: keywords of both kinds.
     """
     theirs = _said(cpu_architecture=cpu_architecture, default_cores=default_cores,
@@ -148,18 +148,18 @@ def find_cheapest(
     regions: Optional[Sequence[SomeSubstitutionsType]] = None, **wanted: Any,
 ) -> tuple[Choice, Choice]:
     """
-    Return the region and the type of the cheapest EC2 instance that has what is asked for.
+    Choose the region and the type of the cheapest EC2 instance that meets the requirements.
 
-    :param regions: those to choose among; None for all that every account may use.
+    :param regions: candidates; None for all regions that every account may use.
     :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
-        ``gpu_memory_gb``, ``max_price``, ``spot``, as AWSCloudInstance has them.
-    :raises ConfigurationError: another keyword.
+        ``gpu_memory_gb``, ``max_price``, ``spot``, with the meaning of AWSCloudInstance.
+    :raises ConfigurationError: an unknown keyword.
     """
     for name in wanted:
         if name not in _WANTED:
             raise ConfigurationError(f"find_cheapest takes no '{name}'",
                                      f"it takes regions, {', '.join(_WANTED)}")
-    # both are parts of one answer, asked for once
+    # one request answers both
     both = Choice('the cheapest EC2 instance', functools.partial(_cheapest, asked=wanted),
                   {'regions': words.items(regions)})
     return (
@@ -177,7 +177,7 @@ def _said(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-# The provider is loaded when somebody is asked.
+# The provider is imported only when a request is made.
 
 def _nearest(regions: Optional[Sequence[str]]) -> str:
     from fogros2.provider.aws import choices

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CloudGroup: all processes of some part of the launch, on a machine."""
+"""CloudGroup: run all processes of a part of the launch on a machine."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
 
 class CloudGroup(GroupAction):
     """
-    A :class:`launch.actions.GroupAction` whose processes are on a machine.
+    A :class:`launch.actions.GroupAction` whose processes run on a machine.
 
-    Nodes, lifecycle nodes, component containers and ExecuteProcess of its content run there, at
-    any depth and whenever they come: from an included file, a timer, an OpaqueFunction, an event
-    handler. All other actions run here, so configurations, namespaces, parameters and service
-    calls work as in any group. A node with ``machine=``, or another CloudGroup, keeps its own.
+    Nodes, lifecycle nodes, component containers and ExecuteProcess actions of its content run
+    there, at any depth and at any time: also from an included file, a timer, an OpaqueFunction or
+    an event handler. All other actions execute on the robot, so configurations, namespaces,
+    parameters and service calls work as in any group. A node with ``machine=``, or a nested
+    CloudGroup, keeps its own machine.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param actions: the content.
-    :param stream_topics: image topics that cross the VPN encoded, as at Node.
+    :param stream_topics: image topics that cross the VPN encoded, as for Node.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class CloudGroup(GroupAction):
         self._streams: Sequence[Entry] = ()
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action: yields the content, its processes turned into remote ones."""
+        """Execute the group: return its content, with remote processes in place of local ones."""
         if context.is_shutdown:
             return None
         coordinator = Coordinator.of(context)
@@ -60,7 +61,7 @@ class CloudGroup(GroupAction):
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
         if isinstance(entity, Action) and entity.condition is not None and (
                 not entity.condition.evaluate(context)):
-            return  # launch leaves it out
+            return  # launch skips it
         if isinstance(entity, ExecuteLocal) and not isinstance(
                 entity, (RemoteProcess, RobotCarrier)):
             send(entity, self._resolved, self._streams)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Components that are loaded into a container on a machine, and what streamed topics are there."""
+"""Rename streamed topics for components that are loaded into a container on a machine."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from fogros2.actions.coordinator import SomeMachine
     from fogros2.image_transport.streams import Entry
 
-#: Where launch_ros keeps the remappings of SetRemap and of groups.
+#: Launch configurations in which launch_ros keeps remappings (SetRemap) and the namespace.
 _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
 
 
 def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
     """Return whether an entity loads components."""
-    # by name: importing it takes longer than most launches have use for
+    # compare names: importing the class takes longer than a launch without components should
     return any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__)
 
 
@@ -34,9 +34,9 @@ def send(
     context: LaunchContext,
 ) -> None:
     """
-    Have components that an entity loads into a container on a machine use the streams there.
+    Make the components that an entity loads on a machine use the machine's streams.
 
-    :param entity: any other entity stays unchanged.
+    :param entity: changed only if it loads components.
     """
     if not (isinstance(entity, Action) and are_loaded_by(entity)):
         return
@@ -54,13 +54,13 @@ def tell(
     carriers: Callable[[LaunchContext], Sequence[LaunchDescriptionEntity]],
 ) -> None:
     """
-    Have an action that loads components tell them what topics are called on their machine.
+    Make an action that loads components rename the streamed topics for them.
 
-    :param names: returns new names by the full old ones, when the action is executed.
-    :param carriers: adds the components' streams, before that, and returns what carries them.
+    :param names: returns new topic names by full old names, when the action is executed.
+    :param carriers: called before that; adds the components' streams, returns republishers.
     """
     if 'execute' in vars(action):
-        return  # another visit of it
+        return  # an earlier visit has replaced it
     execute = action.execute
 
     def telling(context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
@@ -76,7 +76,7 @@ def tell(
 def _renamed(
     action: Action, context: LaunchContext, names: Mapping[str, str],
 ) -> Iterator[None]:
-    """Rewrite all remappings that the action is about to read, for the time of the block."""
+    """Rewrite the remappings that the action is about to read, for the duration of the block."""
     if not names:
         yield
         return
@@ -85,7 +85,7 @@ def _renamed(
     group: Optional[list[tuple[str, str]]] = configurations.get(_REMAPS)
     components = [component for component in private.components(action)
                   if component.condition() is None or component.condition().evaluate(context)]
-    # Jazzy's are a generator, which can be gone through once
+    # in Jazzy these are generators, which can be read only once
     before = [None if component.remappings is None else list(component.remappings)
               for component in components]
     base = configurations.get(_NAMESPACE) or '/'
@@ -95,8 +95,8 @@ def _renamed(
                     perform_substitutions(context, list(new))) for old, new in rules or ()]
             namespace = absolute(
                 perform_substitutions(context, component.node_namespace or []) or base, base)
-            # those of the group come first and count first, but they are one list for all
-            # components: what they lead to is said once more here
+            # the group's rules come first and win, but launch_ros applies one list to all
+            # components: combine them with each component's own rules here
             pairs = rewrite([*(group or ()), *own], names, namespace)
             private.set_remappings(component, [
                 (normalize_to_list_of_substitutions(old), normalize_to_list_of_substitutions(new))

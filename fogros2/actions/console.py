@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of a deployment in the terminal: a line each, a table at the end."""
+"""Show the steps of a deployment in the terminal: one line each, a table at the end."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _WIDTH = 24
 
 class Console:
     """
-    Takes events from any thread and shows them through launch's logger ``fogros2``.
+    Receive events from any thread and show them through launch's logger ``fogros2``.
 
-    :param stream: where progress is drawn if it is a terminal.
+    :param stream: shows the progress line, if it is a terminal.
     """
 
     def __init__(self, stream: Optional[TextIO] = None) -> None:
@@ -39,7 +39,7 @@ class Console:
         self._drawn = False
         self._live = self._stream.isatty()
         if self._live:
-            # a log line takes the place of the progress line instead of following it
+            # a log line overwrites the progress line instead of following it
             launch.logging.launch_config.get_screen_handler().addFilter(self._before_line)
 
     def __call__(self, event: Event) -> None:
@@ -58,7 +58,7 @@ class Console:
                 self._running.pop((event.machine, event.step), None)
                 what = f'{_where(event.machine)}: {event.step} failed after {event.seconds:.2f} s'
                 if event.fatal:
-                    # the launch ends with the reason: one line of error, not two
+                    # the launch ends with the reason: report the error once
                     self._logger.info(what)
                 else:
                     self._logger.warning(f'{what}: {event.reason}')
@@ -88,7 +88,7 @@ class Console:
             self._logger.info('\n'.join(['steps', *lines]))
 
     def close(self) -> None:
-        """Take the progress line away."""
+        """Remove the progress line."""
         with self._lock:
             self._running.clear()
             self._erase()

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What ties a launch to its machines: one coordinator in each launch context.
+Connect a launch with its machines: one coordinator in each launch context.
 
-Cloud processes register here as launch executes them. When launch has gone through everything
-that is there to execute at that moment, the machines that are new are checked together, before
-any of them is made, then brought up in parallel, in threads. When launch shuts down, by whatever
-cause, it is kept alive until all processes have ended and everything is taken down again.
+Cloud processes register here as launch executes them. When launch has executed everything that
+is due at that moment, the coordinator checks all new machines together, before any exists. Then
+it brings them up in parallel, in threads. When launch shuts down, for whatever reason, the
+coordinator keeps it alive until all processes have ended and the machines are taken down.
 """
 
 from __future__ import annotations
@@ -54,17 +54,17 @@ if TYPE_CHECKING:
     from fogros2.image_transport.streams import Entry
     from fogros2.model import MachineSpec, NodeSpec
 
-    #: What launch files have for a machine; a name may be of one that is mentioned elsewhere.
+    #: A machine in a launch file; a name may be of a machine that is mentioned elsewhere.
     SomeMachine = Union[CloudInstance, SomeSubstitutionsType]
 
-#: Name under which ``context.locals`` has the coordinator.
+#: Name of the coordinator in ``context.locals``.
 _LOCAL = 'fogros2'
-#: More than any launch has machines: each may wait in a thread of its own.
+#: More than any launch has machines: each may block a thread.
 _THREADS = 128
 
 
 class Begin(Event):
-    """Everything that was there to execute has been: machines asked for meanwhile may come up."""
+    """Everything that was due has executed: the machines requested meanwhile may come up."""
 
     name = 'fogros2.Begin'
 
@@ -73,7 +73,7 @@ class Failed(Event):
     """
     The deployment failed.
 
-    Its handler raises the error, which is how a launch ends with a status other than zero.
+    Its handler raises the error, so that ``ros2 launch`` exits with a status other than zero.
     """
 
     name = 'fogros2.Failed'
@@ -87,8 +87,8 @@ class Coordinator:
     """
     The robot's side of a launch, on launch's event loop.
 
-    :param make_launch: makes the deployment (a :class:`fogros2.deploy.Launch`) when the first
-        machine is asked for.
+    :param make_launch: creates the deployment (a :class:`fogros2.deploy.Launch`) for the first
+        machine.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Coordinator:
         make_launch: Optional[Callable[..., Launch]] = None,
     ) -> None:
         self.base_environment: dict[str, str] = {}
-        #: Opens when the cloud is up: True to go on, False to give up.
+        #: Done when the cloud is up (True: start the robot's processes) or never will be (False).
         self.gate: Optional[asyncio.Future[bool]] = None
         self._context = context
         self._make_launch = make_launch or _make_launch
@@ -115,7 +115,7 @@ class Coordinator:
         self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
         self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
-        #: Ends with the launch.
+        #: The watch for uncompressed images, which ends with the launch.
         self._watched: Optional[asyncio.Future[None]] = None
         self._restore_signals: Callable[[], None] = _nothing
         self._logger = launch.logging.get_logger('fogros2')
@@ -127,7 +127,7 @@ class Coordinator:
             EventHandler(
                 matcher=lambda event: isinstance(event, Failed),
                 entities=OpaqueFunction(function=self._on_failed)),
-            # handlers that come later are asked earlier: those of launch files
+            # launch asks the handlers that were registered last first: those of launch files
             EventHandler(
                 matcher=lambda event: isinstance(event, MachineInterrupted),
                 entities=OpaqueFunction(function=self._on_interrupted)),
@@ -137,7 +137,7 @@ class Coordinator:
 
     @classmethod
     def of(cls, context: LaunchContext) -> Coordinator:
-        """Return the context's coordinator, made if there is none yet."""
+        """Return the context's coordinator; create it if there is none."""
         known: Optional[Coordinator] = context.get_locals_as_dict().get(_LOCAL)
         return cls(context) if known is None else known
 
@@ -145,15 +145,15 @@ class Coordinator:
 
     @property
     def launch(self) -> Launch:
-        """The deployment; :meth:`engage` made it."""
+        """The deployment, which :meth:`engage` has created."""
         assert self._launch is not None
         return self._launch
 
     def engage(self) -> None:
         """
-        Note that this launch uses the cloud: from now on its nodes get the DDS environment.
+        Create the deployment; from now on the launch's nodes get the DDS environment.
 
-        :raises FogError: the environment can't be had, such as for an unknown RMW_IMPLEMENTATION.
+        :raises FogError: the environment is unavailable, as for an unknown RMW_IMPLEMENTATION.
         """
         if self._launch is not None:
             return
@@ -162,7 +162,7 @@ class Coordinator:
         self.base_environment = _environment_at_start(context)
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
-        # what the launch file has set so far counts: its ROS_DOMAIN_ID, its RMW_IMPLEMENTATION
+        # includes what the launch file has set so far, such as ROS_DOMAIN_ID
         self._launch = self._make_launch(
             report=self._console, environment=dict(context.environment), cancel=self._cancel)
         self._restore_signals = signals.take_over(context)
@@ -172,16 +172,16 @@ class Coordinator:
 
     def use_dds(self, name: str) -> None:
         """
-        Have all nodes of the launch use a middleware; see :meth:`fogros2.deploy.Launch.use_dds`.
+        Select the middleware of all nodes; see :meth:`fogros2.deploy.Launch.use_dds`.
 
-        :raises DdsError: nodes of the launch use another one already.
+        :raises DdsError: nodes of the launch already use another one.
         """
         self._dds = name
         if self._launch is not None:
             self._launch.use_dds(name)
 
     def know(self, machine: Optional[SomeMachine]) -> None:
-        """Remember a machine that the launch mentions, so that its name may stand for it."""
+        """Remember a machine that the launch mentions, so that nodes can refer to its name."""
         if isinstance(machine, CloudInstance):
             self._instances[machine.name] = machine
 
@@ -189,26 +189,26 @@ class Coordinator:
         self, overrides: Overrides, machines: Iterable[SomeMachine], *, whole: bool,
     ) -> None:
         """
-        Have machines made elsewhere than the launch file says.
+        Create machines elsewhere than the launch file says.
 
-        :param machines: those that the launch is known to have; ``whole`` if there are no others.
+        :param machines: the known machines of the launch; ``whole`` if there are no others.
         """
         self._overrides = overrides
         self._mentioned += machines
         self._whole = whole
-        # what there is no machine for is refused in any case
+        # an override without a machine is refused even if no machine is requested
         self.begin()
 
     def mention(self, machine: Optional[SomeMachine]) -> None:
-        """Remember that the launch has a machine, whether or not it will be asked for."""
+        """Remember that the launch has a machine, even if no process requests it."""
         if machine is not None:
             self._mentioned.append(machine)
 
     def _check_overrides(self, *, early: bool) -> None:
         """
-        Hold the overrides against the machines there are.
+        Check that each override has a machine.
 
-        :param early: as far as all of them are known already.
+        :param early: check only if all machines are already known.
         """
         if self._overrides is None or (early and not self._whole):
             return
@@ -219,14 +219,14 @@ class Coordinator:
             self._overrides.check([name for name in names if name is not None])
 
     def resolve(self, machine: SomeMachine) -> Union[CloudInstance, str]:
-        """Return a machine, or its name resolved."""
+        """Return a machine as it is, or its name resolved."""
         if isinstance(machine, CloudInstance):
             return machine
         return str(words.resolve(self._context, machine))
 
     def on_robot(self, machine: SomeMachine) -> bool:
         """
-        Return whether what is for a machine runs on the robot, where none is to be made.
+        Return whether a machine's processes run on the robot, because its provider is 'robot'.
 
         :raises ConfigurationError: a wrong value, or an unknown name.
         """
@@ -239,7 +239,7 @@ class Coordinator:
         return self._spec(machine).provider == ROBOT
 
     def engage_for(self, machines: Iterable[Optional[SomeMachine]]) -> None:
-        """Engage if one of the machines may have to be made; their names may not be known yet."""
+        """Create the deployment if one of the machines, or an unknown name, needs a provider."""
         if any(self._may_be_made(machine) for machine in machines):
             self.engage()
 
@@ -255,7 +255,7 @@ class Coordinator:
         return machine is None or machine.provider != ROBOT
 
     def _resolved(self, name: Optional[SomeSubstitutionsType]) -> Optional[str]:
-        """Return a name, None while it isn't known."""
+        """Resolve a name; return None if a substitution has no value yet."""
         try:
             resolved: Optional[str] = words.resolve(self._context, name)
         except SubstitutionFailure:
@@ -268,9 +268,9 @@ class Coordinator:
 
     def session(self, machine: SomeMachine) -> Session:
         """
-        Return the session of a machine, which comes up soon if this is the first to ask for it.
+        Return the session of a machine; the first call for a machine schedules its creation.
 
-        :raises ConfigurationError: a wrong value, an unknown name, or a name used twice.
+        :raises ConfigurationError: a wrong value, an unknown name, or a duplicate name.
         """
         self.engage()
         machine = self.resolve(machine)
@@ -299,9 +299,9 @@ class Coordinator:
         """
         Stream topics between the robot and every machine of the launch.
 
-        :param entries: resolved when a machine's process executes.
-        :param namespace: the one that relative names are in.
-        :raises ConfigurationError: an unknown transport, or no topic.
+        :param entries: streams, resolved when a machine's process executes.
+        :param namespace: namespace of relative names.
+        :raises ConfigurationError: an unknown transport, or an invalid topic.
         """
         streaming.check(entries)
         if entries:
@@ -311,10 +311,10 @@ class Coordinator:
         self, entries: Iterable[Entry], session: Session,
     ) -> list[tuple[Optional[str], NodeSpec]]:
         """
-        Stream topics to and from a machine, besides what all machines stream.
+        Stream topics to and from a machine, in addition to the streams of all machines.
 
-        :return: the nodes it takes that aren't there yet, with their machine, None for the robot.
-        :raises ConfigurationError: an unknown transport, or streams that contradict each other.
+        :return: the new nodes that this needs, each with its machine, None for the robot.
+        :raises ConfigurationError: an unknown transport, or contradictory streams.
         """
         wanted: list[Entry] = []
         for everywhere, namespace in self._stream_everywhere:
@@ -331,14 +331,14 @@ class Coordinator:
         return new
 
     def begin(self) -> None:
-        """Go on once launch has executed all that is there to execute now."""
+        """Emit :class:`Begin`; launch handles it after everything that is due has executed."""
         if self._begun:
             self._begun = False
-            # events are handled after what launch is visiting, and not after its failure
+            # launch handles events after its current visit, and not if that visit fails
             self._context.emit_event_sync(Begin())
 
     def hold(self) -> asyncio.Future[bool]:
-        """Return the gate, closed from now on until the cloud is up."""
+        """Return the gate; from now on it is closed until the cloud is up."""
         if self.gate is None:
             self.gate = self._context.asyncio_loop.create_future()
             self.begin()
@@ -348,7 +348,7 @@ class Coordinator:
 
     def _by_name(self, name: str) -> CloudInstance:
         for known, instance in list(self._instances.items()):
-            # a name that was a substitution reads otherwise once it is resolved
+            # a resolved name differs from the key of a name that was a substitution
             if name in (known, instance.name):
                 return instance
         raise ConfigurationError(
@@ -361,7 +361,7 @@ class Coordinator:
         environment = self.launch.robot_environment()
         for kept in (self._context.environment, *private.kept_environments(self._context)):
             kept.update(environment)
-        # what the launch sets for the robot isn't the launch file's change, and doesn't travel
+        # these are not changes of the launch file, so they must not be sent to machines
         self.base_environment.update(environment)
         for action in census.processes(self._context):
             details, ended = action.process_details, private.completed(action)
@@ -370,7 +370,7 @@ class Coordinator:
             if details['env'].items() >= environment.items():
                 continue
             if details.get('pid') is None:
-                # executed, but not started before launch gets back to its event loop
+                # executed; starts when launch returns to its event loop
                 details['env'].update(environment)
             elif details['name'] not in self._late:
                 self._late.add(details['name'])
@@ -412,7 +412,7 @@ class Coordinator:
                 self._crossing_images, self._logger.warning, self._cancel)
 
     def _crossing_images(self) -> list[str]:
-        # the launch may add a machine meanwhile: this runs in a thread
+        # copied, because this runs in a thread and the launch may add machines
         machines = {name: session.node_names() for name, session in list(self._sessions.items())}
         return uncompressed.crossing_images(
             machines, {**self._context.environment, **self.launch.robot_environment()},
@@ -422,13 +422,13 @@ class Coordinator:
         try:
             running = await self._in_thread(self.launch.up, session.spec)
         except FogError as error:
-            # at once, though other machines are still on their way
+            # end the launch at once, although other machines are still coming up
             self._fail(error)
             return
         session.up(running)
 
     def _raise_in_launch(self, task: asyncio.Task[None]) -> None:
-        # asking one that was cancelled for its error raises, and what should follow wouldn't
+        # ``exception()`` of a cancelled task raises
         error = None if task.cancelled() else task.exception()
         if error is not None:
             self._fail(error)
@@ -439,7 +439,7 @@ class Coordinator:
         if not self._new and all(session.ready for session in self._sessions.values()):
             self.gate.set_result(True)
 
-    # -- a machine is taken away ----------------------------------------------------------------
+    # -- a machine is preempted -----------------------------------------------------------------
 
     def _taken_away(self, session: Session, reason: str) -> None:
         if not self._context.is_shutdown:
@@ -450,7 +450,7 @@ class Coordinator:
         session = self._sessions.get(context.locals.event.machine)
         if session is None or context.is_shutdown:
             return []
-        # which needs this module
+        # imports this module
         from fogros2.actions.remote import carrier_on
         new = interruption.react(
             context.locals.event, session, self._streams, context, self._logger)
@@ -466,7 +466,7 @@ class Coordinator:
 
     def _fail(self, error: BaseException) -> None:
         if isinstance(error, Cancelled):
-            return  # the launch is ending; that is what cancelled it
+            return  # the shutdown of the launch has caused it
         self._context.emit_event_sync(Failed(error))
 
     def _on_failed(self, context: LaunchContext) -> None:
@@ -487,7 +487,7 @@ class Coordinator:
         context.add_completion_future(self._down)
 
     async def _take_down(self) -> None:
-        # the VPN's interface must not go from under a node that runs
+        # the VPN interface must stay while a node runs
         sessions = self._sessions.values()
         futures = [private.completed(action) for action in census.processes(self._context)]
         await _all_done({
@@ -518,17 +518,17 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
 
 
 def _nothing() -> None:
-    """Undo nothing."""
+    """Do nothing."""
 
 
 def _make_launch(**arguments: Any) -> Launch:
-    # not before a machine is asked for: it brings SSH along
+    # imported for the first machine: it imports the SSH shell
     from fogros2.deploy import Launch
     return Launch(**arguments)
 
 
 def _environment_at_start(context: LaunchContext) -> dict[str, str]:
-    """Return the environment that the launch was started in, by the actions that reset to it."""
+    """Return the environment in which the launch was started, as ResetEnvironment restores it."""
     PushEnvironment().execute(context)
     ResetEnvironment().execute(context)
     environment = dict(context.environment)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a launch has cost, as its last words; pure."""
+"""Format the cost of a launch, for its last log lines; pure."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from decimal import Decimal
 
 def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
     """
-    Return a line for each machine, and for several one with the sum.
+    Return a line for each machine, and a line with the sum of several.
 
-    :param machines: name, US dollars an hour, seconds.
+    :param machines: name, US dollars per hour, seconds.
     """
     found = []
     total = Decimal(0)
@@ -26,15 +26,15 @@ def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
 
 
 def hours(seconds: float) -> str:
-    """Return a time in hours, as prices are for hours; of a short one what is worth telling."""
+    """Format a time in hours, the unit of prices; a short time with two significant digits."""
     return f'{_plain(Decimal(seconds) / 3600, below=Decimal("0.1"))} h'
 
 
 def dollars(cost: Decimal) -> str:
-    """Return US dollars to the cent; of a few cents what is worth telling."""
+    """Format US dollars with two decimals; a small sum with two significant digits."""
     return _plain(cost, below=Decimal('0.1'))
 
 
 def _plain(value: Decimal, *, below: Decimal) -> str:
-    # two digits that aren't zero, and no exponent
+    # two significant digits, without an exponent
     return f'{Decimal(f"{value:.2g}"):f}' if 0 < value < below else f'{value:.2f}'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FogMachine: a machine as an action, for launch files that have nothing but actions."""
+"""FogMachine: a machine as an action, for XML and YAML, which contain only actions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 class FogMachine(Action):
     """
-    A machine that nodes name after this action was executed.
+    A machine to which nodes can refer by name after this action was executed.
 
-    :param provider: 'container', 'ssh', 'aws', 'kubernetes' or another that is installed; 'robot'
-        runs what is meant for the machine here.
-    :param given: keywords of that provider's class. Where the provider is a substitution, those
-        that it doesn't have may be empty texts.
-    :param containers: keywords of ``add_docker_container``, each for one container there.
-    :raises ConfigurationError: what is plain is wrong.
+    :param provider: 'container', 'ssh', 'aws', 'kubernetes' or another installed provider; 'robot'
+        runs the machine's nodes on the robot.
+    :param given: keywords of that provider's class. If the provider is a substitution, keywords
+        that its class lacks may be empty strings.
+    :param containers: keywords of ``add_docker_container``, one mapping for each container.
+    :raises ConfigurationError: a value that is known already is wrong.
     """
 
     def __init__(
@@ -37,13 +37,13 @@ class FogMachine(Action):
         self._provider = provider
         self._given = dict(given)
         self._containers = list(containers)
-        #: The machine, None while its provider isn't known.
+        #: The machine; None until the provider is resolved.
         self.machine: Optional[CloudInstance] = None
         if isinstance(provider, str):
             self.machine = keywords.make(provider, self._given)
 
     def execute(self, context: LaunchContext) -> None:
-        """Execute the action: from now on the machine's name stands for it."""
+        """Create the machine's description, and register its name with the launch."""
         if self.machine is None:
             provider = words.resolve(context, self._provider)
             known = keywords.keywords(keywords.machine_class(provider))
@@ -53,7 +53,7 @@ class FogMachine(Action):
         for container in self._containers:
             self.machine.add_docker_container(**{
                 name: words.resolve(context, value) for name, value in container.items()})
-        # its name may be a substitution, and is to be found resolved
+        # resolves the name, so that nodes can refer to it
         self.machine.spec(context)
         Coordinator.of(context).know(self.machine)
 

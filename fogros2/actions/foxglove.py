@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Foxglove: a machine's topics in a browser."""
+"""Foxglove: show the topics of a machine in a browser."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ if TYPE_CHECKING:
 
 #: Seconds before a bridge that ended is started again.
 _RESPAWN = 2.0
-#: The agent's folder, as processes on a machine know it.
+#: The agent's folder, as a process on the machine sees it.
 _AGENT = '$FOGROS2_AGENT_DIRECTORY'
 
 
 class Foxglove(Action):
     """
-    Serves the topics that a machine sees to Foxglove, or Lichtblick, in a browser.
+    Serve the topics that a machine sees to Foxglove or Lichtblick in a browser.
 
-    The bridge listens on the machine's loopback and in the VPN, and lets in who has its token.
-    That is printed by ``ros2 fog monitor``, for the robot and all who may enter the machine. A
-    machine that turns out to be the robot itself serves on its loopback alone.
+    The bridge listens on the machine's loopback interface and in the VPN, and admits clients with
+    its token. ``ros2 fog monitor`` prints the token, on the robot and for users who may log in to
+    the machine. If the machine is the robot itself, the bridge listens on its loopback only.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param topics: patterns (``*``, ``?``) of the topics to show.
-    :param port: TCP port; the two after it are for others than the robot, and the application.
-    :param monitor_allow: networks (CIDR) from which others than the robot get in, at the port
-        after that one, over TLS and with the token; through the provider's firewall, where it has
-        one. The machine itself turns all others away.
-    :param image: container image of the web application, served at the same port where the machine
-        can run it; '' for none.
-    :raises ConfigurationError: no port, no pattern, or no network.
+    :param port: TCP port; the next two ports serve external clients and the web application.
+    :param monitor_allow: networks (CIDR) of external clients, which connect to the port after
+        that one by TLS and with the token. The launch opens the port in the provider's firewall,
+        if there is one. The machine itself refuses other addresses.
+    :param image: container image of the web application, which is served at the same port if the
+        machine can run containers; '' for none.
+    :raises ConfigurationError: an invalid port, pattern or network.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Foxglove(Action):
             _port(port)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Start the bridge as soon as the machine is up, and say where it is once it runs."""
+        """Start the bridge when the machine is up, and log its address when it runs."""
         coordinator = Coordinator.of(context)
         port = _port(words.resolve(context, self._port))
         topics = [words.resolve(context, topic) for topic in self._topics]
@@ -101,7 +101,7 @@ class Foxglove(Action):
     def _on_robot(
         self, coordinator: Coordinator, port: int, topics: Sequence[str],
     ) -> list[LaunchDescriptionEntity]:
-        """Serve what the robot sees, on its loopback; the token goes with the launch."""
+        """Serve the robot's topics on its loopback; delete the token when the launch ends."""
         machine = coordinator.resolve(self.machine)
         name = machine if isinstance(machine, str) else machine.name
         folder = addresses.on_robot(Store(), name)
@@ -132,8 +132,8 @@ def _bridge(
     return NodeSpec(
         id=f'foxglove-{where}-{port}', name='foxglove_bridge', package=package,
         executable=executable, respawn=True, respawn_delay=_RESPAWN,
-        # a stream is called for it as for a machine's nodes: who looks at its images would have
-        # them come from the robot otherwise, raw
+        # with ROS arguments the bridge gets the renamed topics of streams, as the machine's nodes
+        # do; otherwise its images would cross the VPN from the robot uncompressed
         arguments=('--name', where, '--listen', f'127.0.0.1:{port}', *options,
                    *(word for topic in topics for word in ('--topic', topic)), '--ros-args'))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine that its provider takes away: what launch files learn of it, and what is done."""
+"""Handle the preemption of a machine: emit an event, and move its nodes or end the launch."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 class MachineInterrupted(Event):
     """
-    The provider takes a machine of the launch away, or has; emitted once for each.
+    The provider reclaims a machine of the launch, or has done so; emitted once for each machine.
 
-    Handlers see it before the machine's ``on_interrupt`` has its effect::
+    Handlers see it before the machine's ``on_interrupt`` takes effect::
 
         RegisterEventHandler(EventHandler(
             matcher=lambda event: isinstance(event, MachineInterrupted),
             entities=[LogInfo(msg='on our own from now on')]))
 
-    :param machine: its name.
-    :param reason: in the provider's words.
-    :param lost: whether it is gone already; False while it runs for some time still.
+    :param machine: the machine's name.
+    :param reason: the provider's explanation.
+    :param lost: True if the machine is gone; False if it still runs for some time.
     """
 
     name = 'fogros2.MachineInterrupted'
@@ -49,11 +49,11 @@ def react(
     logger: logging.Logger,
 ) -> list[tuple[Optional[str], NodeSpec]]:
     """
-    Do what the machine's ``on_interrupt`` says.
+    Apply the machine's ``on_interrupt``.
 
-    :param streams: of the launch; those of this machine end, or are the robot's from now on.
+    :param streams: the launch's streams; those of this machine end or move to the robot.
     :returns: nodes of streams to start, each with its machine, None for the robot.
-    :raises ProviderError: to end the launch.
+    :raises ProviderError: ends the launch.
     """
     what = (f"the machine '{event.machine}' "
             f'{"is gone" if event.lost else "is being taken away"}: {event.reason}')

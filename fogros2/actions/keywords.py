@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the machines' constructors take, for those who write texts: XML, YAML, the command line.
+Read the keywords of the machines' constructors from text: XML, YAML, the command line.
 
-The constructors' annotations say of what kind a value is, so a provider's keyword is an attribute
-without a line of its own here.
+The annotations of a constructor give the kind of each value, so a keyword of a provider becomes
+an attribute without any code here.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from fogros2.actions import words
 from fogros2.actions.machines import CloudInstance
 from fogros2.errors import ConfigurationError, did_you_mean
 
-#: Entry points that name the machines' classes, by provider.
+#: Entry point group of the machines' classes, by provider.
 GROUP = 'fogros2.machine'
-#: Stands for no machine at all: the nodes run on this computer.
+#: The provider name for no machine: the nodes run on this computer.
 ROBOT = 'robot'
 
 Kind = Literal[
     'text', 'number', 'truth', 'scalar', 'list', 'mapping', 'text or mapping', 'table']
 
-#: What the annotations name that exists for type checkers alone.
+#: Names in annotations that exist only for type checkers.
 _NAMES: dict[str, Any] = {
     'SomeSubstitutionsType': str, 'Value': Union[str, int, float], 'Truth': Union[bool, str],
     'ByRegion': Union[str, Mapping[str, str]],
 }
-#: Parameters that are not for launch files.
+#: Parameters that launch files cannot set.
 _NOT_MEANT = ('self', 'return', 'options', 'unknown', 'common')
 
 
@@ -43,8 +43,8 @@ class Keyword:
     """
     One keyword of a constructor.
 
-    :param columns: of a table: what each row has, by name.
-    :param needed: whether the constructor can't do without.
+    :param columns: for a table, the kind of each column by name.
+    :param needed: whether the constructor requires the keyword.
     """
 
     name: str
@@ -54,13 +54,13 @@ class Keyword:
 
 
 class Robot(CloudInstance):
-    """No machine: what is meant for it runs on the robot, and nothing is made."""
+    """No machine: its nodes run on the robot, and nothing is created."""
 
     provider = ROBOT
 
 
 def providers() -> list[str]:
-    """Return the names of all providers, and the one that stands for none."""
+    """Return the names of all providers, and 'robot'."""
     return sorted([*plugin_system.names(GROUP), ROBOT])
 
 
@@ -68,7 +68,7 @@ def machine_class(provider: str) -> type[CloudInstance]:
     """
     Return the class of a provider's machines.
 
-    :raises ConfigurationError: there is none; the hint has the nearest, and all.
+    :raises ConfigurationError: no such provider; the hint names the nearest one and all.
     """
     if provider == ROBOT:
         return Robot
@@ -80,7 +80,7 @@ def machine_class(provider: str) -> type[CloudInstance]:
 
 
 def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
-    """Return what a class of machines takes, by name; its own keywords come first."""
+    """Return the keywords of a machine class by name; its own come before inherited ones."""
     found: dict[str, Keyword] = {}
     for base in cls.__mro__:
         if '__init__' not in vars(base) or not issubclass(base, CloudInstance):
@@ -93,9 +93,9 @@ def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
 
 def parameters_of(function: Callable[..., Any]) -> dict[str, Keyword]:
     """
-    Return what a function or a constructor takes, by name.
+    Return the keywords of a function or a constructor by name.
 
-    :raises ConfigurationError: an annotation names what isn't there to tell.
+    :raises ConfigurationError: an annotation uses a name that cannot be imported.
     """
     try:
         hints = get_type_hints(function, localns=_NAMES)
@@ -121,7 +121,7 @@ def _kind(hint: Any) -> tuple[Kind, Mapping[str, Kind]]:
         if issubclass(get_origin(option), Mapping):
             return ('text or mapping' if str in options else 'mapping'), {}
         if str in options:
-            continue  # one text, or its parts
+            continue  # a text, or a list of its parts
         if isinstance(item, type) and issubclass(item, dict):
             return 'table', {name: _kind(one)[0] for name, one in get_type_hints(item).items()}
         return 'list', {}
@@ -141,9 +141,9 @@ def _options(hint: Any) -> Iterable[Any]:
 
 def read(keyword: Keyword, text: str) -> Any:
     """
-    Return a plain text as the value that the constructor takes.
+    Convert text to the value that the constructor expects.
 
-    :raises ConfigurationError: it is of another kind.
+    :raises ConfigurationError: the text does not fit the keyword's kind.
     """
     try:
         return _read(keyword, text)
@@ -167,7 +167,7 @@ def _read(keyword: Keyword, text: str) -> Any:
 
 
 def number(text: str) -> Union[int, float, str]:
-    """Return the number in a text, the text itself where there is none, such as '8h'."""
+    """Return the number in a text, or the text itself if it is no number, such as '8h'."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -177,7 +177,7 @@ def number(text: str) -> Union[int, float, str]:
 
 
 def _nested(keyword: Keyword, text: str) -> Any:
-    """Return a mapping, or a table's rows, of YAML's: ``{a: b}``, ``[{key: gpu}]``."""
+    """Parse a YAML mapping, or the rows of a table: ``{a: b}``, ``[{key: gpu}]``."""
     found = words.read_yaml(text)
     if keyword.kind != 'table':
         if isinstance(found, dict) and all(isinstance(one, str) for one in found.values()):
@@ -190,9 +190,9 @@ def _nested(keyword: Keyword, text: str) -> Any:
 
 def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return a table's row with its values in their kinds.
+    Convert the values of a table's row to their kinds.
 
-    :raises ConfigurationError: it has a column that the table hasn't.
+    :raises ConfigurationError: the table has no such column.
     """
     for name in row:
         if name not in keyword.columns:
@@ -203,10 +203,10 @@ def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
 
 def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
     """
-    Return a machine's description.
+    Create a machine's description.
 
-    :param given: its constructor's keywords.
-    :raises ConfigurationError: no such provider or keyword, a wrong value, or one lacks.
+    :param given: keywords of its constructor.
+    :raises ConfigurationError: an unknown provider or keyword, a wrong value, or a missing one.
     """
     cls = machine_class(provider)
     known = keywords(cls)
@@ -224,9 +224,9 @@ def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
 @contextlib.contextmanager
 def refused(cls: type[Any]) -> Iterator[None]:
     """
-    Name the nearest keyword where a constructor that the block calls knows none of that name.
+    Replace the error of an unexpected keyword by one that names the nearest keyword.
 
-    :param cls: the class; launch's actions hand on keywords from class to class.
+    :param cls: the class; launch's actions pass keywords on to their base classes.
     """
     try:
         yield
@@ -240,5 +240,5 @@ def refused(cls: type[Any]) -> Iterator[None]:
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> ConfigurationError:
-    """Return the error for a name that there isn't, with the nearest that there is."""
+    """Return the error for an unknown name, with the nearest known one in its hint."""
     return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(known)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FogROSLaunchDescription: a launch description that has the whole picture."""
+"""FogROSLaunchDescription: a launch description that knows all of its machines."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fogros2.actions.coordinator import SomeMachine
     from fogros2.image_transport.streams import Entry
 
-#: What only sets something for what comes after it.
+#: Entities that only set something for the entities after them.
 _SETTINGS = (
     AppendEnvironmentVariable, DeclareLaunchArgument, FogMachine, LogInfo,
     SetEnvironmentVariable, SetLaunchConfiguration, UnsetEnvironmentVariable,
@@ -48,12 +48,12 @@ class FogROSLaunchDescription(LaunchDescription):
     """
     A :class:`launch.LaunchDescription` whose robot nodes wait for its cloud.
 
-    :param robot_nodes: 'after_cloud' starts the processes and timers of the robot when the
-        machines are up and their nodes run; 'immediately' starts them at once. Everything is
-        executed in its order either way: only the start of a process waits.
-    :param stream_topics: image topics that cross the VPN encoded, as at Node, between the
+    :param robot_nodes: 'after_cloud' starts the robot's processes and timers when the machines
+        are up and their nodes run; 'immediately' starts them at once. In both cases launch
+        executes all actions in their order: only the start of a process waits.
+    :param stream_topics: image topics that cross the VPN encoded, as for Node, between the
         robot and every machine of the launch.
-    :param dds: the middleware of all nodes, such as 'fastdds', in RMW_IMPLEMENTATION's place.
+    :param dds: the middleware of all nodes, such as 'fastdds'; replaces RMW_IMPLEMENTATION.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class FogROSLaunchDescription(LaunchDescription):
         self.dds = dds
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Visit the content; its robot processes wait for the cloud."""
+        """Visit the content; make its robot processes wait for the cloud."""
         entities = super().visit(context)
         if context.is_shutdown or entities is None:
             return entities
@@ -86,17 +86,18 @@ class FogROSLaunchDescription(LaunchDescription):
         cloudy: list[SomeMachine] = []
         for entity, certain in cloud_entities(self.entities):
             if isinstance(entity, FogMachine):
-                # of several with one name, the one whose condition holds makes itself known
+                # of several with the same name, the one whose condition holds registers itself
                 coordinator.know(entity.machine if certain else None)
                 continue
             coordinator.know(entity.machine)
-            # what comes late, from a timer, is refused before a machine is made all the same
+            # streams of a process that executes late are checked before a machine is created
             streaming.check(getattr(entity, 'stream_topics', ()))
             if certain:
                 cloudy.append(entity.machine)
         if cloudy:
-            # the first cloud process may come late, from a timer; the nodes here, launch's own
-            # among them, need the DDS settings before they begin. What is set first counts.
+            # the first cloud process may execute late, from a timer, but nodes here, launch's own
+            # included, need the DDS settings before they start. Settings that come first, such as
+            # ROS_DOMAIN_ID, have to be applied before that.
             first = next((number for number, entity in enumerate(entities)
                           if not isinstance(entity, _SETTINGS)), len(entities))
             engage = OpaqueFunction(function=lambda context: coordinator.engage_for(cloudy))
@@ -110,7 +111,7 @@ class FogROSLaunchDescription(LaunchDescription):
 def has_machine(
     entity: LaunchDescriptionEntity,
 ) -> TypeGuard[Union[RemoteProcess, CloudGroup, FogMachine]]:
-    """Return whether an entity is for a machine, or is one."""
+    """Return whether an entity is a machine, or has one."""
     return isinstance(entity, (RemoteProcess, CloudGroup, FogMachine))
 
 
@@ -118,9 +119,9 @@ def cloud_entities(
     entities: Iterable[LaunchDescriptionEntity], certain: bool = True,
 ) -> Iterator[tuple[Union[RemoteProcess, CloudGroup, FogMachine], bool]]:
     """
-    Yield what of these entities, at any depth, is for a machine; no file is read for it.
+    Yield the entities that belong to a machine, at any depth, without reading files.
 
-    The flag tells that no condition stands before it: it will be executed, or can be by an event.
+    The flag is True if no condition precedes the entity: it executes, or an event can execute it.
     """
     for entity in entities:
         sure = certain and getattr(entity, 'condition', None) is None
@@ -136,7 +137,7 @@ def cloud_entities(
 def _hold(
     coordinator: Coordinator, entity: LaunchDescriptionEntity, context: LaunchContext,
 ) -> None:
-    """Have a robot process, or a timer, start only when the cloud is up."""
+    """Make a robot process or a timer wait until the cloud is up."""
     if isinstance(entity, RemoteProcess):
         return
     if isinstance(entity, ExecuteLocal):

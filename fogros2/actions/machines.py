@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What launch files call machines: thin constructors of a MachineSpec that ask nobody."""
+"""Machines in launch files: constructors that describe a MachineSpec and make no request."""
 
 from __future__ import annotations
 
@@ -40,37 +40,37 @@ _DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 
 class CloudInstance:
     """
-    A machine that a launch asks for; base of one class per provider.
+    A machine that a launch requests; the base class of one class for each provider.
 
-    Building one asks nobody and costs nothing: the machine is made when the first of its nodes
-    is executed. Values may be launch substitutions, resolved at that time.
+    The constructor makes no request and costs nothing. The launch creates the machine when it
+    executes the machine's first node, and resolves substitutions in the values at that time.
 
-    :param ros_workspace: colcon workspace that travels; None for the one whose install space
-        comes first in COLCON_PREFIX_PATH (or AMENT_PREFIX_PATH), '' for none.
-    :param working_dir_base: taken for FogROS2's launch files; only :meth:`info` shows it. What is
-        known of machines is kept below FOGROS2_STATE_HOME.
+    :param ros_workspace: colcon workspace that is sent to the machine; None for the one whose
+        install space comes first in COLCON_PREFIX_PATH (or AMENT_PREFIX_PATH), '' for none.
+    :param working_dir_base: accepted for FogROS2's launch files; only :meth:`info` shows it. The
+        records of machines are below FOGROS2_STATE_HOME.
     :param launch_foxglove: serve the machine's topics to Foxglove.
     :param name: up to 40 lower-case letters, digits and hyphens, unique on this robot; without
-        one each launch makes up its own.
-    :param on_exit: what becomes of the machine when the launch ends: 'delete', 'stop' or 'keep'.
-        One that stays needs a name, or nobody would find it again.
-    :param lifetime: when the machine ends by itself, in seconds or as '8h', '1d12h'.
-    :param robot_timeout: how long the launch may be silent before the machine stops its nodes;
+        a name, each launch invents one.
+    :param on_exit: what happens to the machine when the launch ends: 'delete', 'stop' or 'keep'.
+        With 'stop' and 'keep' a name is required, so that a later launch finds the machine.
+    :param lifetime: time until the machine ends by itself, in seconds or as '8h', '1d12h'.
+    :param robot_timeout: time without contact to the launch until the machine stops its nodes;
         seconds or as above.
-    :param bootstrap: how ROS 2 gets there: 'auto', 'apt', 'embedded', 'none'.
+    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
-        of folders come before the machine's own.
-    :param apt: Debian packages that the machine has to have, such as 'libzbar0'.
-    :param pip: Python packages that it has to have, as pip takes them ('pyzbar>=0.1.9'). They lie
-        behind the system's own: a package that both have is the system's.
-    :param on_interrupt: when the provider takes the machine away while its nodes run: 'shutdown'
-        ends the launch, with an exit status other than zero; 'robot' starts them anew on the
-        robot, which has to have their programs: with the same names and parameters, without
-        what they had in memory, a lifecycle state, or components that were loaded.
-    :param monitor_allow: networks (CIDR) from which others than the robot may watch: the bridge
-        to Foxglove is there for them as well, over TLS and with a token.
-    :param options: the provider's own settings, for subclasses to give.
-    :raises ConfigurationError: an unknown keyword (with the nearest one), or a wrong value.
+        of folders are prepended to the machine's own.
+    :param apt: Debian packages that the machine needs, such as 'libzbar0'.
+    :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
+        system has the same package, the system's version is used.
+    :param on_interrupt: what to do when the provider reclaims the machine while its nodes run.
+        'shutdown' ends the launch with a nonzero exit status. 'robot' restarts the nodes on the
+        robot, where their programs must be installed. They keep names and parameters, and lose
+        their memory: lifecycle states and loaded components.
+    :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
+        bridge, by TLS and with a token.
+    :param options: the provider's own options; subclasses set it.
+    :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
     """
 
     #: Name of the entry point in the group ``fogros2.provider``.
@@ -115,7 +115,7 @@ class CloudInstance:
         self._packages = {'apt': _packages('apt', apt), 'pip': _packages('pip', pip)}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
-        # what is plain is checked where it is written
+        # values that are known already are checked where they are written
         for key, value in self._options.items():
             with _named(key):
                 words.check_plain(value)
@@ -143,24 +143,24 @@ class CloudInstance:
 
     @property
     def name(self) -> str:
-        """The machine's name; described only, while it is a substitution not yet resolved."""
+        """The machine's name; a description while it is an unresolved substitution."""
         if self._spec is not None:
             return self._spec.name
         return words.describe(self._name)
 
     @property
     def own_name(self) -> SomeSubstitutionsType:
-        """The name as the launch file has it."""
+        """The name as the launch file gives it."""
         return self._name
 
     @property
     def ip(self) -> Optional[str]:
-        """The address the robot reaches the machine at, None while it isn't up."""
+        """The address at which the robot reaches the machine, None until the machine is up."""
         return self._running.machine.vpn_host if self._running else None
 
     @property
     def vpn_ip(self) -> Optional[str]:
-        """The machine's address in the VPN, None while it isn't up."""
+        """The machine's address in the VPN, None until the machine is up."""
         return self._running.vpn_address if self._running else None
 
     @property
@@ -170,9 +170,9 @@ class CloudInstance:
 
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
         """
-        Return what is known of the machine, with FogROS2's keys.
+        Return what is known about the machine, with FogROS2's keys.
 
-        :param flush_to_disk: taken for FogROS2's launch files; the store has it on disk already.
+        :param flush_to_disk: accepted for FogROS2's launch files; the record is on disk already.
         """
         shell = self._running.machine.shell if self._running else None
         return {
@@ -189,19 +189,19 @@ class CloudInstance:
 
     def apt_install(self, args: str) -> None:
         """
-        Have the machine install Debian packages before its nodes start, as ``apt=`` does.
+        Install Debian packages on the machine before its nodes start, as ``apt=`` does.
 
-        :param args: their names, with spaces between them.
-        :raises ConfigurationError: one is no package's name.
+        :param args: package names, separated by spaces.
+        :raises ConfigurationError: an invalid package name.
         """
         self._packages['apt'] += _packages('apt', shlex.split(args))
 
     def pip_install(self, args: str) -> None:
         """
-        Have the machine install Python packages before its nodes start, as ``pip=`` does.
+        Install Python packages on the machine before its nodes start, as ``pip=`` does.
 
-        :param args: requirements, with spaces between them.
-        :raises ConfigurationError: one is no requirement, or is part of FogROS2.
+        :param args: requirements, separated by spaces.
+        :raises ConfigurationError: an invalid requirement, or a package that FogROS2 contains.
         """
         self._packages['pip'] += _packages('pip', shlex.split(args))
 
@@ -209,16 +209,16 @@ class CloudInstance:
         self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
     ) -> None:
         """
-        Run a container on the machine from before its nodes start until they have ended.
+        Run a container on the machine, from before its nodes start until they have ended.
 
-        Its nodes hear the launch's: unless the options say otherwise it has the machine's network
-        and the variables and configuration of the middleware.
+        ROS nodes in the container communicate with the launch's nodes: by default the container
+        uses the machine's network and the variables and configuration of the middleware.
 
         :param cmd: a ``docker run`` command line.
-        :param image: instead of that, the container's image, with any of ``command``, ``ports``,
-            ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see
+        :param image: instead of ``cmd``, the container's image, with any of ``command``,
+            ``ports``, ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see
             :func:`fogros2.containers.described`.
-        :raises ConfigurationError: it is neither, or both.
+        :raises ConfigurationError: neither or both were given.
         """
         if bool(cmd) == bool(image) or cmd and parts:
             raise ConfigurationError(
@@ -239,17 +239,17 @@ class CloudInstance:
         self.takes_containers()
 
     def takes_containers(self) -> None:
-        """Note that containers will run on the machine."""
+        """Note that containers will run on the machine; a provider's class may override it."""
 
     def is_up(self, running: RunningMachine) -> None:
-        """Note that the machine is up; called by the launch."""
+        """Note that the machine is up; the launch calls this."""
         self._running = running
 
     def spec(self, context: LaunchContext) -> MachineSpec:
         """
-        Resolve everything, once, and return the description that the core works with.
+        Resolve all values, once; return the machine's spec.
 
-        :raises ConfigurationError: a value is wrong.
+        :raises ConfigurationError: a wrong value.
         """
         if self._spec is None:
             values = {
@@ -291,7 +291,7 @@ class CloudInstance:
             return words.resolve_later(context, value)
 
     def _option(self, name: str) -> Any:
-        """Return an option: as it was resolved, or what is to be read of it until then."""
+        """Return an option: resolved if the machine is up, else its plain value or description."""
         if self._running is not None:
             return self._running.spec.options.get(name)
         value = (self._spec.options if self._spec else self._options).get(name)
@@ -300,26 +300,26 @@ class CloudInstance:
 
 class ContainerInstance(CloudInstance):
     """
-    A container on this computer that behaves like a cloud machine of its own.
+    A container on this computer that behaves like a separate cloud machine.
 
-    :param image: what it is made of; None for this computer's own root, seen through an
-        allow-list (podman alone).
-    :param isolated: give it the root of a new system of this computer's release, made once by
-        debootstrap, in place of this computer's own: it has none of the packages that are
-        installed here, as a new machine in a cloud.
+    :param image: its container image; None for this computer's own root file system, restricted
+        by an allow-list (podman only).
+    :param isolated: use the root file system of a new installation of this computer's release
+        instead, created once by debootstrap. Like a new machine in a cloud, it has none of the
+        packages that are installed on this computer.
     :param engine: 'podman' or 'docker'; None for the one that works.
-    :param user: login user, made if needed.
-    :param network: name of an existing container network; None for the engine's own.
+    :param user: login user, created if needed.
+    :param network: name of an existing container network; None for the engine's default.
     :param ip: fixed address in that network.
-    :param cpus: limit, such as 1.5.
-    :param memory: limit, such as '2g'.
-    :param ports: what is published on the robot, in the engine's form.
-    :param mounts: folders of this computer that the container sees: ``path`` or
-        ``path:path there``; it can't write to them.
+    :param cpus: CPU limit, such as 1.5.
+    :param memory: memory limit, such as '2g'.
+    :param ports: ports to publish on the robot, in the engine's syntax.
+    :param mounts: folders of this computer that the container can read: ``path`` or
+        ``path:path there``.
     :param gpus: 'all' or a number.
     :param devices: such as '/dev/video0'.
-    :param containers: whether it may run containers of its own, which takes rights that make it
-        little of a wall; None where ``add_docker_container`` or a node's ``image`` asks for it.
+    :param containers: whether it may run containers of its own, which weakens its isolation;
+        None: only if ``add_docker_container`` or a node's ``image`` requires it.
     """
 
     provider = 'container'
@@ -350,19 +350,19 @@ class ContainerInstance(CloudInstance):
         }, **common)
 
     def takes_containers(self) -> None:
-        """Have the machine made with the rights that an engine takes, if nothing else is said."""
+        """Create the machine with the rights that a container engine needs, by default."""
         self._options.setdefault('containers', words.Truth(True))
 
 
 class SSHInstance(CloudInstance):
     """
-    Any computer that exists already and takes our SSH key; it outlives the launch.
+    An existing computer that accepts the robot's SSH key; it outlives the launch.
 
     :param host: name or address.
-    :param user: login user; None for what ``ssh`` would use.
+    :param user: login user; None for the user that ``ssh`` would choose.
     :param port: TCP port of its SSH server.
-    :param key: private key file to log in with; None for the user's own keys and agent.
-    :param host_key: its public host key (``ssh-ed25519 AAAA...``); None lets known_hosts decide.
+    :param key: private key file for the login; None for the user's own keys and agent.
+    :param host_key: its public host key (``ssh-ed25519 AAAA...``); None to use known_hosts.
     """
 
     provider = 'ssh'
@@ -379,7 +379,7 @@ class SSHInstance(CloudInstance):
 
 def checked(machine: SomeMachine) -> SomeMachine:
     """
-    Return a machine, or the name of one, as launch files pass it.
+    Check that a value is a machine, or the name of one; return it.
 
     :raises ConfigurationError: it is neither.
     """
@@ -392,7 +392,7 @@ def checked(machine: SomeMachine) -> SomeMachine:
 
 def parse_duration(what: str, value: Union[str, int, float]) -> float:
     """
-    Return seconds for a number, or for text such as '90', '8h', '1h30m', '2d'.
+    Convert a number, or text such as '90', '8h', '1h30m', '2d', to seconds.
 
     :raises ConfigurationError: not a duration, or not above zero.
     """
@@ -416,7 +416,7 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
 
 @contextlib.contextmanager
 def _named(keyword: str) -> Iterator[None]:
-    """Have an error in the value of a keyword say which it is."""
+    """Name the keyword in the error of a wrong value."""
     try:
         yield
     except ConfigurationError as error:
@@ -439,9 +439,9 @@ _PACKAGE_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
 
 def _packages(program: str, values: Any) -> list[Union[words.Items, words.Listed]]:
     """
-    Return what ``apt=`` or ``pip=`` takes, each checked as far as it is known.
+    Read a value of ``apt=`` or ``pip=``; check the items that are known already.
 
-    :raises ConfigurationError: it is no list of packages.
+    :raises ConfigurationError: not a list of packages.
     """
     if isinstance(values, str):
         raise ConfigurationError(f'{program}={values!r} is no list',

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines that somebody rents out: an EC2 instance, a pod. They too ask nobody when written."""
+"""Machines of cloud providers in launch files: an EC2 instance, a pod. They make no request."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Toleration(TypedDict, total=False):
-    """Lets a pod onto nodes that keep others off, as in its specification."""
+    """Allow a pod on tainted nodes, with the fields of a pod's specification."""
 
     key: str
     operator: str
@@ -32,38 +32,38 @@ class Toleration(TypedDict, total=False):
 
 class AWSCloudInstance(CloudInstance):
     """
-    An EC2 instance, made for the launch.
+    An EC2 instance, created for the launch.
 
-    What isn't said is left to the provider: the region of the user's AWS configuration, an image
-    baked before with what the launch needs or else Ubuntu 24.04, and of the types t3.medium, or
-    the cheapest with what is asked for below.
+    Defaults: the region of the user's AWS configuration, an image that ``ros2 fog`` has baked with
+    what the launch needs or else Ubuntu 24.04, and the type t3.medium, or the cheapest type that
+    meets the requirements below.
 
     ``ami_image``, ``ec2_instance_type`` and ``subnet`` may depend on the region: a mapping such as
-    ``{'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}`` has a value for each, and the launch takes the
-    one of the region that it chooses.
+    ``{'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}`` has a value for each region, and the launch
+    uses the value of the region that it chooses.
 
     :param ami_image: id of an image.
-    :param region: such as 'eu-central-1'; 'nearest' for the one that answers first.
-    :param ec2_instance_type: such as 't3.medium'; 'cheapest' for the cheapest that has what is
-        asked for below.
-    :param disk_size: GB, 30 unless said.
-    :param spot: take a spot instance: cheaper, and AWS may take it back at two minutes' notice.
+    :param region: such as 'eu-central-1'; 'nearest' for the region with the fastest response.
+    :param ec2_instance_type: such as 't3.medium'; 'cheapest' for the cheapest type that meets
+        the requirements below.
+    :param disk_size: GB; default 30.
+    :param spot: use a spot instance: cheaper, but AWS may reclaim it with two minutes' notice.
     :param arch: x86_64 or arm64.
-    :param min_cpu: vCPUs at the least.
-    :param min_memory_gb: GiB at the least.
-    :param cpu_type: the processor's maker: intel, amd, aws.
-    :param gpu: how many GPUs, True for one, or part of the name of one.
-    :param gpu_memory_gb: GB of each at the least.
-    :param max_price: US dollars an hour; what costs more is refused, and it caps a spot price.
-    :param iam_instance_profile: name or ARN of what the instance itself may do at AWS.
-    :param subnet: id; None for one of the default VPC's.
-    :param security_groups: ids of groups besides the instance's own.
-    :param tags: on everything that is made, besides FogROS2's own.
-    :param regions: more regions to try, in this order, when one has no room.
-    :param instance_types: more types to try, in this order, when there is no room for one.
+    :param min_cpu: minimum number of vCPUs.
+    :param min_memory_gb: minimum memory in GiB.
+    :param cpu_type: manufacturer of the processor: intel, amd, aws.
+    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
+    :param gpu_memory_gb: minimum memory of each GPU in GB.
+    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
+    :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
+    :param subnet: subnet id; None for one of the default VPC.
+    :param security_groups: ids of groups in addition to the instance's own.
+    :param tags: tags for everything that is created, in addition to FogROS2's own.
+    :param regions: further regions to try, in this order, if one has no capacity.
+    :param instance_types: further types to try, in this order, if there is no capacity for one.
     :param user: the image's login user.
     :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
-        address alone.
+        address only.
     """
 
     provider = 'aws'
@@ -104,7 +104,7 @@ class AWSCloudInstance(CloudInstance):
         }, **common)
 
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
-        """Return what is known of the machine, with FogROS2's keys."""
+        """Return what is known about the machine, with FogROS2's keys."""
         machine = self._running.machine if self._running else None
         region = self._option('region')
 
@@ -124,27 +124,27 @@ class AWSCloudInstance(CloudInstance):
 
 class KubeInstance(CloudInstance):
     """
-    A pod of a Kubernetes cluster, made for the launch in the context's namespace.
+    A pod of a Kubernetes cluster, created for the launch in the context's namespace.
 
-    :param container_image: has Python 3.10 and ``sh`` at the least; ROS 2 in it saves installing.
-    :param zone: the pod runs there if it can.
-    :param mcpu: thousandths of a CPU, asked for and allowed; 0 for no say.
-    :param mb: MiB of memory, asked for and allowed; 0 for no say.
+    :param container_image: needs Python 3.10 and ``sh``; with ROS 2, no installation is needed.
+    :param zone: preferred zone of the pod.
+    :param mcpu: CPU request and limit in thousandths of a CPU; 0 for none.
+    :param mb: memory request and limit in MiB; 0 for none.
     :param namespace: None for the context's own.
-    :param context: of the kubeconfig; None for the current one.
-    :param gpus: how many devices of the kind ``gpu_resource``.
+    :param context: context of the kubeconfig; None for the current one.
+    :param gpus: number of devices of the kind ``gpu_resource``.
     :param gpu_resource: such as 'nvidia.com/gpu'.
-    :param node_selector: labels that the node has to carry.
+    :param node_selector: labels that the cluster's node must have.
     :param tolerations: as in a pod's specification.
     :param runtime_class: such as 'nvidia'.
     :param image_pull_secrets: names of secrets in the namespace.
-    :param service_account: by whose rights the pod is admitted; its token isn't mounted.
-    :param expose: how the VPN gets to the pod: 'load_balancer', 'node_port', 'pod_dials_robot',
-        'pod_ip'; 'auto' tries in this order.
-    :param robot_host: address at which pods reach the robot, where they have to dial it.
-    :param user: login user, made where the image has none of this name.
-    :param env: variables of every login; ``environment`` is for the nodes alone.
-    :param annotations: of the Service, such as what a cloud wants for its load balancer.
+    :param service_account: the pod's service account; its token is not mounted.
+    :param expose: how the VPN reaches the pod: 'load_balancer', 'node_port', 'pod_dials_robot',
+        'pod_ip'; 'auto' tries them in this order.
+    :param robot_host: address at which pods reach the robot, if they have to dial it.
+    :param user: login user, created if the image has none of this name.
+    :param env: variables of every login; ``environment`` is for the nodes only.
+    :param annotations: annotations of the Service, for example for a cloud's load balancer.
     """
 
     provider = 'kubernetes'
@@ -180,7 +180,7 @@ class KubeInstance(CloudInstance):
         }, **common)
 
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
-        """Return what is known of the machine, with FogROS2's keys."""
+        """Return what is known about the machine, with FogROS2's keys."""
         machine = self._running.machine if self._running else None
         return {
             **super().info(flush_to_disk),
@@ -192,7 +192,7 @@ class KubeInstance(CloudInstance):
 
 
 class _NoProvider(CloudInstance):
-    """A machine of FogROS2's for which there is no provider here; building one is an error."""
+    """A machine class of FogROS2 without a provider here; the constructor raises an error."""
 
     cloud: ClassVar[str]
 
@@ -205,12 +205,12 @@ class _NoProvider(CloudInstance):
 
 
 class GCPCloudInstance(_NoProvider):
-    """A virtual machine of Google Cloud, which launch files of FogROS2 name."""
+    """A virtual machine of Google Cloud; launch files of FogROS2 may name it."""
 
     cloud = 'Google Cloud'
 
 
 class AzureCloudInstance(_NoProvider):
-    """A virtual machine of Azure, which launch files of FogROS2 name."""
+    """A virtual machine of Azure; launch files of FogROS2 may name it."""
 
     cloud = 'Azure'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names for machines that were given none."""
+"""Generate names for machines without a name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NOUNS = (
 
 
 def two_words() -> str:
-    """Return a name that no machine has yet, such as 'misty-otter-3fa2'."""
+    """Return a new random name, such as 'misty-otter-3fa2'."""
     first, second, *number = os.urandom(4)
     return (f'{_ADJECTIVES[first % len(_ADJECTIVES)]}-{_NOUNS[second % len(_NOUNS)]}-'
             f'{bytes(number).hex()}')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks that a launch file names: who may watch."""
+"""Read the networks of a launch file's ``monitor_allow``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _SUCH = "write networks such as '198.51.100.0/28', or addresses"
 
 def items(values: Any) -> Any:
     """
-    Return networks that stay apart, None for none.
+    Return networks as separate values, None for none; check those that are known already.
 
-    :raises ConfigurationError: it is one text, or a plain one is no network.
+    :raises ConfigurationError: a single text, or an invalid network.
     """
     if isinstance(values, str):
         raise ConfigurationError(f'monitor_allow={values!r} is no list of networks', _SUCH)
@@ -33,17 +33,17 @@ def items(values: Any) -> Any:
 
 def resolve(context: LaunchContext, values: Any) -> tuple[str, ...]:
     """
-    Return networks in CIDR form.
+    Resolve networks; return them in CIDR form.
 
-    :param values: as :func:`items` has them.
-    :raises ConfigurationError: one is no network.
+    :param values: a result of :func:`items`.
+    :raises ConfigurationError: an invalid network.
     """
     return tuple(normal(value) for value in words.resolve(context, values) or ())
 
 
 def normal(text: str) -> str:
     """
-    Return a network, or an address, in CIDR form.
+    Convert a network or an address to CIDR form.
 
     :raises ConfigurationError: it is neither, or has bits set beyond its mask.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a process action, resolved on the robot, to the NodeSpec that travels."""
+"""Convert a process action, resolved on the robot, to the NodeSpec that a machine runs."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from fogros2.actions import private
 from fogros2.errors import ConfigurationError
 from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
 
-#: ROS arguments whose next word is a file, which travels.
+#: ROS arguments with a file name as next word; the file is sent to the machine.
 _FILE_ARGUMENTS = ('--params-file', '--log-config-file')
 
-#: Variables that describe the robot's own system: a launch file's change of them stays here.
+#: Variables that describe the robot's own system; a launch file's changes of them stay here.
 LOCAL_VARIABLES = frozenset({
     'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
     'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
@@ -34,13 +34,13 @@ LOCAL_VARIABLES = frozenset({
 
 
 class ProgramName(Substitution):
-    """Stands for a program that is looked up where it will run, so here it is just a name."""
+    """The name of a program, which is looked up on the machine where it will run."""
 
     def __init__(
         self, name: list[Substitution], package: list[Substitution], here: Substitution,
     ) -> None:
         super().__init__()
-        #: What looks it up on the robot.
+        #: The substitution that looks it up on the robot.
         self.here = here
         self.name = name
         self.package = package
@@ -55,7 +55,7 @@ class ProgramName(Substitution):
 
 
 def use_names_of_programs(action: ExecuteLocal) -> None:
-    """Replace what would look programs up on the robot by their names, in place."""
+    """Replace substitutions that look programs up on the robot by the names, in place."""
     for word in action.process_description.cmd:
         for index, part in enumerate(word):
             if isinstance(part, ExecutableInPackage):
@@ -66,7 +66,7 @@ def use_names_of_programs(action: ExecuteLocal) -> None:
 
 @contextlib.contextmanager
 def packages_of(folder: Optional[str]) -> Iterator[None]:
-    """Let substitutions find the packages of a workspace, sourced or not, during the block."""
+    """Let substitutions find the packages of a workspace during the block, sourced or not."""
     before = os.environ.get('AMENT_PREFIX_PATH')
     known = before.split(os.pathsep) if before else []
     more = [prefix for prefix in workspace.prefixes(folder) if prefix not in known]
@@ -83,13 +83,13 @@ def packages_of(folder: Optional[str]) -> Iterator[None]:
 
 def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
     """
-    Return the command of a prepared action as it is on the robot.
+    Return the command of a prepared action for the robot.
 
-    :raises ConfigurationError: the robot lacks the program.
+    :raises ConfigurationError: the program is not installed on the robot.
     """
     description = action.process_description
     command = list(description.final_cmd or ())
-    first = len(command) - len(description.cmd)  # launch puts a prefix's words before
+    first = len(command) - len(description.cmd)  # launch puts the prefix before the command
     for index, word in enumerate(description.cmd, first):
         if any(isinstance(part, ProgramName) for part in word):
             try:
@@ -108,17 +108,18 @@ def from_action(
     launch_id: str, image: str = '', image_options: Sequence[str] = (),
 ) -> NodeSpec:
     """
-    Return what a prepared action asks for.
+    Convert a prepared action to a NodeSpec.
 
-    What is in an image is known there alone: paths of the robot's ROS stay as they are then.
+    If the node runs in an image, paths of the robot's ROS stay unchanged: only the machine knows
+    the image's content.
 
-    :param base: the environment before the launch changed it; changes travel.
+    :param base: the environment before the launch changed it; changes are sent.
     :raises ConfigurationError: a package, an executable or a parameter file is missing.
     """
     description = action.process_description
     texts = Texts(() if image else plan.ament_prefixes(base), spec.workspace)
     final = list(description.final_cmd or ())
-    # launch puts the prefix's words before the command's
+    # launch puts the words of the prefix before the command
     count = len(final) - len(description.cmd)
     prefix, final = final[:count], final[count:]
     package = executable = ''
@@ -164,11 +165,11 @@ def from_action(
 def _environment(
     action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str],
 ) -> dict[str, str]:
-    """Return the variables that the launch file set, for this process or for all."""
+    """Return the variables that the launch file set, for this process or for all processes."""
     description = action.process_description
     final: Mapping[str, str] = description.final_env or {}
     if description.env is not None:
-        # an environment of its own: on a machine it comes on top of what ROS needs there
+        # a complete environment: the machine adds it to the variables that ROS needs there
         return dict(final)
     changed = {
         key: value for key, value in final.items()
@@ -198,11 +199,11 @@ def _read(path: str) -> str:
 
 class Texts:
     """
-    Puts markers into texts for what lies elsewhere on a machine.
+    Replace the robot's package paths in texts by markers, which the machine resolves.
 
-    ``/opt/ros/jazzy/share/demo/rviz.yaml`` is ``({'share': 'demo'}, '/rviz.yaml')`` then, and a
-    path below ``lib/demo`` begins with ``{'prefix': 'demo'}``. The workspace that travels has the
-    same path there, so its paths stay as they are.
+    ``/opt/ros/jazzy/share/demo/rviz.yaml`` becomes ``({'share': 'demo'}, '/rviz.yaml')``, and a
+    path below ``lib/demo`` begins with ``{'prefix': 'demo'}``. The workspace has the same path on
+    the machine, so its paths stay unchanged.
 
     :param prefixes: the robot's ament prefixes.
     """
@@ -217,7 +218,7 @@ class Texts:
                 '|'.join(re.escape(root) for root in roots) or r'(?!)'))
 
     def text(self, text: str) -> Text:
-        """Return the text with markers, or as it is where it needs none."""
+        """Return the text with markers, or the unchanged text if it needs none."""
         parts: list[TextPart] = []
         begin = 0
         for match in self._pattern.finditer(text):
@@ -226,7 +227,7 @@ class Texts:
                 continue
             parts.append(text[begin:match.start()])
             parts.append({'share' if kind == 'share' else 'prefix': package})
-            # a package's prefix is looked up; what follows it is the same there
+            # the machine looks up the package's prefix; the rest of the path is the same there
             begin = match.end() if kind == 'share' else match.end('prefix')
         if not parts:
             return text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS nodes of a launch that may run on a machine: launch_ros's actions with ``machine=``."""
+"""ROS nodes that may run on a machine: launch_ros's actions with ``machine=``."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ class Node(launch_ros.actions.Node):
     """
     A :class:`launch_ros.actions.Node` that runs on a machine if it has a ``machine``.
 
-    It takes everything that launch_ros's Node takes. Without a machine it is that Node. With one,
-    conditions, ``respawn``, ``on_exit``, OnProcessStart, OnProcessExit and the like see the
-    machine's process as if it ran here, wherever in the launch the action stands.
+    It accepts all keywords of launch_ros's Node, and without a machine behaves like that Node.
+    With a machine, conditions, ``respawn``, ``on_exit``, OnProcessStart, OnProcessExit and the
+    like treat the machine's process as a local process, wherever the action is in the launch.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere; None for
-        the robot, or for the machine of a CloudGroup around it.
+        the robot, or for the machine of an enclosing CloudGroup.
     :param stream_topics: image topics that cross the VPN encoded: ``(topic, transport)`` pairs for
-        those that the robot publishes and the machine reads, or StreamTopic.
+        topics that the robot publishes and the machine reads, or StreamTopic.
     :param image: container image that the node runs in on the machine, such as
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
     :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
-        has them separated by commas.
+        separates them by commas.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
-    #: Whether the machine is this action's own, and not that of a CloudGroup around it.
+    #: Whether the action itself has a machine; False for the machine of an enclosing CloudGroup.
     _fogros2_own_machine = False
 
     def __init__(
@@ -72,7 +72,7 @@ class Node(launch_ros.actions.Node):
         send(self, checked(machine))
 
     def prepare(self, context: LaunchContext) -> None:
-        """Resolve the action, its streams too, whose relative names are in its namespace."""
+        """Resolve the action and its streams; relative topics are in the node's namespace."""
         if self._fogros2_own_machine and self._image is not None:
             self._use_image(context)
         super().prepare(context)
@@ -84,7 +84,7 @@ class Node(launch_ros.actions.Node):
             streaming.check(self._fogros2_streams)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action; components that it loads know the topics of its machine."""
+        """Execute the action; components that it loads use the topic names of its machine."""
         if context.is_shutdown or not self._fogros2_own_machine:
             executed: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
             return executed

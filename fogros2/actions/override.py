@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where machines run instead of where the launch file says: ``--machine planner=container``."""
+"""Run machines elsewhere than the launch file says: ``--machine planner=container``."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from fogros2.actions.machines import CloudInstance
     from fogros2.model import MachineSpec
 
-#: Keywords of every machine that a MachineSpec calls otherwise, None for those it doesn't have.
+#: Keywords of every machine whose MachineSpec field has another name; None: no such field.
 _FIELDS = {'ros_workspace': 'workspace', 'working_dir_base': None, 'name': None}
-#: How ``ssh:user@host:port`` comes apart.
+#: Prefix of the short form ``ssh:user@host:port``.
 _SSH = 'ssh:'
 
 
 @dataclasses.dataclass(frozen=True)
 class Override:
     """
-    One machine, or several, that run elsewhere.
+    Run one machine, or several, elsewhere.
 
-    :param pattern: the machine's name; ``*`` in it stands for anything.
-    :param given: keywords of the provider's class, in its kinds.
+    :param pattern: the machine's name; ``*`` matches anything.
+    :param given: keywords of the provider's class, converted to their kinds.
     """
 
     pattern: str
@@ -41,14 +41,14 @@ class Override:
 
     @property
     def on_robot(self) -> bool:
-        """Whether no machine is made."""
+        """Whether the nodes run on the robot, without a machine."""
         return self.provider == keywords.ROBOT
 
     def instead(self, spec: MachineSpec, context: LaunchContext) -> MachineSpec:
         """
-        Return what to make instead.
+        Return the spec to use instead.
 
-        What launch files say of any machine holds, what they say to a provider only for that one.
+        Keywords of every machine are kept; options of a provider only with the same provider.
         """
         said = self.machine(spec.name).spec(context)
         before = spec.options if spec.provider == self.provider else {}
@@ -61,16 +61,16 @@ class Override:
 
     def machine(self, name: str) -> CloudInstance:
         """
-        Return the machine of that name as the override alone describes it.
+        Return a machine as the override alone describes it.
 
-        :raises ConfigurationError: it is wrong.
+        :raises ConfigurationError: the override is wrong.
         """
         return keywords.make(self.provider, {**self.given, 'name': name})
 
 
 class Overrides:
     """
-    All that one command line says.
+    All overrides of a command line.
 
     :param texts: such as 'planner=aws,region=eu-west-1'.
     :raises ConfigurationError: see :func:`parse`.
@@ -80,7 +80,7 @@ class Overrides:
         self._overrides = [parse(text) for text in texts]
 
     def of(self, name: str) -> Optional[Override]:
-        """Return what holds for a machine: a name beats a pattern, what is said last the rest."""
+        """Return the override of a machine: a name beats a pattern, a later one an earlier one."""
         for override in reversed(self._overrides):
             if override.pattern == name:
                 return override
@@ -88,15 +88,15 @@ class Overrides:
                      if fnmatch.fnmatchcase(name, override.pattern)), None)
 
     def apply(self, spec: MachineSpec, context: LaunchContext) -> MachineSpec:
-        """Return what to make for a machine."""
+        """Return the spec to use for a machine."""
         override = self.of(spec.name)
         return spec if override is None else override.instead(spec, context)
 
     def check(self, names: Iterable[str]) -> None:
         """
-        Hold them against the machines that the launch has.
+        Check that each override matches a machine of the launch.
 
-        :raises ConfigurationError: one is for a machine that there isn't.
+        :raises ConfigurationError: an override matches none.
         """
         names = sorted(set(names))
         for override in self._overrides:
@@ -109,10 +109,10 @@ class Overrides:
 
 class OverrideMachines(Action):
     """
-    Has machines of some content run elsewhere.
+    Run machines of some content elsewhere.
 
-    :param overrides: which, and where.
-    :param entities: the content: a launch.
+    :param overrides: the machines, and where they run.
+    :param entities: the content, such as an included launch file.
     """
 
     def __init__(
@@ -123,11 +123,11 @@ class OverrideMachines(Action):
         self._entities = list(entities)
 
     def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
-        """Return the content, for launch's own look ahead."""
+        """Return the content, because launch inspects sub-entities before execution."""
         return list(self._entities)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action: yields the content, looked through for the machines it mentions."""
+        """Execute the action: find the machines in the content, and return the content."""
         from fogros2.actions.coordinator import Coordinator
         coordinator = Coordinator.of(context)
         machines: list[SomeMachine] = []
@@ -138,7 +138,7 @@ class OverrideMachines(Action):
 
 
 def _load(entities: Iterable[LaunchDescriptionEntity], context: LaunchContext) -> None:
-    """Load the launch file now, for good: a look through an include loads it for that alone."""
+    """Load included launch files permanently; launch's inspection discards what it loads."""
     for entity in entities:
         if isinstance(entity, LaunchDescription):
             _load(entity.entities, context)
@@ -150,9 +150,9 @@ def _look_through(
     entities: Iterable[LaunchDescriptionEntity], machines: list[SomeMachine],
 ) -> bool:
     """
-    Add the machines that entities have, at any depth, in included files as well.
+    Collect the machines of entities, at any depth, in included files too.
 
-    :return: whether that is all: neither a function nor an unread file may bring more.
+    :return: True if these are all; False if a function or an unread file may add machines.
     """
     from fogros2.actions.launch_description import has_machine
     whole = True
@@ -170,7 +170,7 @@ def _look_through(
 
 
 def _mention(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
-    """Remember the machines that an entity has, those that come with a timer or an event too."""
+    """Remember the machines of an entity, also those that a timer or an event adds."""
     from fogros2.actions.coordinator import Coordinator
     from fogros2.actions.launch_description import cloud_entities
     for found, _ in cloud_entities([entity]):
@@ -179,12 +179,12 @@ def _mention(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
 
 def parse(text: str) -> Override:
     """
-    Return an override from its text: ``NAME=PROVIDER[,KEYWORD=VALUE]...``.
+    Parse an override: ``NAME=PROVIDER[,KEYWORD=VALUE]...``.
 
     ``ssh:user@host:port`` is short for ``ssh,host=host,user=user,port=port``. A value with commas
-    stands in brackets or braces, as YAML has lists and mappings.
+    is enclosed in brackets or braces, as a YAML list or mapping.
 
-    :raises ConfigurationError: it isn't one; an unknown provider or keyword; a wrong value.
+    :raises ConfigurationError: wrong syntax, an unknown provider or keyword, or a wrong value.
     """
     pattern, _, rest = text.partition('=')
     if not pattern.strip() or not rest.strip():
@@ -206,13 +206,13 @@ def parse(text: str) -> Override:
             raise keywords.unknown(f"a machine of the provider '{provider}'", name, known)
         given[name] = keywords.read(known[name], value)
     override = Override(pattern.strip(), provider, given)
-    # what is wrong with it is said before anything begins; any name will do
+    # report wrong values before the launch begins; the name does not matter
     override.machine('machine')
     return override
 
 
 def _parts(text: str) -> Iterator[str]:
-    """Yield what commas separate, but for those in brackets and braces."""
+    """Split at commas, except inside brackets and braces."""
     depth, begin = 0, 0
     for at, character in enumerate(text):
         depth += (character in '[{') - (character in ']}')
@@ -223,7 +223,7 @@ def _parts(text: str) -> Iterator[str]:
 
 
 def _computer(text: str) -> dict[str, Any]:
-    """Return the keywords in ``user@host:port``; an IPv6 address stands in brackets."""
+    """Parse ``user@host:port``; an IPv6 address is enclosed in brackets."""
     user, at, host = text.rpartition('@')
     name, colon, port = host.rpartition(':')
     if not colon or host.endswith(']'):

@@ -2,20 +2,20 @@
 """
 Give the other modules access to private parts of launch, and say why each is needed.
 
-launch has no seam for "start the process elsewhere": ``ExecuteLocal.execute`` resolves the
-action, registers its handlers and then creates a task from its private method
-``__execute_process``. That method is the seam here. A cloud process overrides it and sets
-``_subprocess_transport`` and ``_subprocess_protocol``; a robot process that waits for the cloud
-runs it later. All the rest (substitutions, handlers, output, ``on_exit``, signals) stays launch's
-own code. The options that the method reads have no getters.
+launch has no public extension point to start a process elsewhere. ``ExecuteLocal.execute``
+resolves the action, registers its handlers and then creates a task from its private method
+``__execute_process``. FogROS2 extends launch at that method. A cloud process overrides it and
+sets ``_subprocess_transport`` and ``_subprocess_protocol``; a robot process that waits for the
+cloud calls it later. Everything else (substitutions, handlers, output, ``on_exit``, signals)
+stays launch's own code. The options that the method reads have no getters.
 
-Three other modules use private parts directly: ``remote`` and ``carriers`` override
+Other modules use private parts directly. ``remote`` and ``carriers`` override
 ``_ExecuteLocal__execute_process``, ``remote`` also ``_shutdown_process``, in classes derived from
-ExecuteLocal; ``census`` goes through the event handlers of the context. ``wrapping`` and
+ExecuteLocal. ``census`` reads the event handlers of the context. ``wrapping`` and
 ``components`` replace public methods of single objects.
 
-The names are those of Jazzy (launch 3.4) and the same in its embedded default;
-``test/unit/test_actions_private.py`` looks for each.
+The names are those of Jazzy (launch 3.4), which the embedded default shares;
+``test/unit/test_actions_private.py`` checks each name.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Waiting = Callable[[LaunchContext], Coroutine[Any, Any, None]]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What an ExecuteLocal was told and keeps to itself."""
+    """Options of an ExecuteLocal that have no getter."""
 
     respawn: bool
     respawn_delay: float
@@ -58,15 +58,15 @@ def options(action: ExecuteLocal) -> Options:
 
 
 def prefix_output(action: ExecuteLocal, machine: str) -> None:
-    """Put the machine's name before the process's where the output format names the process."""
+    """Put the machine's name before the process's name in the output format."""
     name = '{this.process_description.final_name}'
     before: str = _private(action, 'output_format')
-    # a name has no braces, so it is safe in a format
+    # a machine's name contains no braces, so it is safe in a format string
     vars(action)['_ExecuteLocal__output_format'] = before.replace(name, f'{machine}.{name}')
 
 
 def unprefix_output(action: ExecuteLocal, machine: str) -> None:
-    """Take the machine's name away again."""
+    """Remove the machine's name from the output format."""
     name = '{this.process_description.final_name}'
     before: str = _private(action, 'output_format')
     vars(action)['_ExecuteLocal__output_format'] = before.replace(f'{machine}.{name}', name)
@@ -77,7 +77,7 @@ def _private(action: ExecuteLocal, name: str) -> Any:
 
 
 def completed(action: ExecuteLocal) -> Optional[asyncio.Future[Any]]:
-    """Return what is done once the process has ended, None before the action's execution."""
+    """Return the future of the process's end, None before the action's execution."""
     future: Optional[asyncio.Future[Any]] = _private(action, 'completed_future')
     return future
 
@@ -90,15 +90,15 @@ def execute_process(action: ExecuteLocal) -> Waiting:
 
 def set_transport(action: ExecuteLocal, process: object) -> None:
     """
-    Make ``process`` what the action takes for its subprocess.
+    Make an action use ``process`` as its subprocess.
 
-    launch calls ``send_signal``, ``kill``, ``get_returncode`` and looks at ``complete``.
+    launch calls ``send_signal``, ``kill``, ``get_returncode`` and reads ``complete``.
     """
     vars(action).update(_subprocess_transport=process, _subprocess_protocol=process)
 
 
 def transport(action: ExecuteLocal) -> Any:
-    """Return what the action takes for its subprocess, None before it has one."""
+    """Return the object that the action uses as its subprocess, None if there is none yet."""
     return action._subprocess_transport
 
 
@@ -120,7 +120,7 @@ def replace_reader(
     reader: Callable[[Callable[[str], LaunchDescription], str], LaunchDescription],
 ) -> None:
     """
-    Have a source of a launch description read its launch file with a function.
+    Make a source of a launch description read its launch file by a function.
 
     :param reader: called with the function that read the file before, and the file's path.
     """
@@ -135,17 +135,17 @@ def components(action: Any) -> list[Any]:
 
 
 def set_remappings(component: Any, rules: Any) -> None:
-    """Give a ComposableNode other remappings, in launch_ros's normal form; it reads them alone."""
+    """Set the remappings of a ComposableNode, in launch_ros's normal form."""
     names = [name for name in vars(component) if name.endswith('remappings')]
     vars(component)[names[0]] = rules
 
 
 def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
     """
-    Return the copies of the environment that launch comes back to, to be changed in place.
+    Return the saved environments that launch restores, so that callers can change them.
 
-    A scoped group returns to one at its end, ResetEnvironment to another; what the launch as a
-    whole needs has to be in them.
+    A scoped group restores one at its end, ResetEnvironment another. Variables of the whole
+    launch have to be in all of them.
     """
     found: list[dict[str, str]] = []
     for name, value in vars(context).items():
@@ -157,9 +157,9 @@ def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
 
 def signal_manager() -> Optional[AsyncSafeSignalManager]:
     """
-    Return the manager in which the running LaunchService handles signals.
+    Return the signal manager of the running LaunchService.
 
-    Its handler for SIGTERM cancels the service on the spot; there is no public way to replace it.
+    Its SIGTERM handler cancels the service at once; launch has no public way to replace it.
     """
     name = '_AsyncSafeSignalManager__current'
     manager: Optional[AsyncSafeSignalManager] = getattr(AsyncSafeSignalManager, name)

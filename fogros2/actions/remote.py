@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of the launch that run on a machine, as launch's own process actions see them."""
+"""Process actions of launch whose processes run on a machine."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ if TYPE_CHECKING:
 
 class RemoteProcess(ExecuteLocal):
     """
-    A process action whose process is on a machine.
+    A process action whose process runs on a machine.
 
-    A base to stand behind the action proper, as :func:`send` has it: the method resolution order
-    of ``class Away(Node, RemoteProcess)`` has it between Node and ExecuteLocal, whose execution it
-    keeps but for the start of the process.
+    :func:`send` makes it the second base of a class: the method resolution order of
+    ``class Away(Node, RemoteProcess)`` puts it between Node and ExecuteLocal. It keeps the
+    execution of ExecuteLocal except the start of the process.
     """
 
     _fogros2_machine: SomeMachine
     _fogros2_streams: Sequence[Entry] = ()
-    #: Container image that the process runs in there, and options of its ``docker run``.
+    #: Container image that the process runs in, and more options for its ``docker run``.
     _fogros2_image = ''
     _fogros2_image_options: Sequence[str] = ()
     _fogros2_session: Session
     _fogros2_node: NodeSpec
-    #: The command on the robot, where it may have to go on.
+    #: The command on the robot, if ``on_interrupt`` may move the process there.
     _fogros2_command: Optional[list[str]] = None
-    #: Whether the process is on the robot: its machine was taken away.
+    #: Whether the process runs on the robot, for example after a preemption.
     _fogros2_here = False
-    #: Whether launch has taken the step in which it would have started the process here.
+    #: Whether launch has reached the point at which it starts a local process.
     _fogros2_began = False
 
     @property
@@ -51,7 +51,7 @@ class RemoteProcess(ExecuteLocal):
         return self._fogros2_machine
 
     def prepare(self, context: LaunchContext) -> None:
-        """Resolve the action as ExecuteLocal does, and what will travel."""
+        """Resolve the action, as ExecuteLocal does, and create its NodeSpec."""
         coordinator = Coordinator.of(context)
         if coordinator.on_robot(self._fogros2_machine):
             self._fogros2_here = True
@@ -69,7 +69,7 @@ class RemoteProcess(ExecuteLocal):
             self._fogros2_command = node_spec.robot_command(self, context)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action: its process is started as soon as its machine is up."""
+        """Execute the action; its process starts when its machine is up."""
         if context.is_shutdown:
             return None
         entities = super().execute(context)
@@ -84,13 +84,13 @@ class RemoteProcess(ExecuteLocal):
         return [*(entities or ()), *self._carriers(context), *self._beside(context)]
 
     def _carriers(self, context: LaunchContext) -> list[ExecuteLocal]:
-        """Return the processes that carry the streams asked for here and nowhere before."""
+        """Return the republishers of this process's streams that no earlier process needed."""
         if isinstance(self, carriers.Carrier):
             return []
         return carriers_of(self._fogros2_streams, context, self._fogros2_session)
 
     def _beside(self, context: LaunchContext) -> list[LaunchDescriptionEntity]:
-        """Return what the machine runs beside its nodes, for the first of them."""
+        """Return what the machine runs beside its nodes, when its first process executes."""
         session = self._fogros2_session
         if session.furnished or session.interrupted:
             return []
@@ -110,11 +110,11 @@ class RemoteProcess(ExecuteLocal):
 
     @property
     def can_come_here(self) -> bool:
-        """Whether the process can go on here, on the robot."""
+        """Whether the process can continue on the robot."""
         return self._fogros2_command is not None
 
     def come_here(self, context: LaunchContext) -> None:
-        """Start the process here, as launch starts any; its machine has it no longer."""
+        """Start the process on the robot, as launch does; its machine no longer runs it."""
         assert self.process_details is not None and self._fogros2_command is not None
         self._fogros2_here = True
         self.process_details.pop('pid', None)
@@ -125,7 +125,7 @@ class RemoteProcess(ExecuteLocal):
             context.asyncio_loop.create_task(private.execute_process(self)(context))
 
     async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
-        """Do nothing: the session starts the process and hands over what happens to it."""
+        """Do nothing if the process runs remotely: the session starts it and passes events."""
         self._fogros2_began = True
         if self._fogros2_here:
             await getattr(super(), private.EXECUTE_PROCESS)(context)
@@ -135,8 +135,8 @@ class RemoteProcess(ExecuteLocal):
     ) -> Optional[list[LaunchDescriptionEntity]]:
         if self._fogros2_here:
             return super()._shutdown_process(context, send_sigint=send_sigint)
-        # launch leaves SIGINT to the terminal where that sends it to the nodes too; not here.
-        # The machine itself goes on to SIGTERM and SIGKILL, so a lost link can't keep it from it
+        # launch expects the terminal to send SIGINT to local nodes; a machine needs a request. The
+        # machine escalates to SIGTERM and SIGKILL by itself, even if the connection is lost
         run: Optional[RemoteRun] = private.transport(self)
         if run is not None:
             run.stop()
@@ -147,12 +147,12 @@ def send(
     action: ExecuteLocal, machine: SomeMachine, streams: Sequence[Entry] = (),
 ) -> None:
     """
-    Turn an action that hasn't been executed yet into one whose process is on ``machine``.
+    Turn an action that has not been executed into one whose process runs on ``machine``.
 
-    The object stays the same one, so handlers that have it as their target go on to match.
+    The object stays the same, so handlers that have it as their target still match.
 
     :param streams: topics to stream between the robot and the machine, resolved.
-    :raises ConfigurationError: it is of a kind that can't be sent.
+    :raises ConfigurationError: launch cannot run this kind of action on a machine.
     """
     try:
         action.__class__ = _remote_class(type(action))
@@ -168,14 +168,14 @@ def send(
 def carriers_of(
     streams: Sequence[Entry], context: LaunchContext, session: Session,
 ) -> list[ExecuteLocal]:
-    """Return the processes that carry streams of what a machine runs, but for those there are."""
+    """Return the republishers that a process on a machine needs and no earlier one needed."""
     if session.interrupted:
         return carriers_here(streams, context)
     return _carriers_to(streams, context, session)
 
 
 def carriers_here(streams: Sequence[Entry], context: LaunchContext) -> list[ExecuteLocal]:
-    """Return those that bring what other machines publish to the robot, for what runs here."""
+    """Return the republishers that bring other machines' topics to a process on the robot."""
     coordinator = Coordinator.of(context)
     found: list[ExecuteLocal] = []
     for entry in streams:
@@ -196,7 +196,7 @@ def _carriers_to(
 
 
 def carrier_on(spec: NodeSpec, machine: str) -> ExecuteLocal:
-    """Return the process that carries a stream on a machine."""
+    """Return the republisher of a stream on a machine."""
     carrier = carriers.Carrier(spec)
     send(carrier, machine)
     return carrier
@@ -207,7 +207,7 @@ _remote_classes: dict[type[ExecuteLocal], type[RemoteProcess]] = {}
 
 def _remote_class(cls: type[ExecuteLocal]) -> type[RemoteProcess]:
     if cls not in _remote_classes:
-        # ExecuteLocal itself can't stand before a class derived from it
+        # ExecuteLocal cannot precede its subclass in the bases
         bases = (RemoteProcess,) if cls is ExecuteLocal else (cls, RemoteProcess)
         remote: type[RemoteProcess] = type(cls.__name__, bases, {
             '__module__': cls.__module__, '__doc__': cls.__doc__,
@@ -219,11 +219,11 @@ def _remote_class(cls: type[ExecuteLocal]) -> type[RemoteProcess]:
 def _execute(
     parent: Any, action: RemoteProcess, context: LaunchContext,
 ) -> Optional[list[LaunchDescriptionEntity]]:
-    """Execute an action with its machine known, as launch_ros's actions do much before prepare."""
+    """Register the machine before execution: launch_ros's actions do much before ``prepare``."""
     folder = None
     coordinator = Coordinator.of(context)
     if not context.is_shutdown and not coordinator.on_robot(action.machine):
-        # some actions make a ROS node in this process, which needs the launch's DDS settings
+        # some actions create a ROS node in this process, which needs the launch's DDS settings
         folder = coordinator.session(action.machine).spec.workspace
     with node_spec.packages_of(folder):
         entities: Optional[list[LaunchDescriptionEntity]] = parent.execute(context)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process on a machine, from its execution to its end, or until it goes on on the robot."""
+"""Follow one process on a machine, from its execution to its end or its move to the robot."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from fogros2.actions.remote import RemoteProcess
     from fogros2.actions.session import Session
 
-#: How Qt, GTK and Tk say that there is no screen.
+#: Messages of Qt, GTK and Tk that there is no screen.
 _NO_SCREEN = re.compile(
     r'Qt platform plugin|could not connect to display|cannot open display|GTK backend|'
     r'no \$DISPLAY environment variable', re.IGNORECASE)
-#: Seconds beyond a process's own time-outs that its machine has to report the end of it.
+#: Seconds that the machine has, beyond a process's own time-outs, to report its end.
 GRACE = 10.0
 
 
@@ -31,7 +31,7 @@ class RemoteRun:
     """
     One process on a machine, from its execution to its end.
 
-    To launch's ExecuteLocal it is the subprocess's transport and protocol in one.
+    launch's ExecuteLocal uses it as the subprocess's transport and protocol.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class RemoteRun:
         self.complete = completed
         self.started = False
         self.stopping = False
-        #: It exited, and its machine will start it again.
+        #: Whether it exited and its machine will restart it.
         self.respawning = False
         self._hinted = False
-        #: It is on its way to the robot, then it is there and launch's own.
+        #: Whether it is moving to the robot; whether it runs there as launch's own process.
         self._moving = self._here = False
         self._context = context
         self._session = session
@@ -56,18 +56,18 @@ class RemoteRun:
         if private.options(action).log_cmd:
             self._logger.info(f"process details: cmd='{' '.join(self._details['cmd'])}'")
 
-    # -- what launch asks of a transport --------------------------------------------------------
+    # -- launch calls these as on a transport ---------------------------------------------------
 
     def get_pid(self) -> Optional[int]:
-        """Return the process's id on its machine, None before it started."""
+        """Return the process id on the machine, None before the start."""
         return self._details.get('pid')
 
     def get_returncode(self) -> Optional[int]:
-        """Return the exit status, None while there is none."""
+        """Return the exit status, None until the process has ended."""
         return self._returncode
 
     def send_signal(self, number: Union[int, str]) -> None:
-        """Send the process a signal, by its number or its name."""
+        """Send the process a signal, given by number or name."""
         name = number if isinstance(number, str) else signal.Signals(number).name
         if self.started:
             self._session.signal(self, name)
@@ -75,32 +75,32 @@ class RemoteRun:
             self._logger.warning(f"'{name}' not sent: the process hasn't started yet")
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Send SIGKILL to the process."""
         self.send_signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """Let go of the process; nothing is held here."""
+        """Do nothing: there is no transport to close."""
 
     # -- ending ---------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """End the process in order: SIGINT, SIGTERM and SIGKILL as its time-outs say."""
+        """Stop the process by SIGINT, SIGTERM and SIGKILL, with its time-outs."""
         if self.complete.done() or self.stopping:
             return
         self.stopping = True
         if not self._session.stop(self) or self.respawning:
-            # nothing runs, so there is no end of it to be reported
+            # nothing runs, so no exit will be reported
             self.end()
             return
         self._context.asyncio_loop.call_later(self._patience, self.give_up)
 
     @property
     def _patience(self) -> float:
-        """Seconds that the machine has to end it, all means included, and to say so."""
+        """Seconds until the machine has to have ended the process and reported it."""
         return self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
 
     def give_up(self) -> None:
-        """Stop waiting for a process that should have ended long ago."""
+        """Stop waiting for a process whose end is overdue."""
         if not self.complete.done() and not self._here:
             self._logger.error(
                 f"machine '{self._session.spec.name}' doesn't say that the process ended; "
@@ -111,11 +111,11 @@ class RemoteRun:
 
     def move(self, *, stop: bool) -> None:
         """
-        Have the process go on on the robot; launch sees it start again, and no exit before.
+        Move the process to the robot; launch sees a new start, and no exit before it.
 
-        One that can't, as it carries a stream, ends.
+        A process that cannot move, such as a republisher, ends.
 
-        :param stop: whether the machine has to end it first; False for a machine that is gone.
+        :param stop: whether the machine has to end it first; False if the machine is gone.
         """
         if self.complete.done() or self._here or (self._moving and stop):
             return
@@ -150,15 +150,15 @@ class RemoteRun:
             self.end()
 
     def end(self) -> None:
-        """Tell launch that nothing more will happen."""
+        """Complete launch's future: no more events will follow."""
         if not self.complete.done():
             self.complete.set_result(None)
         self._session.forget(self)
 
-    # -- what the agent says --------------------------------------------------------------------
+    # -- events of the agent --------------------------------------------------------------------
 
     def on_event(self, event: dict[str, Any]) -> None:
-        """Turn an event of the agent into launch's."""
+        """Turn an event of the agent into launch's event."""
         handler = getattr(self, f"_on_{event['event']}", None)
         if handler is not None and not self.complete.done() and not self._here:
             handler(event)
@@ -215,7 +215,7 @@ class RemoteRun:
         self.end()
 
     def on_stdin(self, event: object) -> None:
-        """Refuse input: there is no way for it to the machine."""
+        """Refuse input: the connection to a machine has no channel for it."""
         if self._here:
             return
         self._logger.error('a process on a machine takes no input from launch')

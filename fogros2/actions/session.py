@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One machine of a launch: the processes that wait for it, and those that run on it."""
+"""One machine of a launch: processes that wait for it, and processes that run on it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-#: Events of the agent that concern the machine, not one process: level and how they read.
+#: Events of the agent about the machine, not about one process: log level and message.
 _NOTICES = {
     'watchdog': (logging.ERROR, 'the agent ends everything: {reason}'),
     'ending': (logging.WARNING, 'the agent was asked to end: {reason}'),
@@ -35,28 +35,28 @@ _NOTICES = {
     'connection back': (logging.INFO, 'the connection is back'),
     'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
 }
-#: What events about a process say at the least; a machine may be hijacked and say anything.
+#: Required fields of events about a process; a hijacked machine may send anything.
 _SAID: dict[str, dict[str, type]] = {
     'started': {'pid': int}, 'output': {'text': str}, 'exited': {'returncode': int},
     'refused': {'error': str},
 }
-#: Exit status of processes whose end nobody saw.
+#: Exit status of processes whose end was not reported.
 _UNSEEN = -9
-#: Events after which processes end because their machine does; those that are on their way to the
-#: robot wait so many seconds for the news that it is gone.
+#: Events after which processes end because their machine ends. A session with on_interrupt
+#: 'robot' then holds exits back for so many seconds, until it knows whether the machine is gone.
 _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 
 
 class Run(Protocol):
-    """What a session needs of a process; all calls come from the event loop."""
+    """The interface of a process to its session; the event loop makes all calls."""
 
     node: NodeSpec
     started: bool
     stopping: bool
 
     def on_event(self, event: dict[str, Any]) -> None:
-        """Take an event of the agent that names this process."""
+        """Handle an event of the agent that names this process."""
 
     def end(self) -> None:
         """Stop waiting for events of the process: none will come."""
@@ -65,7 +65,7 @@ class Run(Protocol):
         """Stop waiting for the remote process: the agent will not report its exit."""
 
     def move(self, *, stop: bool) -> None:
-        """Go on on the robot, once the machine has ended it if it has to ``stop`` it."""
+        """Move to the robot; with ``stop``, after the machine has ended the process."""
 
 
 class Session:
@@ -74,9 +74,9 @@ class Session:
 
     :param in_thread: runs a blocking function in a thread.
     :param fail: ends the launch because of an error.
-    :param changed: is called when the machine came up or a process started or ended.
-    :param taken_away: is called with the session and a reason when the provider takes the machine
-        away, or has.
+    :param changed: called when the machine came up or a process started or ended.
+    :param taken_away: called with the session and a reason when the provider reclaims the
+        machine, or has done so.
     """
 
     def __init__(
@@ -85,67 +85,67 @@ class Session:
         fail: Callable[[BaseException], None], changed: Callable[[], None],
         taken_away: Callable[[Session, str], None],
     ) -> None:
-        #: As the launch file has it; what takes a while to know is open in it.
+        #: The spec as the launch file gives it, with open choices.
         self.asked = spec
         self.spec = spec
-        #: What launch files have for the machine; told when it is up.
+        #: The launch file's objects for the machine; notified when it is up.
         self.instances: list[CloudInstance] = []
         self.running: Optional[RunningMachine] = None
         self.deployment: Optional[asyncio.Task[None]] = None
         #: True when the machine is up, False when it never will be.
         self.came_up: asyncio.Future[bool] = loop.create_future()
-        #: Whether what runs there beside its nodes was asked for.
+        #: Whether containers and monitor of the machine have been requested.
         self.furnished = False
-        #: Topics that its nodes know by other names, for the sake of streams.
+        #: New names of topics for its nodes, because of streams.
         self.names: dict[str, str] = {}
         self._loop = loop
         self._in_thread = in_thread
         self._fail = fail
         self._changed = changed
         self._taken_away = taken_away
-        #: The provider takes the machine away; it may still run.
+        #: Whether the provider reclaims the machine; it may still run.
         self.interrupted = False
-        #: It is gone.
+        #: Whether the machine is gone.
         self.lost = False
         self._ending = False
         self._held: list[tuple[Run, dict[str, Any]]] = []
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
-        #: What components were told that were loaded first; None before that.
+        #: Topic names that the first loaded components got; None if none was loaded.
         self._told: Optional[dict[str, str]] = None
-        #: What was asked of the agent and isn't answered yet.
+        #: Requests to the agent that are not answered yet.
         self.requests: set[asyncio.Task[None]] = set()
-        # requests reach the agent in the order they were made in
+        # keeps requests to the agent in order
         self._order = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
 
     @property
     def ready(self) -> bool:
-        """Whether the machine is up and all that was to start there has started, or ended."""
+        """Whether the machine is up and all of its processes have started or ended."""
         return self.running is not None and all(run.started for run in self._runs.values())
 
     @property
     def programs(self) -> Sequence[tuple[str, str]]:
-        """The (package, executable) pairs of what waits for the machine."""
+        """The (package, executable) pairs of the processes that wait for the machine."""
         return sorted({
             (run.node.package, run.node.executable) for run in self._waiting
             if run.node.package and not run.node.image})
 
     @property
     def images(self) -> Sequence[str]:
-        """The container images that what waits for the machine runs in."""
+        """The container images of the processes that wait for the machine."""
         return sorted({run.node.image for run in self._waiting if run.node.image})
 
     def add(self, instance: CloudInstance) -> None:
-        """Have an instance stand for this machine."""
+        """Add a launch file's object for this machine."""
         if instance not in self.instances:
             self.instances.append(instance)
             if self.running is not None:
                 instance.is_up(self.running)
 
     def rename(self, names: dict[str, str]) -> None:
-        """Have nodes that start from now on know topics by other names."""
+        """Rename topics for nodes that start from now on; warn of nodes that started before."""
         new = [name for name in names if name not in self.names]
         self.names = dict(names)
         early = [run.node.name for run in self._runs.values()
@@ -158,7 +158,7 @@ class Session:
         self._warn_of_components()
 
     def told_to_components(self) -> dict[str, str]:
-        """Return the topics' names for components that are about to be loaded there."""
+        """Return the new topic names for components that are about to be loaded."""
         self._told = dict(self.names) if self._told is None else {
             name: new for name, new in self._told.items() if name in self.names}
         return dict(self.names)
@@ -172,18 +172,18 @@ class Session:
             self._told = None
 
     def give_up(self) -> None:
-        """Stop waiting for the machine to come up, if it isn't up."""
+        """Stop waiting for the machine to come up, unless it is up."""
         if not self.came_up.done():
             self.came_up.set_result(False)
 
     # -- processes ------------------------------------------------------------------------------
 
     def node_names(self) -> list[str]:
-        """Return the names that the machine's nodes have in the graph."""
+        """Return the ROS names of the machine's nodes."""
         return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
 
     def submit(self, run: Run) -> None:
-        """Start a process as soon as the machine is up."""
+        """Start a process when the machine is up."""
         self._runs[run.node.id] = run
         if self.interrupted:
             run.move(stop=False)
@@ -193,7 +193,7 @@ class Session:
             self._request(self._start_waiting)
 
     def stop(self, run: Run) -> bool:
-        """End a process there; False if it isn't there yet and now never will be."""
+        """Stop a process; return False if it does not run there and never will."""
         if run in self._waiting or self.running is None or self.lost:
             if run in self._waiting:
                 self._waiting.remove(run)
@@ -213,14 +213,14 @@ class Session:
         self._request(functools.partial(self._signal, run, name))
 
     def forget(self, run: Run) -> None:
-        """Take a process off the list: it ended."""
+        """Remove a process that has ended."""
         self._runs.pop(run.node.id, None)
         self._changed()
 
     def publish(
         self, port: int, sources: Sequence[str], told: Callable[[str, int], None],
     ) -> None:
-        """Let networks reach a TCP port of the machine that is up; ``told`` learns where."""
+        """Open a TCP port of the running machine; ``told`` is called with host and port."""
         async def publish() -> None:
             assert self.running is not None
             told(*await self._in_thread(self.running.publish, port, sources))
@@ -231,16 +231,16 @@ class Session:
 
     async def choose(self) -> None:
         """
-        Ask for what of the machine takes a while to know.
+        Make the requests of choices such as 'nearest', and complete the spec.
 
-        :raises FogError: it can't be had.
+        :raises FogError: a choice cannot be made.
         """
         if any(callable(value) for value in self.asked.options.values()):
             options = await self._in_thread(words.answered, self.asked.options)
             self.spec = dataclasses.replace(self.asked, options=options)
 
     def up(self, running: RunningMachine) -> None:
-        """Note that the machine is up, and start what waited for it."""
+        """Start the waiting processes: the machine is up."""
         self.running = running
         if not self.came_up.done():
             self.came_up.set_result(True)
@@ -267,7 +267,7 @@ class Session:
             await self._in_thread(self.running.subscribe, self._event_in_thread)
 
     async def _start_waiting(self) -> None:
-        # in one request, so that many nodes start at once
+        # one request for all, so that many nodes start at once
         runs, self._waiting = self._waiting, []
         if not runs or self.running is None:
             return
@@ -306,13 +306,13 @@ class Session:
         except FogError as error:
             self._logger.error(f'{self.spec.name}: {name} not sent to {run.node.name}: {error}')
 
-    # -- what the agent says --------------------------------------------------------------------
+    # -- events of the agent --------------------------------------------------------------------
 
     def _event_in_thread(self, event: dict[str, Any]) -> None:
         try:
             self._loop.call_soon_threadsafe(self._on_event, event)
         except RuntimeError:
-            return  # the launch's event loop is closed: nobody is left to tell
+            return  # the launch's event loop is closed
 
     def _on_event(self, event: dict[str, Any]) -> None:
         if not _makes_sense(event):
@@ -333,7 +333,7 @@ class Session:
         what = ' '.join([event['event'], *([event['state']] if 'state' in event else [])])
         if what in _NOTICES:
             level, text = _NOTICES[what]
-            # an agent of another version may say less
+            # an agent of another version may omit it
             said = f": {event['said']}" if event.get('said') else ''
             self._logger.log(level, f'{self.spec.name}: {text.format_map(_Told(event))}{said}')
         if what in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
@@ -353,19 +353,19 @@ class Session:
             self.move_all()
 
     def move_all(self) -> None:
-        """Have all that runs there go on on the robot."""
+        """Move all of the machine's processes to the robot."""
         ended = [run for run, _ in self._held]
         self._held.clear()
         for run in list(self._runs.values()):
             run.move(stop=not self.lost and run not in ended)
 
     def end_all(self) -> None:
-        """Note the end of all processes of a machine that is gone."""
+        """End all processes of a machine that is gone, for launch."""
         for run in list(self._runs.values()):
             run.end()
 
     def _let_go(self) -> None:
-        """Tell of ends that were held back; the machine is there, or nobody knows."""
+        """Report the exits that were held back: the machine is not known to be gone."""
         self._ending = False
         held, self._held = self._held, []
         for run, event in held:
@@ -392,7 +392,7 @@ def _makes_sense(event: dict[str, Any]) -> bool:
 
 
 class _Told(dict[str, Any]):
-    """Fields of an event, '?' for those that it lacks."""
+    """Fields of an event, with '?' for missing ones."""
 
     def __missing__(self, key: str) -> Any:
         return _Unknown()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGTERM and SIGHUP as the launch's own, orderly shutdown."""
+"""Handle SIGTERM and SIGHUP as an orderly shutdown of the launch."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from fogros2.actions import private
 
 
 def _noticed(number: int, frame: Optional[FrameType]) -> None:
-    """Let Python notice a signal; launch's signal manager then hears of it on its loop."""
+    """Do nothing: a Python handler makes launch's signal manager see the signal."""
 
 
 def take_over(context: LaunchContext) -> Callable[[], None]:
     """
-    Make SIGTERM and SIGHUP shut the launch down in order; return what undoes that.
+    Make SIGTERM and SIGHUP shut the launch down in order; return the undo function.
 
-    Left alone, both kill ``ros2 launch`` on the spot and leave its machines behind. A signal that
-    was ignored from the start (``nohup``) stays ignored. SIGINT stays launch's, but no longer
-    raises KeyboardInterrupt wherever the main thread is, which could cut a rollback short.
+    By default both kill ``ros2 launch`` at once and leave its machines behind. A signal that was
+    ignored from the start (``nohup``) stays ignored. launch still handles SIGINT, but SIGINT no
+    longer raises KeyboardInterrupt in the main thread, which could interrupt a rollback.
     """
     manager = private.signal_manager()
     if manager is None or threading.current_thread() is not threading.main_thread():

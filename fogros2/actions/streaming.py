@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What launch files say of streams, gathered over a launch; and nodes' remappings for them."""
+"""Collect the streams of a launch, and remap the topics of nodes that use them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 _RULE = ('-r', '--remap')
 _NAMESPACE = '__ns:='
 
-# the transports and the reader of entry points are slow to import, so that functions which a
-# launch without streams never calls do it
+# image transports and entry points are slow to import: functions that a launch without streams
+# never calls import them
 
 
 def check(entries: Iterable[Entry]) -> None:
     """
-    Hold entries against what there is, as far as they are plain texts already.
+    Check entries, as far as they are plain texts already.
 
     :raises ConfigurationError: see :func:`fogros2.image_transport.streams.stream`.
     """
@@ -34,15 +34,15 @@ def check(entries: Iterable[Entry]) -> None:
         parts = (entry.topic, entry.transport, entry.direction) \
             if isinstance(entry, StreamTopic) else entry
         if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
-            # a name that no machine has, so that it can't be the source
+            # no machine has the name '', so it cannot be the source
             stream(_named(entry, '/'), '')
 
 
 def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) -> list[Entry]:
     """
-    Return entries with their substitutions performed and their topics' names in full.
+    Resolve the substitutions of entries, and expand their topics to full names.
 
-    :param namespace: the one that relative names are in.
+    :param namespace: namespace of relative names.
     """
     found: list[Entry] = []
     for entry in entries:
@@ -59,7 +59,7 @@ def resolve(context: LaunchContext, entries: Iterable[Entry], namespace: str) ->
 
 
 class Streams:
-    """The streams of a launch, and which of their nodes were handed out already."""
+    """The streams of a launch, and the nodes of them that were returned already."""
 
     def __init__(self) -> None:
         self._streams: list[Stream] = []
@@ -69,10 +69,10 @@ class Streams:
         """
         Add streams to and from ``machine``.
 
-        :return: the nodes that they need and no earlier stream did, each with the machine that
-            it runs on, None for the robot.
+        :return: the nodes that these streams need and no earlier stream did, each with the machine
+            that it runs on, None for the robot.
         :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or images would
-            come back to where they are from, or reach a host in two ways. Nothing was added then.
+            return to their source, or reach a host in two ways. Nothing is added then.
         """
         from fogros2.image_transport import streams
         several = list(self._streams)
@@ -82,7 +82,7 @@ class Streams:
                 for other in several:
                     _compare(one, other)
                 several.append(one)
-        streams.nodes(several)  # which may be refused
+        streams.nodes(several)  # raises if a transport refuses them
         self._streams = several
         return self._not_handed_out()
 
@@ -90,13 +90,13 @@ class Streams:
         self, machine: str,
     ) -> tuple[list[str], list[tuple[Optional[str], NodeSpec]], list[str]]:
         """
-        Have the robot stand for a machine whose nodes go on there.
+        Replace a machine by the robot in all streams, because its nodes move there.
 
-        Topics between the two need no stream any more; those between the machine and another one
-        are between the robot and that one from now on.
+        Streams between the two end. Streams between the machine and another machine become streams
+        between the robot and that machine.
 
-        :return: the ids of nodes elsewhere that none needs now; new nodes, as from ``add``; topics
-            that can't be streamed so, as the robot streams them in another way already.
+        :return: ids of nodes on other hosts that are no longer needed; new nodes, as from ``add``;
+            topics that cannot move, because the robot already streams them in another way.
         """
         if not self._streams:
             return [], [], []
@@ -107,8 +107,8 @@ class Streams:
         for one in self._streams:
             ends = {host for host in (one.source, one.target) if host != machine}
             if len(ends) == 2 or ends == {None}:
-                continue  # not this machine's, or over
-            # camera info goes the way it went: others know it by a name already
+                continue  # another machine's stream, or one that ends
+            # keep the camera info's route: other nodes already use its name
             moved = dataclasses.replace(
                 one, source=None if one.source == machine else one.source,
                 target=None if one.target == machine else one.target,
@@ -127,7 +127,7 @@ class Streams:
         return ended, self._not_handed_out(), left
 
     def _not_handed_out(self) -> list[tuple[Optional[str], NodeSpec]]:
-        """Return the nodes that are needed and were never returned; they count as such then."""
+        """Return nodes that are needed and were not returned before; remember them as returned."""
         from fogros2.image_transport import streams
         new = [(machine, spec) for machine, specs in streams.nodes(self._streams).items()
                for spec in specs if spec.id not in self._handed_out]
@@ -140,7 +140,7 @@ class Streams:
                 if host != machine for spec in specs}
 
     def remappings(self, machine: str) -> dict[str, str]:
-        """Return how the topics of the streams are renamed for nodes on a machine."""
+        """Return the new names of streamed topics for nodes on a machine."""
         if not self._streams:
             return {}
         from fogros2.image_transport.streams import remappings
@@ -149,11 +149,11 @@ class Streams:
 
 def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
     """
-    Return a process that knows topics by their new names, whatever it calls them itself.
+    Rename topics for a process, even if it remaps them itself.
 
-    A program that takes no ROS arguments is returned as it is.
+    A program without ROS arguments is returned unchanged.
 
-    :param names: new names by the full old ones.
+    :param names: new topic names by full old names.
     """
     arguments = node.arguments
     if not names or '--ros-args' not in arguments:
@@ -206,7 +206,7 @@ def _host(machine: Optional[str]) -> str:
 
 
 def _named(entry: Any, namespace: str) -> Any:
-    """Return an entry whose topic has its full name; what is no entry as it is."""
+    """Return an entry with its topic's full name; return an invalid entry unchanged."""
     from fogros2.image_transport.streams import StreamTopic
     from fogros2.image_transport.topics import absolute
     if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], str) and entry[0]:
@@ -229,7 +229,7 @@ def _source(context: LaunchContext, source: Any) -> Any:
     if source is None:
         return None
     coordinator = Coordinator.of(context)
-    # it may be that nothing else of the launch runs there
+    # perhaps the launch runs nothing else there
     coordinator.know(source)
     name = source.spec(context).name if isinstance(source, CloudInstance) \
         else words.resolve(context, source)
@@ -237,17 +237,17 @@ def _source(context: LaunchContext, source: Any) -> Any:
 
 
 def to_robot(entry: StreamTopic) -> StreamTopic:
-    """Return a stream from another machine for one that turned out to be the robot."""
+    """Turn a stream from another machine to this machine into a stream to the robot."""
     from fogros2.image_transport.streams import StreamTopic
     return StreamTopic(entry.topic, entry.transport, 'to_robot', **entry.parameters)
 
 
 def from_robot(entry: Entry, away: Iterable[str]) -> Entry:
-    """Return a stream as it is when its source is one of the machines that were taken away."""
+    """Return a stream with the robot as its source, if its source is a preempted machine."""
     from fogros2.image_transport.streams import StreamTopic
     if not isinstance(entry, StreamTopic) or entry.source not in away:
         return entry
-    # as one that the robot took over
+    # the same form as a stream that ``take_over`` has moved
     return StreamTopic(entry.topic, entry.transport, entry.direction, **{
         'camera_info': False, **entry.parameters})
 
@@ -258,7 +258,7 @@ def _parameter(context: LaunchContext, value: Any) -> Any:
     text = words.resolve(context, value)
     if not isinstance(text, str):
         return text
-    # a substitution makes a text of every value; as in a parameter file, YAML tells its type
+    # a substitution turns every value into a text; YAML finds its type, as in a parameter file
     import yaml
     typed = yaml.safe_load(text)
     return typed if isinstance(typed, (bool, int, float)) else text

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Name the images that cross the VPN as they are, once, so that the user can stream them.
+Warn of images that cross the VPN uncompressed, once each, so that the user can stream them.
 
-The counters of the VPN's interface say whether there is anything to look for, which costs nothing.
-Only on a busy VPN a program of the dashboard's looks at the graph, for some seconds.
+The byte counters of the VPN's interface cost nothing to read. Only if they show a busy VPN, a
+program of the dashboard inspects the ROS graph for some seconds.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from fogros2 import plugin_system, process
 from fogros2.errors import FogError
 from fogros2.model import Command, NodeSpec
 
-#: Seconds between two looks at the counters; bits per second that are worth a look at the graph.
+#: Poll interval of the counters in seconds; bits per second from which the graph is inspected.
 INTERVAL, BUSY = 5.0, 20e6
-#: Looks at the counters that are left out after one at the graph.
+#: Number of polls that are skipped after an inspection of the graph.
 PAUSE = 12
-#: Seconds that a look at the graph takes, until all nodes are known, and the longest.
+#: Duration of an inspection in seconds, until all nodes are discovered, and its time-out.
 LOOK, PATIENCE = 8.0, 40.0
 _IMAGE = 'sensor_msgs/msg/Image'
 
@@ -33,10 +33,10 @@ def watch(
     ended: threading.Event, interval: float = INTERVAL,
 ) -> None:
     """
-    Warn once of each image topic that crosses the VPN as it is, until the launch ends.
+    Warn once of each image topic that crosses the VPN uncompressed, until the launch ends.
 
     :param count: returns the bytes that the VPN has carried, both ways; OSError without a VPN.
-    :param look: returns the image topics that cross; FogError ends the watch.
+    :param look: returns the image topics that cross the VPN; a FogError ends the watch.
     """
     known: set[str] = set()
     pause = 0
@@ -59,7 +59,7 @@ def watch(
 
 
 def carried(interface: str) -> int:
-    """Return the bytes that an interface has carried, both ways."""
+    """Return the bytes that a network interface has carried, both ways."""
     folder = Path('/sys/class/net', interface, 'statistics')
     return sum(int((folder / f'{way}_bytes').read_text()) for way in ('rx', 'tx'))
 
@@ -69,14 +69,14 @@ def crossing_images(
     ended: threading.Event,
 ) -> list[str]:
     """
-    Return the image topics that have ends on both sides of the VPN.
+    Return the image topics that have publishers and subscribers on different sides of the VPN.
 
-    :param machines: by name, the names of the nodes there.
+    :param machines: by machine, the names of its nodes.
     :param environment: the variables of the robot's nodes.
-    :raises FogError: the launch ends, the program hangs, or it isn't installed.
+    :raises FogError: the launch ends, the program hangs, or it is not installed.
     """
     line = json.dumps({'machines': machines, 'pictures': False}) + '\n'
-    # prints the topics that cross, in lines of JSON, until its standard input ends
+    # the program prints topics that cross as lines of JSON, until its standard input ends
     program = plugin_system.load('fogros2.monitor', 'graph')
     output = process.run(Command(
         ('sh', '-c', '{ cat; sleep "$0"; } | "$@"', str(LOOK), *program), input=line.encode(),
@@ -89,16 +89,16 @@ def crossing_images(
 
 
 def images(line: str) -> list[str]:
-    """Return the image topics in a line that the program prints."""
+    """Return the image topics in a line of the program's output."""
     try:
         told: dict[str, Any] = json.loads(line)
         return [one['topic'] for one in told['topics'] if one['type'] == _IMAGE]
     except (ValueError, KeyError, TypeError):
-        return []  # what a library prints
+        return []  # output of a library
 
 
 def node_name(node: NodeSpec) -> str:
-    """Return the name that a node has in the graph: its remapping, or else its program's."""
+    """Return the ROS name of a node: its remapped name, or else its program's name."""
     words = [word for word in node.arguments if isinstance(word, str)]
     told = [word.partition('__node:=')[2] for word in words if word.startswith('__node:=')]
     return told[0] if told else node.executable or node.name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values of launch files: plain, or substitutions that are resolved when executed."""
+"""Values of launch files: plain, or substitutions that are resolved at execution."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _TRUTHS = {'true': True, '1': True, 'false': False, '0': False}
 
 
 class Items(tuple[Any, ...]):
-    """Several values, each resolved alone; launch would read a plain list as one text."""
+    """Several values, each resolved separately; launch would read a plain list as one text."""
 
 
 class Listed:
-    """A text that is several values once it is resolved, as :func:`split` takes it apart."""
+    """A text that contains several values once it is resolved; see :func:`split`."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
@@ -30,18 +30,18 @@ class Listed:
 def items(
     values: Union[Iterable[SomeSubstitutionsType], Substitution, Listed, None],
 ) -> Union[Items, Listed, None]:
-    """Return values that stay apart, None for none; a substitution is several in one text."""
+    """Return values as separate items, None for none; a substitution contains them in one text."""
     if values is None or isinstance(values, Listed):
         return values
-    # known by what it does: describing a machine doesn't import launch
+    # recognised by its method: describing a machine does not import launch
     return Listed(values) if hasattr(values, 'perform') else Items(values)
 
 
 def split(text: str) -> list[str]:
     """
-    Return the values in a text: ``a, b``, or YAML's ``[a, b]``; none in an empty one.
+    Split a text into values: ``a, b``, or YAML's ``[a, b]``; an empty text has none.
 
-    :raises ConfigurationError: it begins as a list of YAML's and is none, or not of texts.
+    :raises ConfigurationError: it begins with '[' and is not a YAML list of texts.
     """
     if not text.lstrip().startswith('['):
         return [part.strip() for part in text.split(',') if part.strip()]
@@ -52,9 +52,9 @@ def split(text: str) -> list[str]:
 
 
 def read_yaml(text: str) -> Any:
-    """Return what YAML there is in a text, its scalars left as texts; None for what is none."""
+    """Parse YAML, with scalars as texts; return None if it is invalid."""
     import yaml
-    # what the safe loader is built on; it makes no number of 2222:22
+    # the base of the safe loader; it does not convert 2222:22 to a number
     loader = yaml.BaseLoader(text)
     try:
         return loader.get_single_data()
@@ -65,57 +65,57 @@ def read_yaml(text: str) -> Any:
 
 
 class Number:
-    """A value that is a number once it is resolved; substitutions only make texts."""
+    """A value that resolves to a number; a substitution resolves to text only."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
 
 
 def number(value: Any) -> Optional[Number]:
-    """Return a value that resolves to a number, None for none."""
+    """Mark a value as a number, None for none."""
     return None if value is None else Number(value)
 
 
 class Truth:
-    """A value that is True or False once it is resolved, as launch reads a condition."""
+    """A value that resolves to True or False, with the syntax of launch's conditions."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
 
 
 def truth(value: Any) -> Optional[Truth]:
-    """Return a value that resolves to True or False, None for none."""
+    """Mark a value as True or False, None for none."""
     return None if value is None else Truth(value)
 
 
 class Later(Protocol):
-    """A value that takes a while to know: calling it asks, in a thread that may wait."""
+    """A value that takes time to obtain: the call makes the request, in a thread."""
 
     def __call__(self) -> str:
         """
-        Return the value; the second call returns the same.
+        Return the value; a second call returns the same.
 
-        :raises FogError: nobody answers, or there is no such value.
+        :raises FogError: the request failed, or there is no such value.
         """
 
 
 def resolve_later(context: LaunchContext, value: Any) -> Any:
-    """Return as ``resolve`` does, but for a value that takes a while, which is Later."""
+    """Resolve a value like ``resolve``, but return a slow value as a :class:`Later`."""
     later = getattr(value, 'later', None)
     return resolve(context, value) if later is None else later(context)
 
 
 def answered(options: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return options with those asked for that are Later; call it in a thread.
+    Call every :class:`Later` among options; run it in a thread.
 
-    :raises FogError: one can't be had.
+    :raises FogError: a value cannot be obtained.
     """
     return {key: value() if callable(value) else value for key, value in options.items()}
 
 
 def plain(value: Any) -> Any:
-    """Return a number, a truth, or a text for people, of a value that may not be resolved yet."""
+    """Return the value without its mark, or a description of an unresolved one."""
     if isinstance(value, (Number, Truth, Listed)):
         return plain(value.value)
     if isinstance(value, Mapping):
@@ -125,10 +125,10 @@ def plain(value: Any) -> Any:
 
 def resolve(context: LaunchContext, value: Any) -> Any:
     """
-    Return a value with its substitutions performed.
+    Resolve the substitutions in a value.
 
-    A list or tuple is one text in pieces, as everywhere in launch; Items become a list; other
-    types are returned as they are.
+    A list or tuple is one text in parts, as everywhere in launch. Items become a list. Values of
+    other types are returned unchanged.
     """
     if value is None or isinstance(value, (str, int, float, Decimal)):
         return value
@@ -157,9 +157,9 @@ def is_text(value: Any) -> bool:
 
 def check_plain(value: Any) -> None:
     """
-    Hold a Number or a Truth against what it has to be, as far as it is known already.
+    Check a Number or a Truth whose value is known already.
 
-    :raises ConfigurationError: it is something else.
+    :raises ConfigurationError: the value is something else.
     """
     if isinstance(value, (Number, Truth)) and isinstance(
             value.value, (str, bool, int, float, Decimal)):
@@ -175,9 +175,9 @@ def _number(value: Any) -> float:
 
 def read_truth(value: Any) -> bool:
     """
-    Return the truth in a text, as launch reads a condition; or of a value that is none.
+    Convert a text to True or False, as launch does for a condition; other values by ``bool``.
 
-    :raises ConfigurationError: a text says neither.
+    :raises ConfigurationError: the text is neither.
     """
     if not isinstance(value, str):
         return bool(value)
@@ -187,7 +187,7 @@ def read_truth(value: Any) -> bool:
 
 
 def describe(value: Any) -> str:
-    """Return a text for people: the value itself, or what a substitution says of itself."""
+    """Return a readable text: the value itself, or a substitution's description."""
     if value is None or isinstance(value, (str, os.PathLike)):
         return os.fspath(value or '')
     parts = value if isinstance(value, (list, tuple)) else [value]

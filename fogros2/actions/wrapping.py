@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at every entity that some content yields, now or later, before launch visits it."""
+"""Apply a function to every entity that some content yields, now or later, before its visit."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from launch import Event, LaunchContext, LaunchDescription, LaunchDescriptionEnt
 from launch.actions import TimerAction
 from launch.events import IncludeLaunchDescription
 
-#: Methods of the context through which something can come later.
+#: Methods of the context by which a visit adds entities for later.
 _INTERCEPTED = ('register_event_handler', 'emit_event_sync')
 
-#: What is done with an entity before it is visited.
+#: Called with each entity before its visit.
 Apply = Callable[[LaunchDescriptionEntity, LaunchContext], None]
 
 
 class Wrapped(LaunchDescriptionEntity):
     """
-    Another entity, looked at first; what its visit yields is wrapped likewise.
+    An entity to which a function is applied before its visit; its results are wrapped too.
 
-    That holds for what comes later too: the actions of a timer, of every event handler that the
-    visit registers (``RegisterEventHandler``, ``on_exit=``), and of an include that it emits.
+    This includes later results: the actions of a timer, of every event handler that the visit
+    registers (``RegisterEventHandler``, ``on_exit=``), and of an include that the visit emits.
     """
 
     def __init__(self, entity: LaunchDescriptionEntity, apply: Apply) -> None:
@@ -32,18 +32,18 @@ class Wrapped(LaunchDescriptionEntity):
         self._apply = apply
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Look at the entity, visit it, and wrap what it yields."""
+        """Apply the function to the entity, visit it, and wrap the results."""
         entity = self._entity
         self._apply(entity, context)
         if isinstance(entity, TimerAction):
-            # the handler it registers is one for all timers of the launch, others' as well
+            # its handler serves all timers of the launch, also timers outside this content
             _wrap_result(entity, self._apply)
             return wrap(entity.visit(context), self._apply)
         with _intercepted(context, self._apply):
             return wrap(entity.visit(context), self._apply)
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
-        """Return the entity's own."""
+        """Return the entity's own future."""
         future: Optional[asyncio.Future[Any]] = self._entity.get_asyncio_future()
         return future
 
@@ -52,18 +52,18 @@ class Wrapped(LaunchDescriptionEntity):
         return str(self._entity.describe())
 
     def describe_sub_entities(self) -> list[LaunchDescriptionEntity]:
-        """Return the entity's own."""
+        """Return the entity's own sub-entities."""
         return list(self._entity.describe_sub_entities())
 
     def describe_conditional_sub_entities(
         self,
     ) -> list[tuple[str, Iterable[LaunchDescriptionEntity]]]:
-        """Return the entity's own."""
+        """Return the entity's own conditional sub-entities."""
         return list(self._entity.describe_conditional_sub_entities())
 
 
 def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]:
-    """Wrap what a visit or a handler returned: nothing, an entity, or several."""
+    """Wrap the result of a visit or a handler: None, an entity, or several."""
     if entities is None:
         return None
     several: Iterable[Any] = entities if isinstance(entities, Iterable) else (entities,)
@@ -71,11 +71,11 @@ def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]
 
 
 def _wrap_result(handles: Any, apply: Apply) -> None:
-    """Have the ``handle`` method of a timer or an event handler return wrapped entities."""
+    """Make the ``handle`` method of a timer or an event handler return wrapped entities."""
     handle = handles.handle
 
     def wrapped(*args: Any) -> Optional[list[LaunchDescriptionEntity]]:
-        # the context comes last: handle(context) of a timer, handle(event, context) of the rest
+        # the context is the last argument: handle(context) of a timer, handle(event, context) else
         with _intercepted(args[-1], apply):
             return wrap(handle(*args), apply)
 
@@ -84,7 +84,7 @@ def _wrap_result(handles: Any, apply: Apply) -> None:
 
 @contextlib.contextmanager
 def _intercepted(context: LaunchContext, apply: Apply) -> Iterator[None]:
-    """Wrap what will come of the handlers registered and the includes emitted meanwhile."""
+    """Wrap the results of handlers registered and of includes emitted during the block."""
     register, emit = context.register_event_handler, context.emit_event_sync
 
     def registering(event_handler: Any, append: bool = False) -> None:
@@ -97,7 +97,7 @@ def _intercepted(context: LaunchContext, apply: Apply) -> Iterator[None]:
                 LaunchDescription(wrap(event.launch_description, apply)))
         emit(event)
 
-    # launch runs one visit at a time, so the context is ours until this one is over
+    # launch runs one visit at a time, so no other visit uses the context meanwhile
     mine = vars(context)
     outer = {name: mine[name] for name in _INTERCEPTED if name in mine}
     mine.update(dict(zip(_INTERCEPTED, (registering, emitting))))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Machines, cloud nodes, cloud groups and streams in launch files of XML and YAML.
+Add machines, cloud nodes, cloud groups and streams to launch files of XML and YAML.
 
-launch imports this module for every such file (``launch.frontend.launch_extension``), so what an
-element takes is imported when one is read. doc/launch_xml_yaml.md shows them all.
+launch imports this module for every such file (``launch.frontend.launch_extension``), so each
+function imports its parser only when needed. doc/launch_xml_yaml.md describes all elements.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from launch.frontend import expose_action
 if TYPE_CHECKING:
     from launch.frontend import Entity, Parser
 
-    #: The class of an action, and what its constructor is called with.
+    #: The class of an action, and its constructor's keywords.
     Parsed = tuple[type[Any], dict[str, Any]]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What XML and YAML say in actions where Python has objects: a stream, a description."""
+"""Actions of XML and YAML for what Python has as objects: a stream, a launch description."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 class StreamTopicEverywhere(Action):
     """
-    A topic that crosses the VPN encoded, between the robot and every machine of the launch.
+    Stream a topic between the robot and every machine of the launch.
 
-    Below a node or a CloudGroup it is that one's alone: these take ``entry`` from it.
+    Inside a node or a CloudGroup the stream belongs to that one only: it uses just ``entry``.
     """
 
     def __init__(self, entry: StreamTopic, **kwargs: Any) -> None:
@@ -32,17 +32,17 @@ class StreamTopicEverywhere(Action):
         self.entry = entry
 
     def execute(self, context: LaunchContext) -> None:
-        """Execute the action: processes that execute after it bring the stream along."""
+        """Execute the action: processes that execute later use the stream."""
         Coordinator.of(context).stream_everywhere(
             [self.entry], context.launch_configurations.get('ros_namespace', '/'))
 
 
 class FogROSLaunch(Action):
     """
-    A FogROSLaunchDescription that stands in another description.
+    A FogROSLaunchDescription inside another description.
 
     :param actions: the content.
-    :param robot_nodes: see there, and ``dds``.
+    :param robot_nodes: as for FogROSLaunchDescription, and ``dds`` too.
     """
 
     def __init__(
@@ -60,11 +60,11 @@ class FogROSLaunch(Action):
             self._description(robot_nodes, None)
 
     def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
-        """Return the content, for launch's own look ahead."""
+        """Return the content, because launch inspects sub-entities before execution."""
         return list(self._actions)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
-        """Execute the action: yields the description."""
+        """Execute the action: return the description."""
         return [self._description(words.resolve(context, self._robot_nodes),
                                   words.resolve(context, self._dds))]
 
@@ -76,9 +76,9 @@ class FogROSLaunch(Action):
 
 def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopic]]:
     """
-    Return actions, and the streams that stand among them, apart.
+    Separate streams from other actions; return both.
 
-    :raises ConfigurationError: a stream has a condition, which is for the whole launch alone.
+    :raises ConfigurationError: a stream has a condition, which only a stream of the launch may.
     """
     others: list[Action] = []
     entries: list[StreamTopic] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading an element of a launch file, in XML or YAML, by what a constructor takes."""
+"""Read an element of a launch file, in XML or YAML, as the keywords of a constructor."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     Parsed = Union[str, list[Substitution]]
 
-#: How the parsers name what nobody has read: ``... found in `node`: {'a', 'b'}``.
+#: The parsers' error about attributes that were not read: ``... found in `node`: {'a', 'b'}``.
 _UNREAD = re.compile(r'found in `.*?`: (\{.*\})', re.DOTALL)
-#: What every action has.
+#: Attributes of every action.
 CONDITIONS = ('if', 'unless')
 _EXPECTED = {
     'text': "a text, such as '512'", 'number': 'a number', 'truth': 'true or false',
@@ -27,7 +27,7 @@ _EXPECTED = {
 
 
 def text(parser: Parser, raw: str) -> Parsed:
-    """Return a text as launch reads it: plain, or substitutions that are performed later."""
+    """Parse a text as launch does: a plain string, or substitutions to resolve later."""
     from launch.substitutions import TextSubstitution
     parts: list[Substitution] = parser.parse_substitution(raw)
     plain = [part.text for part in parts if isinstance(part, TextSubstitution)]
@@ -36,9 +36,9 @@ def text(parser: Parser, raw: str) -> Parsed:
 
 def attribute(entity: Entity, parser: Parser, name: str) -> Optional[Parsed]:
     """
-    Return an attribute that is a text, None for none.
+    Return a text attribute, None if it is missing.
 
-    :raises ConfigurationError: it is another thing.
+    :raises ConfigurationError: the attribute is not a text.
     """
     found: Optional[Parsed] = value(entity, parser, keywords.Keyword(name, 'text'))
     return found
@@ -46,11 +46,11 @@ def attribute(entity: Entity, parser: Parser, name: str) -> Optional[Parsed]:
 
 def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
     """
-    Return what an element says of a keyword in its constructor's kind, None for nothing.
+    Return the value of a keyword, converted to its kind; None if it is missing.
 
-    Texts with substitutions stay such, to be resolved when executed.
+    Texts with substitutions are resolved when the action is executed.
 
-    :raises ConfigurationError: it is of another kind.
+    :raises ConfigurationError: the value is of another kind.
     """
     if keyword.kind == 'mapping':
         return _mapping(entity, parser, keyword)
@@ -74,7 +74,7 @@ def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
 
 
 def _is_text(entity: Entity, name: str) -> bool:
-    """Return whether an attribute is a text, and neither missing nor elements of their own."""
+    """Return whether an attribute is a text; False if it is missing or consists of elements."""
     try:
         return entity.get_attr(name, data_type=str, optional=True) is not None
     except TypeError:
@@ -82,9 +82,9 @@ def _is_text(entity: Entity, name: str) -> bool:
 
 
 def _raw(entity: Entity, name: str) -> Union[str, int, float, bool, list[Any], None]:
-    """Return an attribute as it is written: a text in XML, whatever it is in YAML."""
-    # YAML has types, and refuses another; XML has a list where x-sep stands beside x. The parsers
-    # look at the type, not at what it stands for, so it has to be typing's List
+    """Return an attribute as it is written: a text in XML, any scalar or list in YAML."""
+    # YAML has types and refuses others; XML returns a list if x-sep is given with x. The parsers
+    # compare the type object itself, so it has to be typing's List
     for kind in (str, List[str], None):
         try:
             found: Union[str, int, float, bool, list[Any], None] = entity.get_attr(
@@ -110,9 +110,9 @@ def _wrong(entity: Entity, keyword: keywords.Keyword, raw: object) -> Configurat
 
 def children(entity: Entity, name: str) -> list[Entity]:
     """
-    Return the elements of that name below an element.
+    Return the child elements with this name.
 
-    :raises ConfigurationError: YAML has something else there.
+    :raises ConfigurationError: YAML has another value there.
     """
     try:
         found: Optional[list[Entity]] = entity.get_attr(
@@ -154,11 +154,11 @@ def _table(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
 
 def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
     """
-    Refuse what nobody has read of an element; the parsers would, without a word of what there is.
+    Refuse attributes and elements that were not read; the parsers' own error names no alternative.
 
-    :param known: the attributes and elements that there are.
-    :param what: what the element is, its own name unless given.
-    :raises ConfigurationError: something is left; the hint has the nearest name.
+    :param known: the valid attributes and elements.
+    :param what: description of the element; its name by default.
+    :raises ConfigurationError: something was not read; the hint has the nearest valid name.
     """
     try:
         entity.assert_entity_completely_parsed()

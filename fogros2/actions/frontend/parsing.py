@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the elements of a launch file to FogROS2's actions."""
+"""Parse the elements of a launch file into FogROS2's actions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from fogros2.actions.frontend import Parsed
 
-#: What launch_ros reads of ``<node>`` and ``<node_container>``.
+#: Attributes and elements of ``<node>`` and ``<node_container>`` that launch_ros reads.
 _NODE = (
     'additional_env', 'args', 'composable_node', 'cwd', 'emulate_tty', 'env', 'exec', 'exec_name',
     'launch-prefix', 'name', 'namespace', 'on_exit', 'output', 'output_format', 'param', 'pkg',
@@ -51,7 +51,7 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
     if isinstance(provider, str):
         known = dict(keywords.keywords(keywords.machine_class(provider)))
     else:
-        # which one it is, is known when the action is executed
+        # the provider is resolved when the action is executed: accept the keywords of all
         known = {name: keyword for each in keywords.providers() if _loads(each)
                  for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
@@ -66,7 +66,7 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
 
 
 def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
-    """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and the rest by name."""
+    """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
     known = {'cmd': keywords.Keyword('cmd', 'text'), **keywords.parameters_of(described)}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
     complete(entity, known)
@@ -79,7 +79,7 @@ def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
 
 
 def _loads(provider: str) -> bool:
-    """Return whether a provider's class can be had; another may be meant."""
+    """Return whether a provider's class can be loaded."""
     try:
         keywords.machine_class(provider)
     except ConfigurationError:
@@ -88,12 +88,12 @@ def _loads(provider: str) -> bool:
 
 
 def cloud_node(entity: Entity, parser: Parser) -> Parsed:
-    """Read ``<cloud_node machine="planner" pkg="demo" exec="talker">``, else as ``<node>``."""
+    """Read ``<cloud_node machine="planner" pkg="demo" exec="talker">``, like ``<node>``."""
     return node(entity, parser, CloudNode)
 
 
 def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
-    """Read an element as launch_ros reads that of ``cls``, and the keywords of a machine."""
+    """Read an element of ``cls`` as launch_ros does, with the keywords of a machine."""
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
     known = {'image': keywords.Keyword('image', 'text'),
@@ -108,7 +108,7 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
 
 
 def cloud_group(entity: Entity, parser: Parser) -> Parsed:
-    """Read ``<cloud_group machine="planner">``, otherwise as ``<group>``."""
+    """Read ``<cloud_group machine="planner">``, like ``<group>``."""
     _, kwargs = GroupAction.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
     kwargs['actions'], kwargs['stream_topics'] = instead_of(kwargs['actions'])

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-``machine=`` on ``<node>`` and ``<node_container>``, below ``<fogros_launch>`` alone.
+Allow ``machine=`` on ``<node>`` and ``<node_container>``, only inside ``<fogros_launch>``.
 
-launch has one table of elements for all launch files of a process, so these two stay launch_ros's
-own there. The content of a ``<fogros_launch>`` is read by a copy of its file's parser instead.
-launch hands a parser on to whatever has actions below it, and so the copy reaches them.
+launch has one table of elements for all launch files of a process, so these two elements must stay
+launch_ros's own. A copy of the file's parser reads the content of a ``<fogros_launch>`` instead.
+launch passes the parser on to every element with child actions, so the copy reads these too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NODES = {'node': Node, 'node_container': ComposableNodeContainer}
 
 
 def scoped(parser: Parser) -> Parser:
-    """Return a parser that knows ``machine`` on nodes, in the files that it includes as well."""
+    """Return a parser that accepts ``machine`` on nodes, also in the files that it includes."""
     below = copy.copy(parser)
     vars(below)['parse_action'] = functools.partial(_parse_action, below)
     return below
@@ -48,7 +48,7 @@ def _parse_action(parser: Parser, entity: Entity) -> Action:
 
 
 def _reach(entities: Iterable[LaunchDescriptionEntity]) -> None:
-    """Have the includes among entities, at any depth, read their files with a scoped parser."""
+    """Make the includes among entities, at any depth, read their files with a scoped parser."""
     for entity in entities:
         if isinstance(entity, IncludeLaunchDescription):
             private.replace_reader(entity.launch_description_source, _read)
