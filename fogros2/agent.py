@@ -1,48 +1,51 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-The guard on a cloud machine: starts the nodes, keeps their log, ends the machine in time.
+The agent on a cloud machine: starts the nodes, keeps their log, ends the machine in time.
 
-One file, standard library only, Python 3.10 or newer, so that it runs before anything else is
-there. One thread around a selector; nothing in it waits for a client, a node or a command.
+It is one file for Python 3.10 or newer that uses only the standard library, so that it runs before
+anything is installed. One thread serves a selector and never blocks on a client, node or command.
 
-    agent.py serve --config FILE [--detach]    the guard itself
-    agent.py connect --directory DIR           stdin and stdout to a running guard
+    agent.py serve --config FILE [--detach]    run the agent
+    agent.py connect --directory DIR           relay stdin and stdout to a running agent
 
-Where it runs as root it does so with the login user's effective identity, so that no file the
-user could have swapped is ever touched as root, and takes root back for the commands that need
-it: the VPN's, and the one that ends the machine.
+An agent that was started as root runs with the login user's effective identity, so that root never
+opens a file that the user could have replaced. It becomes root again only for commands that need
+it: those of the VPN, of a watch, and the one that ends the machine.
 
-**Protocol**, JSON objects, one a line. Request ``{"id": 1, "command": ..., ...}``, reply
+**Protocol**: JSON objects, one per line. Request ``{"id": 1, "command": ..., ...}``, reply
 ``{"id": 1, "ok": true, ...}`` or ``{"id": 1, "ok": false, "error", "hint", "kind"}``:
 
-``configure``  any key of ``CONFIG``; re-arms lifetime and, with ``heartbeat``, the watch over it.
-               Another ``launch`` than before: its nodes stop first, and what was kept for it goes;
-               refused (kind ``busy``) while the earlier one sets the machine up or sends
-               heartbeats, unless ``force`` names that earlier one: the robot knows it to be dead.
+``configure``  any key of ``CONFIG``; restarts the lifetime and, with ``heartbeat``, the watchdog.
+               With another ``launch`` than before, the former launch's nodes stop first, and
+               what was kept for that launch ends. Refused (kind ``busy``) while the former launch
+               sets the machine up or sends heartbeats, unless ``force`` names the former launch,
+               which the robot knows to be dead.
                With ``again`` it claims nothing: refused (kind ``released``) unless its ``launch``
-               has the machine, since it may have been under way when that was released.
-``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s)
-``watch``      ``what``, ``argv`` run as root each ``interval`` (s, 5): once it exits with 0 there
-               is one event of the name ``what``, its output as ``reason``, and the watch is over
+               still has the machine; the request may have been delayed until after a release.
+``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
+               health check with repair
+``watch``      ``what``, ``argv``, run as root every ``interval`` (s, default 5). When it exits
+               with 0, the agent sends one event named ``what``, with the output as ``reason``,
+               and ends the watch.
 ``launch``     start the process that will run the nodes, ahead of time
-``start``      ``nodes``: list of NodeSpec; an id that is known already is left alone
+``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
 ``signal``     ``node``, ``signal``: 'SIGINT'
-``status``     see ``Agent.do_status``; ``ping`` says nothing at less cost
+``status``     see ``Agent.do_status``; ``ping`` is cheaper and returns nothing
 ``log``        ``from`` seq, ``follow``: replies ``first`` and ``next`` (seqs that exist), then
-               sends the events' lines; ``lost`` counts events that rotation took away
+               sends the lines of the events; ``lost`` counts events that rotation has deleted
 ``release``    stop the nodes, take down what was kept, disarm the heartbeat, reply when done;
-               ``exit`` true: leave then; does nothing where ``launch`` names one that another
-               has followed
+               with ``exit`` true the agent then exits. Does nothing if another launch has taken
+               the machine over from ``launch``.
 
 Events, in ``events.jsonl`` and on connections that follow: ``{"seq", "time", "event", ...}`` with
 ``started``, ``output``, ``exited``, ``refused``, ``watchdog``, ``vpn_repaired``, ``end_failed``,
-``notice`` (see ``watch``), ``ending`` where a signal ends the agent, and ``launch_exited`` where
-the nodes' launch process ended without having been told to; ``said`` is how its log ends then.
+``notice`` (see ``watch``), ``ending`` when a signal ends the agent, and ``launch_exited`` when the
+nodes' launch process ended unexpectedly, with the end of its log as ``said``.
 
 Heartbeats are UDP datagrams from the robot's VPN address, a JSON object with ``launch``. The agent
-sends each back with ``clock`` added: its time in seconds since the epoch.
+sends each back with ``clock`` added: the machine's time in seconds since the epoch.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ import subprocess
 import sys
 import time
 
-TYPE_CHECKING = False  # typing itself costs a megabyte
+TYPE_CHECKING = False  # importing typing takes a megabyte of memory
 if TYPE_CHECKING:
     from typing import Any, Optional
 
@@ -71,24 +74,24 @@ MAX_LINE = 16 << 20
 #: Bytes of one generation of the log; two are kept.
 LOG_BYTES = 64 << 20
 LAUNCH_LOG_BYTES = 8 << 20
-#: Bytes from the end of the log that are reported when the launch process fails.
+#: Bytes at the end of the launch process's log that are reported when it fails.
 LAST_WORDS = 1000
 BLOCK = 1 << 18
 CLIENTS = 64
-#: Seconds after SIGINT at which what the launch process left behind gets the next signal.
+#: (seconds, signal): when processes that the launch process left behind get each signal.
 SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
 SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
-#: Seconds that a keep's command may take, and between attempts to end the machine.
+#: Time-out of a command in seconds, and seconds between attempts to end the machine.
 COMMAND_TIMEOUT = 30.0
 RETRY_END = 30.0
-#: Events that a watch may be for, and bytes of its command's output that are reported.
+#: Events that a watch may send, and maximum bytes of the command's output in them.
 WATCHED = ('notice',)
 REASON = 2000
 MARK = 'FOGROS2_AGENT_MARK'
-#: Linux: bind to an address that isn't there yet.
+#: Linux: allow to bind to an address that does not exist yet.
 IP_FREEBIND = 15
 
-#: Keys of the configuration: accepted types and default.
+#: Keys of the configuration: accepted types and default value.
 CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'machine': ((str,), ''),
     'launch': ((str,), ''),
@@ -107,14 +110,14 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
 }
 
 
-#: Settings that an agent which starts anew takes from the one before it.
+#: Settings that a restarted agent takes over from its predecessor.
 RESUMED = (
     'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
     'ros_command')
 
 
 class Refused(Exception):
-    """A request that can't be met: message, hint, kind."""
+    """A request that was refused: message, hint, kind."""
 
     def __init__(self, message: str, hint: str = '', kind: str = '') -> None:
         super().__init__(message)
@@ -123,7 +126,7 @@ class Refused(Exception):
 
 
 def boot_clock() -> float:
-    """Return seconds since boot, time asleep included."""
+    """Return seconds since boot, including suspended time."""
     return time.clock_gettime(getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC))
 
 
@@ -141,9 +144,9 @@ def say(text: str) -> None:
 
 def checked(new: Json) -> Json:
     """
-    Return the keys of a configuration that exist, their types looked at.
+    Check the types and values of a configuration; drop unknown keys.
 
-    :raises Refused: a value has the wrong type or makes no sense.
+    :raises Refused: a value has the wrong type or is invalid.
     """
     known: Json = {}
     for key, value in new.items():
@@ -176,9 +179,9 @@ def checked(new: Json) -> Json:
 
 class Watchdog:
     """
-    When a machine has to let go of its nodes; knows seconds alone, so a test brings its own.
+    Decide when a machine has to release its nodes; the caller passes the time in seconds.
 
-    Until a heartbeat has been configured ``boot_timeout`` counts, then ``robot_timeout``.
+    ``boot_timeout`` applies until a heartbeat is configured, then ``robot_timeout``.
     """
 
     def __init__(self, config: Json, now: float) -> None:
@@ -188,7 +191,7 @@ class Watchdog:
         self.beat_at: Optional[float] = None
 
     def configured(self, now: float, *, heartbeat: bool) -> None:
-        """A launch has spoken: the lifetime begins again, and the watch over its heartbeat."""
+        """Restart the lifetime and the heartbeat's deadline: a launch has configured the agent."""
         self.lifetime_from = now
         if heartbeat:
             self.boot_from, self.beat_at = None, now
@@ -196,16 +199,16 @@ class Watchdog:
             self.boot_from = now
 
     def beat(self, now: float) -> None:
-        """A heartbeat came; after ``disarm`` it means nothing."""
+        """Note a heartbeat; ignored after ``disarm``."""
         if self.beat_at is not None:
             self.beat_at = now
 
     def disarm(self) -> None:
-        """The launch said goodbye, or is known to be gone; the lifetime goes on."""
+        """Expect no heartbeat: the launch has ended or is known to be gone; keep the lifetime."""
         self.boot_from = self.beat_at = None
 
     def deadlines(self) -> list[tuple[float, str]]:
-        """Return when what runs out, reason as in the event, soonest first."""
+        """Return (time, reason as in the event) of each deadline, soonest first."""
         found = [(self.lifetime_from + self.config['lifetime'], 'lifetime')]
         if self.boot_from is not None:
             found.append((self.boot_from + self.config['boot_timeout'], 'no launch came'))
@@ -214,7 +217,7 @@ class Watchdog:
         return sorted(found)
 
     def due(self, now: float) -> Optional[str]:
-        """Return the reason to act now, or None."""
+        """Return the reason of a deadline that has passed, or None."""
         at, reason = self.deadlines()[0]
         return reason if now >= at else None
 
@@ -233,7 +236,7 @@ class LogFile:
             os.close(self.fd)
 
     def read(self, offset: int, end: Optional[int] = None) -> bytes:
-        """Return whole lines from ``offset`` on, at least one where there is one."""
+        """Return whole lines from ``offset`` on, at least one if there is one."""
         end = self.size if end is None else min(end, self.size)
         count = BLOCK
         while offset < end:
@@ -242,19 +245,19 @@ class LogFile:
             if cut:
                 return data[:cut]
             if len(data) < count:
-                break  # somebody cut the file short
+                break  # something truncated the file
             count *= 4
         return b''
 
     def seq_at(self, offset: int) -> int:
-        """Return the seq of the line that begins at ``offset``; 0 if that is no line of ours."""
+        """Return the seq of the line that begins at ``offset``; 0 if it is no line of the log."""
         head = os.pread(self.fd, 40, offset)
         number = head[7:].split(b',')[0]
         return int(number) if head.startswith(b'{"seq":') and number.isdigit() else 0
 
     def find(self, seq: int) -> int:
-        """Return the offset of the first line whose seq isn't below ``seq``."""
-        low, high = 0, self.size  # a line begins at low, and it isn't beyond the one sought
+        """Return the offset of the first line whose seq is ``seq`` or higher."""
+        low, high = 0, self.size  # a line begins at low, at or before the wanted line
         while high - low > 1:
             middle = (low + high) // 2
             line = self.next_line(middle)
@@ -267,7 +270,7 @@ class LogFile:
         return low
 
     def next_line(self, offset: int) -> int:
-        """Return where the first line after ``offset`` begins, or the file's size."""
+        """Return the offset of the first line after ``offset``, or the file's size."""
         while offset < self.size:
             data = os.pread(self.fd, 4096, offset)
             at = data.find(b'\n')
@@ -281,9 +284,9 @@ class LogFile:
 
 class Log:
     """
-    The events, on disk in two generations, so that neither memory nor disk fill.
+    The events on disk, in two generations, so that neither memory nor disk fills up.
 
-    :param limit: bytes of a generation.
+    :param limit: size of a generation in bytes.
     """
 
     def __init__(self, directory: str, limit: int) -> None:
@@ -314,18 +317,18 @@ class Log:
             step *= 8
 
     def _cut_torn_line(self, file: LogFile) -> None:
-        """Drop what a crash left of a line in the middle of writing it."""
+        """Remove an incomplete last line that a crash left."""
         if file.size and os.pread(file.fd, 1, file.size - 1) != b'\n':
             file.size = self._last_line(file)
             os.ftruncate(file.fd, file.size)
 
     @property
     def first(self) -> int:
-        """The oldest seq that there is, or would be."""
+        """The oldest seq that exists; the next seq if the log is empty."""
         return self.files[0].first
 
     def append(self, lines: list[bytes]) -> None:
-        """Number and write events: each the inside of a JSON object, ``"event":...}``."""
+        """Number and write events, given without the first brace: ``"event":...}``."""
         stamp = b'"time":%.6f,' % time.time()
         numbered = []
         for line in lines:
@@ -346,7 +349,7 @@ class Log:
             file.size += written
             self.full = False
         except OSError as error:
-            # a guard without a log still guards; the gap shows in the seqs
+            # the agent works without a log too; the missing seqs show the gap
             if not self.full:
                 say(f'events are being lost: {error}')
             self.full = True
@@ -359,7 +362,7 @@ class Log:
         return file
 
     def locate(self, seq: int) -> tuple[LogFile, int]:
-        """Return the file and offset at which events from ``seq`` on begin."""
+        """Return the file and the offset at which the events from ``seq`` on begin."""
         chosen = self.files[0]
         for file in self.files[1:]:
             if file.first <= seq:
@@ -368,14 +371,14 @@ class Log:
 
 
 class Client:
-    """A connection: requests in, replies and log lines out."""
+    """A connection: receives requests, sends replies and log lines."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.socket = connection
         self.received = bytearray()
         self.out = bytearray()
         self.cursor: Optional[tuple[LogFile, int]] = None
-        #: where a log request without follow ends
+        #: End of a log request without ``follow``.
         self.until: Optional[tuple[LogFile, int]] = None
         self.behind = False
         self.awaiting = 0
@@ -384,7 +387,7 @@ class Client:
 
 
 class Kept:
-    """Something the agent keeps going: a command that looks, and commands that repair."""
+    """A health check: a command that checks, and commands that repair."""
 
     def __init__(self, request: Json) -> None:
         self.what = str(request['what'])
@@ -400,7 +403,7 @@ class Kept:
 
 
 class Watched:
-    """A command that is run again and again until it succeeds."""
+    """A command that runs periodically until it succeeds."""
 
     def __init__(self, request: Json) -> None:
         self.what = str(request['what'])
@@ -410,9 +413,9 @@ class Watched:
 
 def words(argv: Any) -> list[str]:
     """
-    Return a command line as it came.
+    Check that a value is a command line; return it.
 
-    :raises Refused: it isn't one.
+    :raises Refused: it is not a list of strings.
     """
     if not isinstance(argv, list) or not all(isinstance(w, str) and '\0' not in w for w in argv):
         raise Refused(f'{json.dumps(argv)[:80]} is no list of words')
@@ -420,7 +423,7 @@ def words(argv: Any) -> list[str]:
 
 
 class Timer:
-    """A callback for later; ``cancel`` by setting ``at`` to None."""
+    """A delayed callback; setting ``at`` to None cancels it."""
 
     def __init__(self, at: float, call: Callable[[], None]) -> None:
         self.at: Optional[float] = at
@@ -429,9 +432,9 @@ class Timer:
 
 class CloudLaunch:
     """
-    The process that runs the nodes, and the socket to it.
+    The process that runs the nodes, and the agent's socket to it.
 
-    :param environment: what was configured for it when it was started.
+    :param environment: the configured variables at its start.
     """
 
     def __init__(self, pid: int, connection: socket.socket, environment: Json) -> None:
@@ -446,10 +449,10 @@ class CloudLaunch:
 
 class Agent:
     """
-    The guard: clients, the nodes' launch process, kept things and the watchdog in one loop.
+    The agent: clients, the nodes' launch process, health checks and the watchdog in one loop.
 
     :param config: see ``CONFIG``.
-    :param clock: monotonic seconds.
+    :param clock: returns monotonic seconds.
     """
 
     def __init__(self, config: Json, clock: Callable[[], float] = boot_clock) -> None:
@@ -464,7 +467,7 @@ class Agent:
             self.directory = os.path.join(self.account.pw_dir, self.directory[2:])
         self.directory = os.path.normpath(self.directory)
         if not os.path.isabs(self.directory) or self.directory in ('/', self.account.pw_dir):
-            # it is emptied in the end: it has to be the agent's own
+            # the agent deletes its content in the end, so it must belong to the agent alone
             raise Refused(f"the agent can't have the directory '{self.directory}'")
         self.config['directory'] = self.directory
         self.selector = selectors.DefaultSelector()
@@ -477,22 +480,22 @@ class Agent:
         self.launch: Optional[CloudLaunch] = None
         self.after_launch: list[Callable[[], None]] = []
         self.stopping = self.ending = self.done = False
-        #: Whether another launch than the one that made the machine has it.
+        #: Whether a launch has taken the machine over from the launch that created it.
         self.adopted = False
-        #: The launch that will have the machine when the former one's nodes are gone.
+        #: The launch that will have the machine when the former launch's nodes have ended.
         self.claimed = ''
-        #: Whether no launch has the machine: what still comes from the former one starts nothing.
+        #: Whether no launch has the machine; late requests of the former launch start nothing.
         self.released = False
         self.heart: Optional[socket.socket] = None
         self.since = time.time()
         self.mark = f'{os.getpid()}-{time.time_ns()}'
         self.watchdog = Watchdog(self.config, clock())
 
-    # -- the directory and who we are ---------------------------------------------------------
+    # -- the directory and the identity -------------------------------------------------------
 
     @contextlib.contextmanager
     def root(self) -> Iterator[None]:
-        """Take root back, where the agent has it, for the block."""
+        """Become root during the block, if the agent was started as root."""
         if not self.privileged:
             yield
             return
@@ -506,9 +509,9 @@ class Agent:
 
     def open(self) -> None:
         """
-        Take the directory: made, locked, the socket in it.
+        Create the directory, lock it, and open the socket in it.
 
-        :raises Refused: it can't be written, or another agent has it.
+        :raises Refused: the directory is not writable, or another agent uses it.
         """
         try:
             if self.privileged:
@@ -543,7 +546,7 @@ class Agent:
         os.makedirs(os.path.dirname(self.directory), mode=0o755, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             os.mkdir(self.directory, 0o700)
-            # only what was just made is given away, and not through a symbolic link
+            # change the owner only of a new directory, and never through a symbolic link
             folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             os.fchown(folder, self.account.pw_uid, self.account.pw_gid)
             os.close(folder)
@@ -551,10 +554,10 @@ class Agent:
     def _listen(self) -> socket.socket:
         path = self.path('agent.sock')
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(path)  # a former agent's: we hold the lock
+            os.unlink(path)  # left by a former agent: this one holds the lock
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         mask = os.umask(0o177)
-        # a Unix address has room for 107 bytes; a directory may be deeper
+        # a Unix socket address has at most 107 bytes; the directory's path may be longer
         folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
         try:
             listener.bind(path if len(path) < 100 else f'/proc/self/fd/{folder}/agent.sock')
@@ -569,22 +572,22 @@ class Agent:
         return os.path.join(self.directory, name)
 
     def _resume(self) -> None:
-        """Take over what a launch had configured an agent that died here."""
+        """Take over the configuration of an agent that died in this directory."""
         try:
             with open(self.path('config.json')) as stream:
                 saved = checked(json.load(stream))
         except (AttributeError, OSError, Refused, ValueError):
             return
         if saved.get('machine') == self.config['machine']:
-            # the user could have written it: nothing that root would do
+            # the user could have written the file: take nothing that root would execute
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self.watchdog.configured(self.clock(), heartbeat=bool(self.config['heartbeat']))
             if not self.config['launch'] and self.config['on_exit'] == 'keep':
-                self.watchdog.disarm()  # it waits for no launch
+                self.watchdog.disarm()  # a kept machine expects no launch
                 self.released = True
 
     def save(self) -> None:
-        """Keep the pid for people and the configuration for an agent that starts anew."""
+        """Write the pid for people, and the configuration for a restarted agent."""
         try:
             os.ftruncate(self.lock, 0)
             os.pwrite(self.lock, f'{os.getpid()}\n'.encode(), 0)
@@ -599,12 +602,12 @@ class Agent:
     # -- the loop -----------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Serve until the agent leaves."""
+        """Serve until the agent ends."""
         alarm, wake = socket.socketpair()
         alarm.setblocking(False)
         wake.setblocking(False)
         signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
-        # SIGHUP has a handler and isn't ignored: a child would inherit that
+        # a handler, because children would inherit an ignored SIGHUP
         for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda number, frame: None)
         register = self.selector.register
@@ -617,7 +620,7 @@ class Agent:
             say(str(error))
         self.every(10.0, self._trim_launch_log)
         if self.log.next > 1:
-            # nodes of an agent that died here ended with it, and nobody could say so
+            # the nodes ended with the agent that died here, and nothing has reported it
             self.emit('launch_exited', returncode=-int(signal.SIGKILL), said='')
         while not self.done:
             now = self.clock()
@@ -634,13 +637,13 @@ class Agent:
             self._drop(client)
 
     def at(self, delay: float, call: Callable[[], None]) -> Timer:
-        """Call in ``delay`` seconds."""
+        """Call a function in ``delay`` seconds."""
         timer = Timer(self.clock() + delay, call)
         self.timers.append(timer)
         return timer
 
     def every(self, interval: float, call: Callable[[], None]) -> None:
-        """Call each ``interval`` seconds."""
+        """Call a function every ``interval`` seconds."""
         def again() -> None:
             call()
             self.at(interval, again)
@@ -659,7 +662,7 @@ class Agent:
             self._reap()
         if signal.SIGTERM in numbers or signal.SIGINT in numbers:
             if self.ending and self.stopping:
-                self.done = True  # asked twice
+                self.done = True  # the second signal ends the agent at once
             say('asked to end')
             if not self.ending:
                 self.emit('ending', reason='asked to end by a signal')
@@ -674,7 +677,7 @@ class Agent:
                 os.unlink(self.path(name))
 
     def _reap(self) -> None:
-        # as process 1 of a container the agent inherits every orphan there
+        # as process 1 of a container, the agent inherits all orphans
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -691,7 +694,7 @@ class Agent:
         output: int = -1,
     ) -> None:
         """
-        Run a command as root where possible; ``then`` gets its exit status, 127: none such.
+        Run a command, as root if possible; pass its exit status to ``then`` (127: not found).
 
         Its output goes to the agent's own log, standard output to the descriptor ``output``.
         """
@@ -707,7 +710,7 @@ class Agent:
             self.at(0.0, lambda: then(127))
             return
         pid = child.pid
-        child.returncode = 0  # the status is ours to collect: see _reap
+        child.returncode = 0  # _reap collects the status
 
         def expire() -> None:
             say(f'{argv[0]} took longer than {timeout:g} s')
@@ -723,7 +726,7 @@ class Agent:
         self.children[pid] = exited
 
     def spawn_all(self, commands: list[list[str]], then: Callable[[bool], None]) -> None:
-        """Run commands as root, one after the other, all of them; ``then``: did all succeed."""
+        """Run all commands as root in order; tell ``then`` whether all succeeded."""
         def step(index: int, good: bool) -> None:
             if index == len(commands):
                 then(good)
@@ -734,18 +737,18 @@ class Agent:
     # -- events -------------------------------------------------------------------------------
 
     def emit(self, event: str, **data: Any) -> None:
-        """Append an event to the log and send it to those who follow."""
+        """Append an event to the log and send it to the clients that follow."""
         self.write([dump({'event': event, **data})[1:]])
 
     def write(self, lines: list[bytes]) -> None:
-        """Append events, given as in ``Log.append``, and send them to those who follow."""
+        """Append events, given as in ``Log.append``, and send them to clients that follow."""
         self.log.append(lines)
         for client in list(self.clients):
             if client.cursor is not None and not client.out:
                 self._pump(client)
 
     def _pump(self, client: Client) -> None:
-        """Copy log lines to a client until it is full; the file is its queue."""
+        """Copy log lines to a client until its buffer is full; the log file is the queue."""
         client.behind = False
         while client.cursor is not None:
             if len(client.out) >= BLOCK:
@@ -777,7 +780,7 @@ class Agent:
             return
         connection.setblocking(False)
         if len(self.clients) >= CLIENTS:
-            # connections whose other end the network lost pile up here
+            # connections whose network is gone accumulate here
             self._drop(min(self.clients, key=lambda client: client.active))
         client = Client(connection)
         client.active = self.clock()
@@ -806,7 +809,7 @@ class Agent:
                 client.received += data
                 self._requests(client)
             elif data == b'':
-                # what it asked for is answered still, what it was saying is lost
+                # answer complete requests, drop an incomplete one
                 client.finished = True
                 client.cursor = client.cursor if client.until else None
         if client in self.clients:
@@ -848,13 +851,13 @@ class Agent:
             self.reply(client, number, answer)
 
     def reply(self, client: Client, number: Any, answer: Json) -> None:
-        """Send an answer: with ``error`` in it a refusal, else a success."""
+        """Send a reply; one with ``error`` in it is a failure."""
         if client in self.clients:
             client.out += dump({'id': number, 'ok': 'error' not in answer, **answer})
             self._pump(client)
 
     def reply_later(self, client: Client, request: Json) -> Callable[[Json], None]:
-        """Return what sends the answer when it is there."""
+        """Return a function that sends the reply when it is available."""
         client.awaiting += 1
 
         def reply(answer: Json) -> None:
@@ -874,14 +877,14 @@ class Agent:
         if client.finished and not client.out and not client.awaiting and not client.cursor:
             self._drop(client)
             return
-        # one that has nothing more to say would wake the selector for ever
+        # a socket at its end of file would wake the selector forever
         wanted = 0 if client.finished else selectors.EVENT_READ
         if client.out or client.behind:
             wanted |= selectors.EVENT_WRITE
         self._select(client.socket, wanted, lambda mask: self._serve(client, mask))
 
     def _select(self, connection: socket.socket, wanted: int, call: Callable[[int], None]) -> None:
-        """Make the selector look at a socket for exactly these events."""
+        """Register exactly these events of a socket with the selector."""
         key = self.selector.get_map().get(connection)
         if not wanted:
             if key is not None:
@@ -894,7 +897,7 @@ class Agent:
     # -- requests -----------------------------------------------------------------------------
 
     def do_configure(self, client: Client, request: Json) -> Optional[Json]:
-        """Take new settings; another launch than before takes the machine over."""
+        """Change settings; a new launch takes the machine over."""
         new = checked(request)
         for fixed in ('directory', 'user', 'log_bytes'):
             new.pop(fixed, None)
@@ -906,7 +909,7 @@ class Agent:
                           kind='released')
         age = self.sign_of_life()
         dead = request.get('force') or None
-        owner = self.config['launch']  # '' after a later boot: nobody's until a launch comes
+        owner = self.config['launch']  # '' after a reboot: no owner until a launch comes
         if taken_over and owner and age is not None and dead != owner:
             raise Refused(
                 f"this machine belongs to launch '{owner}', whose last sign of life is "
@@ -945,7 +948,7 @@ class Agent:
 
             def stopped() -> None:
                 if taken_over:
-                    # the former launch's VPN has the port that the next one's needs
+                    # the former launch's VPN uses the port that the new launch needs
                     self.take_down(lambda: reply(apply()))
                 else:
                     reply(apply())
@@ -955,15 +958,15 @@ class Agent:
 
     def check_held(self) -> None:
         """
-        Let nothing begin for a launch that has let go of the machine, however late it arrives.
+        Refuse to start anything for a launch that has released the machine: a late request.
 
-        :raises Refused: none has it.
+        :raises Refused: no launch has the machine.
         """
         if self.released:
             raise Refused('no launch has this machine any more', kind='released')
 
     def do_keep(self, client: Client, request: Json) -> Json:
-        """Keep something going; ``what`` again replaces it."""
+        """Start a health check, or replace the one with the same ``what``."""
         self.check_held()
         kept = Kept(request)
         former = self.kept.get(kept.what)
@@ -975,7 +978,7 @@ class Agent:
         return {}
 
     def do_watch(self, client: Client, request: Json) -> Json:
-        """Wait for a command to succeed; ``what`` again replaces it."""
+        """Start a watch, or replace the one with the same ``what``."""
         self.check_held()
         watched = Watched(request)
         if watched.what not in WATCHED or not watched.argv:
@@ -985,7 +988,7 @@ class Agent:
         return {}
 
     def do_launch(self, client: Client, request: Json) -> Json:
-        """Start the launch process where it isn't running."""
+        """Start the launch process, if it does not run."""
         return {'pid': self.start_launch().pid}
 
     def do_start(self, client: Client, request: Json) -> Json:
@@ -1010,14 +1013,14 @@ class Agent:
                 'id': spec['id'], 'name': spec['name'], 'state': 'starting', 'pid': None,
                 'returncode': None, 'restarts': 0, 'grace': grace}
         if specs:
-            # not what it has from its start: the files it sourced may have added to that
+            # only variables that changed since its start: sourced files may have extended others
             late = {key: value for key, value in self.config['environment'].items()
                     if launch.environment.get(key) != value}
             self._tell(launch, {'command': 'start', 'nodes': specs, 'environment': late})
         return {'known': known}
 
     def do_stop(self, client: Client, request: Json) -> Json:
-        """Stop nodes as launch does: SIGINT, SIGTERM, SIGKILL."""
+        """Stop nodes as launch does: SIGINT, then SIGTERM, then SIGKILL."""
         ids = request.get('nodes')
         ids = list(self.nodes) if ids is None else [str(number) for number in ids]
         for number in ids:
@@ -1039,7 +1042,7 @@ class Agent:
         return {}
 
     def do_status(self, client: Client, request: Json) -> Json:
-        """Tell how things are; ages and times left in seconds, memory in kB."""
+        """Return the agent's state; ages and remaining times in seconds, memory in kB."""
         with open('/proc/self/statm') as stream:
             rss = int(stream.read().split()[1]) * os.sysconf('SC_PAGE_SIZE') // 1024
         config = self.config
@@ -1058,11 +1061,11 @@ class Agent:
         }
 
     def do_ping(self, client: Client, request: Json) -> Json:
-        """Say something."""
+        """Reply, as a sign of life."""
         return {}
 
     def do_log(self, client: Client, request: Json) -> Optional[Json]:
-        """Send events from a seq on."""
+        """Send the events from a seq on."""
         begin = max(1, int(request.get('from') or 1))
         lost = max(0, self.log.first - begin)
         file = self.log.files[-1]
@@ -1074,7 +1077,7 @@ class Agent:
         return None
 
     def do_release(self, client: Client, request: Json) -> None:
-        """End a launch in order."""
+        """Stop the nodes of a launch and release the machine."""
         asked, has = request.get('launch'), self.claimed or self.config['launch']
         if asked and has and asked != has:
             self.reply(client, request.get('id'), {})
@@ -1096,7 +1099,7 @@ class Agent:
                 reply({})
                 self.take_down(self._leave_for_good)
             else:
-                # kept, the VPN's interface would be made again as soon as the robot deletes it
+                # end the health check first: it would recreate the VPN interface
                 self.take_down(lambda: reply({}))
         self.stop_nodes(stopped)
 
@@ -1104,9 +1107,9 @@ class Agent:
 
     def start_launch(self) -> CloudLaunch:
         """
-        Return the running launch process, started if need be.
+        Return the running launch process; start it if needed.
 
-        :raises Refused: it can't be started now.
+        :raises Refused: it cannot be started now.
         """
         self.check_held()
         if self.ending or self.stopping:
@@ -1146,7 +1149,7 @@ class Agent:
         finally:
             os.close(log)
             theirs.close()
-        child.returncode = 0  # the status is ours to collect: see _reap
+        child.returncode = 0  # _reap collects the status
         ours.setblocking(False)
         launch = CloudLaunch(child.pid, ours, self.config['environment'])
         self.launch = launch
@@ -1155,7 +1158,7 @@ class Agent:
         return launch
 
     def _environment(self, fd: int) -> dict[str, str]:
-        """Return what a login of the user would have, then what the launch asked for."""
+        """Return the variables of a login of the user, and those that the launch configured."""
         user = self.account
         if self.privileged:
             kept = ('LANG', 'LANGUAGE', 'TZ', 'LC_ALL', 'LC_CTYPE', 'LC_NUMERIC')
@@ -1170,7 +1173,7 @@ class Agent:
         environment.update({
             'HOME': user.pw_dir, 'USER': user.pw_name, 'LOGNAME': user.pw_name,
             'SHELL': user.pw_shell or '/bin/sh',
-            # output has to arrive when it is written, not when a buffer is full
+            # send output when it is written, not when a buffer is full
             'PYTHONUNBUFFERED': '1', 'RCUTILS_LOGGING_BUFFERED_STREAM': '1'})
         environment.pop('OVERRIDE_LAUNCH_PROCESS_OUTPUT', None)
         environment.update(self.config['environment'])
@@ -1192,7 +1195,7 @@ class Agent:
             except BlockingIOError:
                 pass
             except OSError:
-                launch.out.clear()  # it died; that is reported when its status has been collected
+                launch.out.clear()  # the process died; reported when its status is collected
         if mask & selectors.EVENT_READ:
             self._receive(launch)
         wanted = 0 if launch.silent else selectors.EVENT_READ
@@ -1201,7 +1204,7 @@ class Agent:
         self._select(launch.socket, wanted, lambda mask: self._hear(launch, mask))
 
     def _receive(self, launch: CloudLaunch) -> bool:
-        """Take what the launch process said; returns whether it may have said more."""
+        """Read lines of the launch process; return whether there may be more."""
         try:
             data = launch.socket.recv(BLOCK)
         except BlockingIOError:
@@ -1215,10 +1218,10 @@ class Agent:
         return bool(data)
 
     def _reported(self, lines: list[bytes]) -> None:
-        """Take the launch process's events: ``{"event":...}`` lines."""
+        """Handle events of the launch process: ``{"event":...}`` lines."""
         events = []
         for line in lines:
-            # most lines are output, which changes no state and isn't worth parsing
+            # most lines are output, which changes no state: skip parsing it
             if not line.startswith(b'{"event":"output"'):
                 try:
                     self._node_changed(json.loads(line))
@@ -1242,7 +1245,7 @@ class Agent:
             node['state'], node['error'] = 'refused', event['error']
 
     def stop_nodes(self, then: Callable[[], None], *, quickly: bool = False) -> None:
-        """Stop every node and the launch process; call ``then`` when the last one is gone."""
+        """Stop every node and the launch process; then call ``then``."""
         self.after_launch.append(then)
         launch = self.launch
         if self.stopping and not quickly:
@@ -1254,7 +1257,7 @@ class Agent:
         if not launch.stopping:
             launch.stopping = True
             with contextlib.suppress(OSError):
-                # it reads on to the end of file, then stops the nodes in launch's own way
+                # at the end of file it stops the nodes as launch does
                 launch.socket.shutdown(socket.SHUT_WR)
         alive = [n['grace'] for n in self.nodes.values() if n['state'] in ('starting', 'running')]
         patience = [(0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL)]
@@ -1272,12 +1275,12 @@ class Agent:
 
     def _launch_exited(self, launch: CloudLaunch, status: int) -> None:
         while self._receive(launch):
-            pass  # what it said last
+            pass  # its last lines
         self._select(launch.socket, 0, lambda mask: None)
         launch.socket.close()
         self.launch = None
         expected = self.stopping
-        self.stopping = True  # nothing new until its nodes are gone
+        self.stopping = True  # start nothing until its nodes have ended
         left = [n for n in self.nodes.values() if n['state'] in ('starting', 'running')]
 
         def swept(number: int) -> None:
@@ -1303,7 +1306,7 @@ class Agent:
             call()
 
     def sweep(self, then: Callable[[int], None], *, quickly: bool = False) -> None:
-        """End what nodes and a dead launch process left; ``then`` gets the last signal sent."""
+        """End processes that the launch process left; pass the last signal sent to ``then``."""
         begin = self.clock()
         steps = list(SWEEP_QUICKLY if quickly else SWEEP)
         last = signal.SIGKILL
@@ -1323,14 +1326,14 @@ class Agent:
         look()
 
     def _remove_files(self) -> None:
-        """Remove the folder of travelled files that a killed launch process left."""
+        """Remove the folder of received files that a killed launch process left."""
         with contextlib.suppress(OSError):
             for name in os.listdir(self.directory):
                 if name.startswith('files-'):
                     remove_tree(self.path(name))
 
     def _last_words(self) -> str:
-        """Return how the launch process's log ends: why it failed, as a traceback's last lines."""
+        """Return the end of the launch process's log, which shows why it failed."""
         with contextlib.suppress(OSError), open(self.path('launch.log'), 'rb') as log:
             log.seek(max(0, os.fstat(log.fileno()).st_size - LAST_WORDS))
             lines = log.read().decode(errors='replace').split('\n')
@@ -1342,10 +1345,10 @@ class Agent:
             if os.path.getsize(self.path('launch.log')) > LAUNCH_LOG_BYTES:
                 os.truncate(self.path('launch.log'), 0)
 
-    # -- keeping, guarding, ending ------------------------------------------------------------
+    # -- health checks, watchdog, end ---------------------------------------------------------
 
     def _look(self, kept: Kept) -> None:
-        """See whether a kept thing is alive, repair it if not, and come back."""
+        """Run a health check, repair on failure, and schedule the next check."""
         def later() -> None:
             pause = min(30.0, kept.interval * 2 ** min(kept.failures, 10))
             kept.timer = self.at(pause, lambda: self._look(kept))
@@ -1374,7 +1377,7 @@ class Agent:
         self.spawn(kept.alive, looked, timeout=10.0)
 
     def _see(self, watched: Watched) -> None:
-        """Run a watch's command; come back unless it succeeded or the watch is over."""
+        """Run a watch's command; repeat it until it succeeds or the watch ends."""
         if self.watched.get(watched.what) is not watched or self.ending:
             return
         output = os.memfd_create('watch', os.MFD_CLOEXEC)
@@ -1394,19 +1397,19 @@ class Agent:
         self.spawn(watched.argv, ran, timeout=10.0, output=output)
 
     def sign_of_life(self) -> Optional[float]:
-        """Return seconds since a launch that has the machine spoke, None while none has it."""
+        """Return seconds since the current launch was last heard, None without a launch."""
         spoke = self.watchdog.beat_at
         if spoke is None:
             spoke = self.watchdog.boot_from
         return None if spoke is None else self.clock() - spoke
 
     def heartbeat_age(self) -> Optional[float]:
-        """Return seconds since the launch's last sign of life, None while nobody watches."""
+        """Return seconds since the last heartbeat, None if none is expected."""
         beat = self.watchdog.beat_at
         return None if beat is None else self.clock() - beat
 
     def open_heart(self) -> None:
-        """Listen for heartbeats where the configuration says."""
+        """Listen for heartbeats at the configured address."""
         if self.heart is not None:
             self._select(self.heart, 0, lambda mask: None)
             self.heart.close()
@@ -1416,7 +1419,7 @@ class Agent:
             return
         heart = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
-            # the VPN's address may come later, and come back
+            # the VPN's address may appear later, and disappear for a time
             heart.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
             heart.bind((where['bind'], where['port']))
         except (OSError, OverflowError) as error:
@@ -1436,13 +1439,13 @@ class Agent:
             self.watchdog.beat(self.clock())
             heart.sendto(dump({**beat, 'clock': time.time()}), peer)
         except (OSError, KeyError, TypeError, ValueError, RecursionError):
-            return  # the VPN is down, or somebody sends nonsense
+            return  # the VPN is down, or the datagram is invalid
 
     def _guard(self, now: float) -> None:
         reason = self.watchdog.due(now)
         if reason is None:
             return
-        # 'no launch came' ends a machine whose first launch died; an adopted one was kept before
+        # 'no launch came' ends a machine whose first launch died, but not an adopted machine
         gone = reason == 'robot gone' or (reason == 'no launch came' and self.adopted)
         stay = gone and self.config['on_exit'] == 'keep'
         ends = 'end the machine' if self.config['end_command'] else 'leave'
@@ -1457,7 +1460,7 @@ class Agent:
             self.stop_nodes(self.end_machine)
 
     def end_machine(self) -> None:
-        """End the machine, again and again until that works; or leave one that isn't ours."""
+        """End the machine, retrying until it works; exit where there is no end command."""
         command = self.config['end_command']
         if not command:
             self.take_down(self._leave_for_good)
@@ -1467,12 +1470,12 @@ class Agent:
             if status != 0:
                 self.emit('end_failed', returncode=status)
             if os.getpid() == 1:
-                self.done = True  # the container ends with us
+                self.done = True  # the container ends with this process
             self.at(RETRY_END, self.end_machine)
         self.spawn(command, ended, timeout=60.0)
 
     def take_down(self, then: Callable[[], None]) -> None:
-        """Take the kept things down, then go on."""
+        """Run the ``down`` commands of all health checks, then call ``then``."""
         commands = [argv for kept in self.kept.values() for argv in kept.down]
         self.kept.clear()
         self.watched.clear()
@@ -1485,7 +1488,7 @@ class Agent:
             os.rmdir(self.directory)
         parent = os.path.dirname(self.directory)
         if os.path.basename(parent) == 'fogros2':
-            # the folder of all agents goes with the last one
+            # the last agent removes the folder of all agents
             with self.root(), contextlib.suppress(OSError):
                 os.rmdir(parent)
 
@@ -1496,9 +1499,9 @@ HANDLERS: dict[str, Callable[[Agent, Client, Json], Optional[Json]]] = {
 
 def account(user: str) -> pwd.struct_passwd:
     """
-    Return the login user's entry.
+    Return the login user's entry in the user database.
 
-    :raises Refused: there is none, or the agent can't act for that user.
+    :raises Refused: no such user, or the agent cannot act as that user.
     """
     try:
         entry = pwd.getpwnam(user) if user else pwd.getpwuid(os.getuid())
@@ -1510,19 +1513,19 @@ def account(user: str) -> pwd.struct_passwd:
 
 
 def search_path() -> str:
-    """Return PATH with the folders of system programs in it."""
+    """Return PATH, extended by the folders of system programs."""
     known = os.environ.get('PATH', os.defpath).split(':')
     more = ('/usr/local/bin', '/usr/bin', '/bin', '/usr/local/sbin', '/usr/sbin', '/sbin')
     return ':'.join(known + [folder for folder in more if folder not in known])
 
 
 def quoted(word: str) -> str:
-    """Return a word as a shell reads it back."""
+    """Quote a word for the shell."""
     return "'" + word.replace("'", "'\"'\"'") + "'"
 
 
 def marked(mark: str) -> list[int]:
-    """Return the processes that the agent's launch process started, at whatever remove."""
+    """Return all descendants of the agent's launch process, found by their environment."""
     wanted = f'{MARK}={mark}'.encode()
     found = []
     for name in os.listdir('/proc'):
@@ -1535,7 +1538,7 @@ def marked(mark: str) -> list[int]:
 
 
 def remove_tree(path: str) -> None:
-    """Remove a folder and what is in it, as far as that can be done."""
+    """Remove a folder with its content; skip what cannot be removed."""
     for folder, subfolders, files in os.walk(path, topdown=False):
         for name in files + subfolders:
             entry = os.path.join(folder, name)
@@ -1548,9 +1551,9 @@ def remove_tree(path: str) -> None:
 
 def detach() -> int:
     """
-    Become a daemon; in the parent wait for a line about how that went and exit with it.
+    Become a daemon; the parent prints a line about the start, and exits.
 
-    Returns the descriptor for that line.
+    Returns the daemon's descriptor for that line.
     """
     reader, writer = os.pipe()
     if os.fork():
@@ -1571,7 +1574,7 @@ def detach() -> int:
 
 
 def serve(config_path: str, *, daemon: bool) -> int:
-    """Run the agent with a configuration file; returns the exit status."""
+    """Run the agent with a configuration file; return the exit status."""
     answer = -1
     try:
         try:
@@ -1605,7 +1608,7 @@ def serve(config_path: str, *, daemon: bool) -> int:
 
 
 def connect(directory: str) -> int:
-    """Relay stdin and stdout to the agent of a directory; returns the exit status."""
+    """Relay stdin and stdout to the agent of a directory; return the exit status."""
     directory = os.path.expanduser(directory)
     link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -1619,7 +1622,7 @@ def connect(directory: str) -> int:
     sources = [0, link.fileno()]
     selector = selectors.DefaultSelector()
     for source in sources:
-        with contextlib.suppress(PermissionError):  # a file or /dev/null as standard input
+        with contextlib.suppress(PermissionError):  # standard input is a file or /dev/null
             selector.register(source, selectors.EVENT_READ)
     if 0 not in selector.get_map():
         link.shutdown(socket.SHUT_WR)
@@ -1631,7 +1634,7 @@ def connect(directory: str) -> int:
                     link.sendall(data)
                 elif key.fd == 0:
                     selector.unregister(0)
-                    link.shutdown(socket.SHUT_WR)  # what was asked is answered still
+                    link.shutdown(socket.SHUT_WR)  # the agent still answers pending requests
                 elif data:
                     while data:
                         data = data[os.write(1, data):]
@@ -1642,7 +1645,7 @@ def connect(directory: str) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """Run a command line; returns the exit status."""
+    """Run a command line; return the exit status."""
     daemon = '--detach' in arguments
     rest = [word for word in arguments if word != '--detach']
     if len(rest) == 3 and rest[:2] == ['serve', '--config']:

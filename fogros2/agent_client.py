@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's end of the agent: requests, events that survive a lost connection, heartbeats."""
+"""Talk to a machine's agent: requests, events that survive a lost connection, heartbeats."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
 from fogros2.waiting import wait_until
 
-#: Seconds between heartbeats.
+#: Interval of heartbeats in seconds.
 HEARTBEAT_INTERVAL = 2.0
-#: Seconds after which a connection that says nothing is given up.
+#: Seconds without data after which a connection counts as lost.
 SILENCE = 20.0
-#: Seconds after which an agent that has gone won't come back.
+#: Seconds after which an agent that has gone will not come back.
 RESTART = 5.0
 
-#: A request for which nobody waits; its reply shows that the agent is there.
+#: A request without a waiting caller; its reply shows that the agent is there.
 _PING = b'{"id":0,"command":"ping"}\n'
 
 EventCallback = Callable[[dict[str, Any]], None]
 
 
 def agent_source() -> Path:
-    """Return the path of ``agent.py``, to be put onto a machine."""
+    """Return the path of ``agent.py``, which is copied to machines."""
     return Path(__file__).with_name('agent.py')
 
 
 def cloud_launch_source() -> Path:
-    """Return the path of the launch file that runs nodes there: needs launch, not fogros2."""
+    """Return the path of the launch file that runs nodes; it imports launch, not fogros2."""
     return Path(__file__).with_name('cloud_launch.py')
 
 
@@ -61,21 +61,21 @@ class _Pending:
 
 class AgentClient:
     """
-    A connection to a machine's agent that comes back after a loss.
+    A connection to a machine's agent that reconnects after a loss.
 
-    One thread reads. It calls the subscribers with each event, once and in order, and with
-    ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``, and where the agent's log has
-    forgotten some that it would have got ``{'event': 'gap', 'count': n}``; these have no ``seq``.
-    A subscriber must not make requests: their replies would come in on its own thread.
+    One thread reads. It passes each event to the subscribers, once and in order, and adds events
+    without ``seq``: ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``, and
+    ``{'event': 'gap', 'count': n}`` if the agent's log has dropped events.
+    A subscriber must not make requests: its own thread would have to read their replies.
 
     :param shell: reaches the machine.
-    :param directory: the agent's directory there.
-    :param python: interpreter there.
-    :param agent_path: where ``agent.py`` is there.
-    :param cancel: once set, requests end with Cancelled and no new connection is tried.
-    :param silence: seconds without a byte, though asked for one, after which a connection counts
-        as lost: a robot that changed networks would learn of that from TCP in a quarter hour.
-    :param restart: seconds that an agent which was there may take to be there again.
+    :param directory: the agent's directory on the machine.
+    :param python: interpreter on the machine.
+    :param agent_path: path of ``agent.py`` on the machine.
+    :param cancel: when set, requests raise Cancelled and no new connection is opened.
+    :param silence: seconds without a byte, although a ping was sent, after which a connection
+        counts as lost. TCP would need 15 minutes after the robot has changed networks.
+    :param restart: seconds that an agent may need to restart.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class AgentClient:
     ) -> None:
         self._shell = shell
         self._command = Command(
-            # the standard library is all it needs; finding out what else is installed takes time
+            # -IS: the agent needs only the standard library, and searching for more takes time
             (python, '-IS', agent_path, 'connect', '--directory', directory),
             what='reach the agent')
         self._callbacks: list[EventCallback] = []
@@ -109,26 +109,26 @@ class AgentClient:
         self._ever = self._lost = False
         self._absent: Optional[str] = None
         self._next: Optional[int] = None
-        #: The number of the request whose answer says where the log begins, 0 is a ping's.
+        #: The id of the request whose reply says where the log begins; 0 is a ping's.
         self._log_request = -1
         self._thread: Optional[threading.Thread] = None
 
     @property
     def next_seq(self) -> int:
-        """The seq that the next event delivered will have at the least."""
+        """The lowest seq that the next event may have."""
         return self._next or 1
 
     @property
     def silent_for(self) -> float:
-        """Seconds since anything came from the machine; a quarter of ``silence`` is usual."""
+        """Seconds since the last data from the machine; normally up to ``silence / 4``."""
         return time.monotonic() - self._heard
 
     def connect(self) -> None:
         """
-        Open the connection now rather than with the first request; harmless when it is open.
+        Open the connection now instead of with the first request; idempotent.
 
-        :raises ConnectError: the machine can't be reached.
-        :raises AgentError: no agent answers there.
+        :raises ConnectError: the machine cannot be reached.
+        :raises AgentError: the connection was closed.
         """
         with self._lock:
             if self._thread is not None:
@@ -147,15 +147,15 @@ class AgentClient:
         **arguments: Any,
     ) -> dict[str, Any]:
         """
-        Ask the agent for something and return its reply.
+        Send a request to the agent and return its reply.
 
-        A connection that breaks meanwhile comes back and the request is sent again, but for
-        ``signal``, which would count twice.
+        If the connection breaks, the client reconnects and repeats the request, except ``signal``,
+        which would take effect twice.
 
-        :param timeout: seconds, lost connections included.
-        :param silent: seconds without a word from the machine after which it is given up before,
-            more than half of ``silence``: an agent that is busy with the request says something.
-        :raises AgentError: refused, with the agent's hint; or there is no agent (any more).
+        :param timeout: seconds, including the time of lost connections.
+        :param silent: seconds without any data after which the request fails earlier; must be more
+            than half of ``silence``, because a busy agent still answers pings.
+        :raises AgentError: refused, with the agent's hint; or no agent is there (any more).
         :raises DeadlineExceeded: no reply in time.
         :raises Cancelled: ``cancel`` was set.
         """
@@ -197,12 +197,12 @@ class AgentClient:
 
     def subscribe(self, callback: EventCallback, since: Optional[int] = None) -> None:
         """
-        Call ``callback`` with events, each once and in order, over lost connections too.
+        Pass events to ``callback``, each once and in order, across lost connections.
 
-        The first subscriber decides where to begin; a later one joins where the others are.
+        The first subscriber decides where to begin; later ones join at the current event.
 
-        :param since: seq to begin with, 1 for all that the agent has; None for new ones alone.
-        :raises AgentError: as ``request``.
+        :param since: first seq, 1 for all that the agent has; None for new events only.
+        :raises AgentError: as for ``request``.
         """
         if since is None and self._next is None:
             since = int(self.request('status')['next'])
@@ -217,14 +217,14 @@ class AgentClient:
             self._follow_on(stream)
 
     def close(self) -> None:
-        """Drop the connection; requests that wait fail; the agent goes on."""
+        """Close the connection; waiting requests fail, and the agent keeps running."""
         self._closed.set()
         with self._lock:
             stream, thread = self._stream, self._thread
         if stream is not None:
             stream.close()
         if thread is not None and thread is not threading.current_thread():
-            # one that is connecting sees it later, and nobody needs what comes of that
+            # a thread that is still connecting notices later; its result is not needed
             thread.join(5.0 if stream is not None else 0.5)
 
     # -- the reader's thread --------------------------------------------------------------
@@ -259,7 +259,7 @@ class AgentClient:
             self._tell({'event': 'connection', 'state': 'absent', 'error': str(self._error)})
 
     def _hopeless(self, seconds: float) -> bool:
-        """Tell whether to give up on an agent that hasn't said a word for so long."""
+        """Return whether to give up an agent that was silent for so many seconds."""
         if self._absent is not None and (not self._ever or seconds > self._restart):
             self._error = AgentAbsent(self._absent, 'its machine may have ended')
         elif not self._ever and seconds > self._restart:
@@ -269,7 +269,7 @@ class AgentClient:
         return self._error is not None
 
     def _read_stream(self) -> bool:
-        """Take what comes until the stream ends; returns whether an agent was there."""
+        """Read until the stream ends; return whether an agent answered."""
         stream = self._stream
         assert stream is not None
         self._absent = None
@@ -279,7 +279,7 @@ class AgentClient:
             try:
                 message = json.loads(line)
             except (ValueError, RecursionError):
-                continue  # what a login script there says
+                continue  # output of a login script
             if not isinstance(message, dict):
                 continue
             if message.get('kind') == 'absent' and 'ok' not in message:
@@ -302,7 +302,7 @@ class AgentClient:
         number = reply.get('id')
         if number is not None and number == self._log_request:
             if reply.get('next', 0) < self.next_seq:
-                # an agent with a new log: everything in it is new to us
+                # an agent with a new log: none of its events was delivered
                 self._next = 1
                 stream = self._stream
                 if reply.get('next', 0) > 1 and stream is not None:
@@ -334,12 +334,12 @@ class AgentClient:
         }).encode() + b'\n')
 
     def _send(self, stream: Stream, line: bytes) -> None:
-        """Write a line; where the link is gone the reader sees to what was asked."""
+        """Write a line; after a connection error the reading thread repeats the requests."""
         with self._writing, contextlib.suppress(ConnectError):
             stream.write(line)
 
     def _watch(self) -> None:
-        """Give up a connection on which nothing comes, after having asked for something."""
+        """Ping a silent connection, and close it if nothing comes back."""
         thread = self._thread
         while thread is not None and thread.is_alive():
             if self._closed.wait(self._silence / 4):
@@ -350,12 +350,12 @@ class AgentClient:
             if silent > self._silence:
                 stream.close()
             elif self._writing.acquire(timeout=self._silence / 4):
-                # a thread that holds the lock for longer is stuck in a dead link
+                # a thread that holds the lock for longer is stuck in a dead connection
                 self._writing.release()
                 self._send(stream, _PING)
 
     def _reopen(self) -> None:
-        """Connect again, with growing pauses, for as long as anybody wants it."""
+        """Reconnect, with increasing pauses, until the client is closed."""
         def attempt() -> Optional[Stream]:
             if self._cancel.is_set():
                 raise Cancelled('the connection to the agent')
@@ -375,7 +375,7 @@ class AgentClient:
             except Cancelled:
                 return
             except FogError as error:
-                # another host key, our key refused: no reconnecting helps
+                # a changed host key or a refused login key: reconnecting does not help
                 self._error = AgentError(f"the agent can't be reached: {error.args[0]}",
                                          error.hint)
                 return
@@ -400,13 +400,13 @@ class AgentClient:
 
 class Heartbeat:
     """
-    Tells a machine over the VPN that the launch lives; measures the round trip and its clock.
+    Send heartbeats to a machine through the VPN; measure the round trip and its clock.
 
-    Begins at once. Datagrams get lost, and the VPN may be down for a while: no errors here.
+    Starts at once. Lost datagrams, or a VPN that is down for a while, raise no errors.
 
     :param address: the machine's VPN address.
-    :param port: the agent's port there.
-    :param launch_id: as the agent was configured.
+    :param port: the agent's port on the machine.
+    :param launch_id: the launch for which the agent was configured.
     :param interval: seconds between heartbeats.
     """
 
@@ -426,22 +426,22 @@ class Heartbeat:
 
     @property
     def round_trip(self) -> Optional[float]:
-        """Seconds that the last answered heartbeat took there and back, None before one was."""
+        """Round-trip time of the last answered heartbeat in seconds, None before the first."""
         return self._round_trip
 
     @property
     def clock_offset(self) -> Optional[ClockOffset]:
-        """The best of the last measurements, None before one and from older agents."""
+        """The best of the recent measurements; None before the first, or with an older agent."""
         return self._offset
 
     @property
     def age(self) -> Optional[float]:
-        """Seconds since an answer came, None before the first."""
+        """Seconds since the last answer, None before the first."""
         at = self._answered_at
         return None if at is None else time.monotonic() - at
 
     def close(self) -> None:
-        """Stop; the agent's watch over the launch runs out after its ``robot_timeout``."""
+        """Stop; the agent's watchdog then acts after its ``robot_timeout``."""
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
@@ -470,7 +470,7 @@ class Heartbeat:
             except TimeoutError:
                 continue
             except OSError:
-                # 'connection refused' of an agent that isn't there yet; the next may fare better
+                # 'connection refused' because the agent does not listen yet; retry
                 self._stopped.wait(0.05)
                 continue
             now = time.monotonic()
@@ -484,6 +484,6 @@ class Heartbeat:
                 continue
 
     def _compare(self, round_trip: float, clock: Any) -> None:
-        """Take the machine's time out of an answer, if it is one."""
+        """Measure the clock's offset from an answer, if it contains a valid time."""
         if type(clock) in (int, float) and abs(clock) < 1e11 and 0 <= round_trip < SILENCE:
             self._offset = self._offsets.add(round_trip, time.time(), clock)

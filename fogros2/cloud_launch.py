@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs on the machine, inside ``ros2 launch``: turns the agent's NodeSpecs into launch's processes.
+Run inside ``ros2 launch`` on the machine: turn the agent's NodeSpecs into launch's processes.
 
-Imports launch and the ament index alone, nothing of fogros2: the file works where only it and
-``agent.py`` have been copied to. It exchanges JSON lines with the agent over the socket whose
-number is in ``FOGROS2_AGENT_FD``: ``start``, ``stop``, ``signal`` come in, ``started``,
-``output``, ``exited``, ``refused`` go out; its end of file shuts launch down in order.
+The file imports only launch and the ament index, not fogros2: it works where only it and
+``agent.py`` have been copied. It exchanges JSON lines with the agent over the socket whose number
+is in ``FOGROS2_AGENT_FD``. It receives ``start``, ``stop`` and ``signal``, and sends ``started``,
+``output``, ``exited`` and ``refused``. The end of the agent's stream shuts launch down in order.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from launch.events.process import (
 )
 
 Json = dict[str, Any]
-#: Text with markers, as it arrives: see ``fogros2.model.Text``.
+#: Text with markers, as received: see ``fogros2.model.Text``.
 Text = Union[str, Sequence[Union[str, Mapping[str, str]]]]
-#: Characters of one output event at the most.
+#: Maximum number of characters in one output event.
 CHUNK = 1 << 16
-#: What a user reads who starts the launch file.
+#: Message to a user who starts the launch file by hand.
 BY_HAND = (
     'cloud.launch.py is for the agent of a cloud machine, which starts it there to run the nodes '
     "of that machine. To start a machine, launch a file with machine= on a node: 'ros2 launch "
@@ -52,7 +52,7 @@ BY_HAND = (
 
 
 class RefusedNode(Exception):
-    """A node that this machine can't run: message and hint."""
+    """A node that this machine cannot run: message and hint."""
 
     def __init__(self, message: str, hint: str = '') -> None:
         super().__init__(message)
@@ -60,9 +60,9 @@ class RefusedNode(Exception):
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return a launch description that does what the agent says, until the agent goes."""
+    """Return a launch description that follows the agent's requests until the agent ends."""
     if 'FOGROS2_AGENT_FD' not in os.environ:
-        # launch adds lines about syntax to an error that comes while it loads a file
+        # launch would add lines about syntax to an error that is raised while it loads a file
         return LaunchDescription([OpaqueFunction(function=_refuse_start_by_hand)])
     fd = int(os.environ.pop('FOGROS2_AGENT_FD'))
     directory = os.environ.get('FOGROS2_AGENT_DIRECTORY')
@@ -74,7 +74,7 @@ def _refuse_start_by_hand(context: LaunchContext) -> None:
 
 
 class Node:
-    """A NodeSpec and the process made of it."""
+    """A NodeSpec and the process that runs it."""
 
     def __init__(self, spec: Json) -> None:
         self.id: str = spec['id']
@@ -86,20 +86,20 @@ class Node:
         self.seen = False
         self.stopping = False
         self.expected = True
-        self.waiting: list[str] = []  # signals that came before the process
-        self.held: list[tuple[str, str]] = []  # output that launch reported before its process
+        self.waiting: list[str] = []  # signals to send when the process has started
+        self.held: list[tuple[str, str]] = []  # output that launch reported before ProcessStarted
         decoder = codecs.getincrementaldecoder('utf-8')
         self.decoders = {name: decoder('replace') for name in ('stdout', 'stderr')}
 
 
 class ObeyAgent(Action):
     """
-    Does what comes over the agent's socket and reports what becomes of it.
+    Execute requests from the agent's socket and report the results.
 
-    :param connection: the socket, blocking: an agent that is slow slows the nodes' output down
+    :param connection: the socket, blocking: a slow agent then slows the nodes' output down
         instead of filling this process's memory.
-    :param directory: private folder below which files that travelled are written; None for the
-        system's own place for such.
+    :param directory: private folder for the contents of sent files; None for the system's folder
+        for temporary files.
     """
 
     def __init__(self, connection: socket.socket, directory: Optional[str] = None) -> None:
@@ -116,19 +116,19 @@ class ObeyAgent(Action):
         self._files = 0
 
     def execute(self, context: LaunchContext) -> None:
-        """Listen; launch runs until the socket ends."""
+        """Listen to the agent; launch runs until the socket ends."""
         loop = context.asyncio_loop
         self._done = loop.create_future()
         context.register_event_handler(_Watch(self))
         loop.add_reader(self._connection.fileno(), self._read, context)
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[None]]:
-        """Return what is done once launch has been told to shut down."""
+        """Return a future that is done when launch may end."""
         return self._done
 
     def _read(self, context: LaunchContext) -> None:
         try:
-            # the flag spares the socket from being non-blocking for writing too
+            # MSG_DONTWAIT, because a non-blocking socket would not block for writing either
             data = self._connection.recv(1 << 18, socket.MSG_DONTWAIT)
         except BlockingIOError:
             return
@@ -145,7 +145,7 @@ class ObeyAgent(Action):
         for line in lines:
             message = json.loads(line)
             if message['command'] == 'start':
-                # the launch's variables may have come after this process was started
+                # variables that were configured after the start of this process
                 os.environ.update(message.get('environment', {}))
                 for spec in message['nodes']:
                     self._start(context, spec)
@@ -156,7 +156,7 @@ class ObeyAgent(Action):
                 self._signal(context, self._nodes.get(message['node']), message['signal'])
 
     def finish(self) -> None:
-        """Let go of launch: it may end once the nodes have."""
+        """Complete the action: launch may end when the nodes have ended."""
         if self._done is not None and not self._done.done():
             self._done.set_result(None)
 
@@ -178,17 +178,17 @@ class ObeyAgent(Action):
 
     def _process(self, spec: Json) -> ExecuteProcess:
         """
-        Return the launch action for a NodeSpec.
+        Return the launch action of a NodeSpec.
 
-        :raises RefusedNode: something that it names isn't on this machine.
+        :raises RefusedNode: this machine lacks something that the spec names.
         """
         files = {key: self._write(key, text) for key, text in spec.get('files', {}).items()}
-        # a file may name another one: contents last, when all have a path
+        # write contents last: a file may contain the path of another one
         for key, text in spec.get('files', {}).items():
             with open(files[key], 'w', encoding='utf-8') as stream:
                 stream.write(resolve(text, files))
         arguments = [resolve(word, files) for word in spec.get('arguments', [])]
-        environment: dict[Any, Any] = {  # launch's type is a union that a dict can't match
+        environment: dict[Any, Any] = {  # a dict does not match launch's union type
             name: resolve(value, files) for name, value in spec.get('environment', {}).items()}
         if spec.get('package'):
             arguments.insert(0, find_executable(spec['package'], spec.get('executable', '')))
@@ -215,11 +215,11 @@ class ObeyAgent(Action):
             respawn_max_retries=int(spec.get('respawn_max_retries', -1)),
             sigterm_timeout=str(float(spec.get('sigterm_timeout', 5.0))),
             sigkill_timeout=str(float(spec.get('sigkill_timeout', 5.0))),
-            output={},  # the agent has it already: to no log, to no screen
+            output={},  # the agent stores the output: use neither log nor screen
         )
 
     def _write(self, key: str, text: Text) -> str:
-        """Return the path of a new private file for ``key``."""
+        """Create a private file for ``key``; return its path."""
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix='files-', dir=self._directory)
         self._files += 1
@@ -237,7 +237,7 @@ class ObeyAgent(Action):
         if node is None or node.process is None:
             return
         if not node.running:
-            # launch takes a signal to a process that isn't there yet for an error of its own
+            # launch reports an error for a signal to a process that has not started
             if not node.seen:
                 node.waiting.append(name)
             return
@@ -245,11 +245,11 @@ class ObeyAgent(Action):
             signal_number=signal.Signals[name], process_matcher=matches_action(node.process)))
 
     def node_of(self, event: Event) -> Optional[Node]:
-        """Return the node whose process an event of launch's is about."""
+        """Return the node of a process event, None for other processes."""
         return self._by_action.get(id(getattr(event, 'action', None)))
 
     def started(self, context: LaunchContext, node: Node, event: ProcessStarted) -> None:
-        """Report a process."""
+        """Report the start of a process."""
         node.running = node.seen = True
         node.expected = False
         self._report('started', node, pid=event.pid, cmd=list(event.cmd))
@@ -259,7 +259,7 @@ class ObeyAgent(Action):
             self._signal(context, node, name)
 
     def output(self, node: Node, event: ProcessIO) -> None:
-        """Report what a process wrote."""
+        """Report output of a process."""
         stream = 'stdout' if event.from_stdout else 'stderr'
         text = node.decoders[stream].decode(event.text)
         if node.expected:
@@ -268,7 +268,7 @@ class ObeyAgent(Action):
             self._output(node, stream, text)
 
     def exited(self, context: LaunchContext, node: Node, event: ProcessExited) -> None:
-        """Report the end of a process, and whether launch starts it again."""
+        """Report the end of a process, and whether launch restarts it."""
         node.running = False
         for stream, decoder in node.decoders.items():
             self._output(node, stream, decoder.decode(b'', final=True))
@@ -281,16 +281,16 @@ class ObeyAgent(Action):
         self._report('exited', node, returncode=event.returncode, respawns=respawns)
 
     def _executed(self, context: LaunchContext, node: Node) -> None:
-        """See to it that a process which launch fails to start is reported."""
+        """Make sure that a process which launch fails to start is reported."""
         future = node.process.get_asyncio_future() if node.process is not None else None
         if future is None:
             self._refuse(node, f'{node.name} came when the machine was shutting down')
             return
-        # behind the ProcessStarted of one that ended at once
+        # handled after the ProcessStarted of a process that ended at once
         future.add_done_callback(lambda _: context.emit_event_sync(_Ended(node)))
 
     def ended(self, node: Node) -> None:
-        """See to what is left when launch is through with a process."""
+        """Report remaining output, or a failed start, when launch has finished a process."""
         self._let_go(node)
         if not node.seen:
             self._refuse(node, f'{node.name} could not be executed', 'see launch.log there')
@@ -313,11 +313,11 @@ class ObeyAgent(Action):
         try:
             self._connection.sendall(line.encode() + b'\n')
         except OSError:
-            pass  # the agent is gone; the end of file that comes next shuts down
+            pass  # the agent has ended; the end of its stream shuts launch down
 
 
 class _Ended(Event):
-    """Launch is through with a process."""
+    """launch has finished a process."""
 
     name = 'fogros2.Ended'
 
@@ -326,7 +326,7 @@ class _Ended(Event):
 
 
 class _Watch(EventHandler):
-    """Takes launch's events about the agent's processes."""
+    """Handle launch's events about the agent's processes."""
 
     def __init__(self, obey: ObeyAgent) -> None:
         kinds = (ProcessStarted, ProcessIO, ProcessExited, Shutdown, _Ended)
@@ -354,10 +354,10 @@ class _Watch(EventHandler):
 
 def resolve(text: Text, files: Mapping[str, str]) -> str:
     """
-    Return a Text with its markers replaced by this machine's paths.
+    Replace the markers in a Text by this machine's paths.
 
-    :param files: path of each file that travelled.
-    :raises RefusedNode: a package isn't on this machine.
+    :param files: path of each received file.
+    :raises RefusedNode: a package is not on this machine.
     """
     if isinstance(text, str):
         return text
@@ -381,13 +381,13 @@ def prefix_of(package: str) -> str:
     """
     Return the prefix that a package is installed in.
 
-    :raises RefusedNode: it isn't on this machine.
+    :raises RefusedNode: the package is not on this machine.
     """
     try:
         return str(get_package_prefix(package))
     except (PackageNotFoundError, ValueError) as error:
         import difflib
-        # the index lists a link that leads nowhere, too
+        # the index also lists broken links
         others = [name for name in get_packages_with_prefixes() if name != package]
         near = difflib.get_close_matches(package, others, n=1, cutoff=0.75)
         hint = f"did you mean '{near[0]}'?" if near else 'is its workspace the one that travels?'
@@ -398,7 +398,7 @@ def find_executable(package: str, executable: str) -> str:
     """
     Return the path of a package's executable.
 
-    :raises RefusedNode: the package or the executable isn't on this machine.
+    :raises RefusedNode: the package or the executable is not on this machine.
     """
     folder = os.path.join(prefix_of(package), 'lib', package)
     path = os.path.join(folder, executable)
@@ -412,9 +412,9 @@ def find_executable(package: str, executable: str) -> str:
 
 def check_program(program: str, path: str, cwd: Optional[str]) -> None:
     """
-    Look for a program as exec would.
+    Check that a program exists, with the rules of exec.
 
-    :raises RefusedNode: there is none, or it isn't executable.
+    :raises RefusedNode: it is missing, or not executable.
     """
     if '/' in program:
         candidates = [os.path.join(cwd or os.getcwd(), program)]
@@ -430,12 +430,12 @@ def check_program(program: str, path: str, cwd: Optional[str]) -> None:
 
 def interpreter(command: Sequence[str]) -> list[str]:
     """
-    Return the words before a command that start a Python program with this machine's Python.
+    Return [Python] for a Python program whose interpreter is missing, else [].
 
     A build in a virtual environment writes that environment's Python into the first line of each
     program. A machine may lack that Python.
 
-    :raises RefusedNode: the first line names a missing interpreter that isn't Python.
+    :raises RefusedNode: the first line names a missing interpreter that is not Python.
     """
     try:
         with open(command[0], 'rb') as file:
@@ -453,7 +453,7 @@ def interpreter(command: Sequence[str]) -> list[str]:
 
 
 def main() -> int:
-    """Run without ``ros2 launch`` around it; returns the exit status."""
+    """Run without ``ros2 launch``; return the exit status."""
     from launch import LaunchService
     service = LaunchService(noninteractive=True)
     service.include_launch_description(generate_launch_description())
