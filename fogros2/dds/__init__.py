@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The seam to DDS: which interfaces and peers a launch's nodes use, as the middleware wants it."""
+"""The plugin interface of ROS middlewares: interfaces and peers of a launch's nodes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from fogros2.model import Command, DdsInterface
 @dataclasses.dataclass(frozen=True)
 class Router:
     """
-    A program at which the nodes of a host meet each other, and other hosts.
+    A program that connects the nodes of a host with each other and with other hosts.
 
     :param package: with ``executable`` names a program of the ament index.
-    :param variable: names the file with ``config`` to it.
+    :param variable: environment variable with the path of its configuration file.
+    :param config: content of that file.
     """
 
     package: str
@@ -34,18 +35,18 @@ class DdsVendor(abc.ABC):
     A ROS middleware whose interfaces and peers can be configured; pure.
 
     :param domain: ROS_DOMAIN_ID of the launch.
-    :raises DdsError: the middleware has no such domain.
+    :raises DdsError: the middleware does not support the domain.
     """
 
     #: Value of RMW_IMPLEMENTATION.
     rmw: ClassVar[str]
-    #: Ranges of UDP ports, first and last, that the robot's nodes listen at beside the domain's.
+    #: Further ranges of UDP ports, (first, last), on which the robot's nodes listen.
     ports: ClassVar[Sequence[tuple[int, int]]] = ()
-    #: Whether the VPN's interface is configured by its address in place of its name.
+    #: Whether the VPN interface is configured by its address instead of its name.
     by_address: ClassVar[bool] = False
-    #: What the configuration's file is called, where the middleware minds.
+    #: Name of the configuration file; some middlewares require a suffix.
     file_name: ClassVar[str] = 'dds.xml'
-    #: The last domain; DDS has ports for no more. Those above 101 take ports that Linux hands out.
+    #: The last domain for which DDS has ports. Domains above 101 use Linux's ephemeral ports.
     last_domain: ClassVar[int] = 232
 
     def __init__(self, domain: int = 0) -> None:
@@ -54,11 +55,11 @@ class DdsVendor(abc.ABC):
         self.domain = domain
 
     def ask_lan(self) -> Command:
-        """Return the command, for the robot, whose output ``parse_lan`` reads; unless it minds."""
+        """Return the robot's command for ``parse_lan``; by default no output is needed."""
         return Command(('true',), what='look at the network interfaces')
 
     def parse_lan(self, output: str) -> Optional[str]:
-        """Return the interface that nodes would take by themselves, None where there is none."""
+        """Return the LAN interface that nodes use by default, None without one."""
         return None
 
     @abc.abstractmethod
@@ -66,17 +67,17 @@ class DdsVendor(abc.ABC):
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:
         """
-        Return the interfaces of the robot's nodes: what is there without us, and the VPN.
+        Return the interfaces of the robot's nodes: those that they use anyway, and the VPN.
 
-        :param vpn: name of the VPN's interface.
-        :param lan: of ``parse_lan``.
-        :param user: the environment as the user has it.
-        :raises DdsError: the user's configuration leaves no place for the VPN.
+        :param vpn: name of the VPN interface, or its address (``by_address``).
+        :param lan: result of ``parse_lan``.
+        :param user: the user's environment variables.
+        :raises DdsError: the user's configuration does not allow the VPN.
         """
 
     @abc.abstractmethod
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
-        """Return the interfaces of a machine's nodes: the VPN and the machine itself."""
+        """Return the interfaces of a machine's nodes: the VPN and the loopback."""
 
     @abc.abstractmethod
     def render(
@@ -84,12 +85,12 @@ class DdsVendor(abc.ABC):
         user: Mapping[str, str] = MappingProxyType({}),
     ) -> str:
         """
-        Return the configuration file's text.
+        Return the text of the configuration file.
 
-        :param interfaces: those the nodes use.
-        :param peers: addresses asked for participants, ours (127.0.0.1) not among them.
-        :param user: the environment as the user has it, for middlewares that read one file alone:
-            what it configures goes into that.
+        :param interfaces: the interfaces that the nodes use.
+        :param peers: addresses of hosts to ask for participants, without 127.0.0.1.
+        :param user: the user's environment variables, for middlewares that read only one file: the
+            user's configuration is merged into that file.
         """
 
     @abc.abstractmethod
@@ -97,29 +98,29 @@ class DdsVendor(abc.ABC):
         """
         Return the variables that make nodes read the file at ``path``.
 
-        :param user: the environment as the user has it; what it configures is kept, ours after it.
+        :param user: the user's environment variables; their configuration stays, ours follows.
         """
 
     def router(
         self, address: str, others: Sequence[str], user: Optional[Mapping[str, str]],
     ) -> Optional[Router]:
         """
-        Return what has to run beside the nodes of a host; None, the default, for nothing.
+        Return the router that has to run beside the nodes of a host; None, the default, for none.
 
-        :param address: the host's in the VPN.
-        :param others: those of hosts that it shall find.
-        :param user: the robot's environment as the user has it; None on a machine.
+        :param address: the host's VPN address.
+        :param others: VPN addresses of hosts that it has to find.
+        :param user: the robot's user environment; None on a machine.
         """
         return None
 
 
 def static_peers(user: Mapping[str, str]) -> list[str]:
-    """Return the hosts of ROS_STATIC_PEERS, which has ``;`` between them."""
+    """Return the hosts in ROS_STATIC_PEERS, which are separated by ``;``."""
     return [host.strip() for host in user.get('ROS_STATIC_PEERS', '').split(';') if host.strip()]
 
 
 def is_address(text: str) -> bool:
-    """Return whether a text is an IP address, not a name."""
+    """Return whether a text is an IP address rather than a name."""
     try:
         ipaddress.ip_address(text)
     except ValueError:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Cyclone DDS, ROS 2's ``rmw_cyclonedds_cpp``: its configuration for a robot with a VPN.
+Configure Cyclone DDS, ROS 2's ``rmw_cyclonedds_cpp``, for a robot with a VPN.
 
-Written for 0.10 (ROS 2 Jazzy) and 11: only elements that both know, and all of it tried with both.
+Written for 0.10 (ROS 2 Jazzy) and 11: it uses only elements that both accept, and was tested with
+both.
 
-A process announces every address it has, in the order of its interfaces' priorities, and another
-host takes the first that isn't a loopback. So the robot prefers the loopback (its own nodes talk
-there whatever becomes of its networks), then its LAN (whose other computers send to it there),
-then the VPN. Machines don't route: the robot's LAN address isn't reachable directly from them,
-so they take the VPN's. A process asks its ``Peers`` from the socket of its first interface, which
-leads nowhere from a loopback: the robot has none, and announcements cross the VPN by multicast
-(see ``vpn/wireguard.py``), once in an interval rather than once per port that may be in use. They
-go to each participant that is known, too, as those have no multicast address of their own: what
-an idle launch sends grows with the pairs of processes here and there; the interval divides it.
+A process announces all of its addresses, in the order of its interfaces' priorities. Another host
+uses the first address that is not a loopback. So the robot prefers the loopback, where its own
+nodes communicate whatever happens to its networks, then its LAN, whose computers use that address,
+then the VPN. Machines do not route: they cannot reach the robot's LAN address directly, so they
+use the VPN address. A process asks its ``Peers`` from the socket of its first interface, which
+cannot reach other hosts from a loopback. So the robot has no peers, and announcements cross the
+VPN by multicast (see ``vpn/wireguard.py``), once per interval instead of once per possible port.
+They are also sent to each known participant, because participants have no multicast address of
+their own. So the traffic of an idle launch grows with the pairs of processes on both sides, and
+is inversely proportional to the interval.
 """
 
 from __future__ import annotations
@@ -30,35 +32,36 @@ from fogros2.dds import DdsVendor, is_address
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 
-#: ROS 2 processes that a host can have in a domain, as its ports allow.
+#: Maximum number of ROS 2 processes of a host in a domain, limited by its ports.
 MAX_PARTICIPANTS = 119
-#: Of these, how many a peer is asked for: each has a port, which each participant asks in each
-#: interval, whether anything runs there or not. Who is asked answers, so only two processes that
-#: both come later than that on their hosts don't find each other.
+#: Number of processes that a peer is asked for. Each participant asks each of their ports in each
+#: interval, whether or not a process uses the port. An asked process answers, so only two
+#: processes that both have higher numbers on their hosts do not find each other.
 ASKED = 10
-#: RTPS 2.5, 9.6.2.3: participant i of a domain is asked at 7410 + 250 * domain + 2 * i.
+#: RTPS 2.5, 9.6.2.3: participant i of a domain listens at 7410 + 250 * domain + 2 * i.
 PORT_BASE = 7410
 PORTS_PER_DOMAIN = 250
-#: Seconds between a participant's announcements: how soon a host is found again whose lease
-#: ended in a long cut, or whose first one was lost. Fifty processes send 210 kB/s by it.
+#: Seconds between announcements of a participant: how soon a host is found again after its lease
+#: ended in a long interruption, or its first announcement was lost. Fifty processes send 210 kB/s.
 SPDP_INTERVAL = 3
-#: Seconds a silent participant is kept: what a cut may last without being discovered anew.
+#: Seconds after which a silent participant is dropped; shorter interruptions need no rediscovery.
 LEASE_DURATION = 60
-#: Milliseconds after which a gap is reported, rather than 100: what comes out of order over a VPN
-#: is less late than that. And after which a writer asks whether all has come, 100 as well by
-#: default: with nothing behind it, a lost message is missed no sooner. Writers ask only as long as
-#: something isn't acknowledged, less and less often, so idle ones stay silent.
+#: NACK_DELAY: milliseconds after which a gap is reported (default 100). Packets that a VPN
+#: reorders are less late than that. HEARTBEAT: milliseconds after which a writer asks whether all
+#: samples have arrived (default 100): without a following sample, a lost one is noticed only then.
+#: Writers ask only while samples are unacknowledged, less and less often: idle ones send nothing.
 NACK_DELAY = 5
 HEARTBEAT = 20
-#: Bytes of receive buffer asked for (a raw 1080p image is 6 MB, sent in one burst); the kernel
-#: gives what its rmem_max allows, and asking for a minimum would fail there.
+#: Requested receive buffer in bytes (a raw 1080p image is 6 MB in one burst). The kernel limits
+#: it to its rmem_max; a required minimum above that limit would fail.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Bytes of one fragment, of a retransmission, and of a message where all of them cross the VPN:
-#: what fits into 1420 bytes after IPv4 and UDP (28), RTPS, INFO_DST, INFO_TS and DATA_FRAG (84).
+#: Bytes of a fragment; MESSAGE: of a retransmission, and of any message where all messages cross
+#: the VPN: what fits into 1420 bytes after IPv4 and UDP (28), RTPS, INFO_DST, INFO_TS and
+#: DATA_FRAG (84).
 FRAGMENT = 1280
 MESSAGE = 1380
 LOOPBACK = '127.0.0.1'
-#: Interfaces of FogROS2's own, and the loopback.
+#: FogROS2's own interfaces, and the loopback.
 _NOT_LAN = re.compile('lo$|fog')
 #: <linux/if.h>
 _IFF_MULTICAST = 0x1000
@@ -66,7 +69,7 @@ _IFF_MULTICAST = 0x1000
 
 class CycloneDds(DdsVendor):
     """
-    Renders CYCLONEDDS_URI: local first, then LAN, then VPN; patient with a link that is cut.
+    Write CYCLONEDDS_URI: local first, then LAN, then VPN; tolerate interruptions of the link.
 
     :param domain: ROS_DOMAIN_ID, in which peers are asked.
     """
@@ -80,11 +83,11 @@ class CycloneDds(DdsVendor):
 
     def parse_lan(self, output: str) -> Optional[str]:
         """
-        Return the interface that Cyclone takes by itself, so that what it reaches stays in reach.
+        Return the interface that Cyclone uses by default, so that its network stays reachable.
 
-        That is the first one that can multicast, in the kernel's order; None where there is none.
+        That is the first one with multicast, in the kernel's order; None if there is none.
 
-        :raises DdsError: it isn't what ``ip`` prints.
+        :raises DdsError: the output is not that of ``ip``.
         """
         try:
             for link in json.loads(output or '[]'):
@@ -103,11 +106,11 @@ class CycloneDds(DdsVendor):
         Return the interfaces of the robot's nodes, which get no peers.
 
         :param lan: see :meth:`parse_lan`.
-        :param user: the environment as the user has it; interfaces configured there are used in
-            the LAN's place, peers make the LAN come first, or they couldn't be asked, and who
-            keeps ROS 2 to this computer has no LAN.
-        :raises DdsError: the user's configuration can't be read, can't be added to, or lets no
-            announcement of a machine in.
+        :param user: the user's environment variables. Interfaces configured there replace the LAN.
+            Peers make the LAN come first, because a loopback cannot ask them. If ROS 2 is
+            limited to this computer, the LAN is not used.
+        :raises DdsError: the user's configuration cannot be read or extended, or blocks the
+            announcements of machines.
         """
         text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
         if '<NetworkInterfaceAddress' in text:
@@ -115,7 +118,7 @@ class CycloneDds(DdsVendor):
                 "CYCLONEDDS_URI's NetworkInterfaceAddress leaves no place for the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
         if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST':
-            # the user keeps to this computer: to it and its machines, then
+            # the user limits ROS 2 to this computer; here: to this computer and its machines
             lan = None
         has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
         listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
@@ -127,7 +130,7 @@ class CycloneDds(DdsVendor):
                  or user.get('ROS_LOCALHOST_ONLY') == '1')
         if lan is not None and not listed and not local:
             interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
-        # below 0, which is what an interface has whose priority the user didn't think of
+        # below 0, the default priority of the user's own interfaces
         return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
@@ -140,9 +143,9 @@ class CycloneDds(DdsVendor):
         user: Mapping[str, str] = MappingProxyType({}),
     ) -> str:
         """
-        Return the XML; the user's own comes beside it, see :meth:`environment`.
+        Return the XML; the user's own configuration stays separate, see :meth:`environment`.
 
-        :param peers: left out where the preferred interface is a loopback, which can't ask them.
+        :param peers: ignored if the preferred interface is a loopback, which cannot ask them.
         :raises DdsError: no interface.
         """
         if not interfaces:
@@ -162,21 +165,21 @@ class CycloneDds(DdsVendor):
             '      <Interfaces>',
             *(f'        {_interface(interface)}' for interface in ordered),
             '      </Interfaces>',
-            # announcements alone: data goes to whom it matches, and no further
+            # multicast for announcements only: data is sent to matching participants
             f'      <AllowMulticast>{"spdp" if multicast else "false"}</AllowMulticast>',
             *_if(multicast, '      <MulticastRecvNetworkInterfaceAddresses>all'
                             '</MulticastRecvNetworkInterfaceAddresses>'),
-            # machines: what isn't on the VPN's subnet, such as the robot's LAN, is out of reach
+            # machines: addresses outside the VPN's subnet, as in the robot's LAN, are unreachable
             *_if(len(networks) == 1 and ordered[0] in networks,
                  '      <DontRoute>true</DontRoute>'),
-            # the size holds for the whole process: small only where nothing big stays on the host
+            # the size applies to the whole process: small only if no data stays on the host
             *_if(len(interfaces) == len(networks) == 1,
                  f'      <MaxMessageSize>{MESSAGE} B</MaxMessageSize>'),
             f'      <MaxRexmitMessageSize>{MESSAGE} B</MaxRexmitMessageSize>',
             f'      <FragmentSize>{FRAGMENT} B</FragmentSize>',
             '    </General>',
             '    <Discovery>',
-            # a port that others can know: machines are asked by unicast
+            # a predictable port: machines are asked by unicast
             '      <ParticipantIndex>auto</ParticipantIndex>',
             f'      <MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>',
             f'      <SPDPInterval>{SPDP_INTERVAL} s</SPDPInterval>',
@@ -198,7 +201,7 @@ class CycloneDds(DdsVendor):
 
     def _addresses(self, host: str) -> list[str]:
         begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
-        # it costs no network to ask more of this host
+        # asking more processes of this host uses no network
         count = 4 * ASKED if host == LOOPBACK else ASKED
         return [f'{host}:{port}' for port in range(begin, begin + 2 * count, 2)]
 
@@ -206,11 +209,11 @@ class CycloneDds(DdsVendor):
         """
         Return RMW_IMPLEMENTATION and CYCLONEDDS_URI: the user's fragments, then our file.
 
-        Cyclone reads them in order and the last word on a setting counts; interfaces and peers
-        add up.
+        Cyclone reads them in order, and the last value of a setting wins; interfaces and peers add
+        up.
 
-        :param path: absolute.
-        :raises DdsError: the user's environment turns discovery off, or the path has a comma.
+        :param path: absolute path of our file.
+        :raises DdsError: the user's environment disables discovery, or the path contains a comma.
         """
         if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
             raise DdsError(
@@ -218,7 +221,7 @@ class CycloneDds(DdsVendor):
                 'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
         if ',' in path:
             raise DdsError(f'Cyclone DDS reads {path} as two files', 'use a path without a comma')
-        # Cyclone opens what follows file:// as it is, without decoding
+        # Cyclone opens the path after file:// without decoding it
         ours = f'file://{path}'
         theirs = user.get('CYCLONEDDS_URI', '').strip().rstrip(',')
         if theirs.endswith(ours):
@@ -229,7 +232,7 @@ class CycloneDds(DdsVendor):
 
 
 def _fragments(uri: str) -> Iterator[str]:
-    """Yield the XML of each part of a CYCLONEDDS_URI: inline, or the file that it names."""
+    """Yield the XML of each part of a CYCLONEDDS_URI: inline text, or the content of a file."""
     rest = uri.strip(' ,\n\t')
     while rest:
         if rest.startswith('<'):
@@ -249,10 +252,10 @@ def _fragments(uri: str) -> Iterator[str]:
 
 def _check_multicast(listed: Sequence[str]) -> None:
     """
-    Refuse an interface of the user's that takes multicast from all the others.
+    Refuse a user's interface that disables multicast on all interfaces.
 
-    Cyclone 0.10, which ROS 2 Jazzy has, turns it off for the whole process then, and with it what
-    machines are found by.
+    Cyclone 0.10 (ROS 2 Jazzy) then disables multicast for the whole process, and machines are
+    found by multicast.
 
     :param listed: the attributes of each ``<NetworkInterface>``.
     """
@@ -269,7 +272,7 @@ def _has_multicast(interface: str) -> bool:
     try:
         flags = Path('/sys/class/net', interface, 'flags').read_text()
     except OSError:
-        return True  # Cyclone has its own word on one that isn't there
+        return True  # Cyclone itself reports a missing interface
     return bool(int(flags, 16) & _IFF_MULTICAST)
 
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Fast DDS, ROS 2's ``rmw_fastrtps_cpp``: its profile for a robot with a VPN.
+Configure Fast DDS, ROS 2's ``rmw_fastrtps_cpp``, for a robot with a VPN.
 
-Written for 2.14 (ROS 2 Jazzy). 2.9 reads it too, but knows no ``netmask_filter``.
+Written for 2.14 (ROS 2 Jazzy). 2.9 reads the profile too, but does not know ``netmask_filter``.
 
-A process announces every address it has, and others send to all of them. So the robot keeps what
-it has without us, every interface, and the VPN's is one of them: other computers on its LAN go on.
-A machine has the VPN's interface alone, and sends to addresses of that network alone: the robot's
-LAN is none of its business, and what is sent there would leave the machine in clear. Announcements
-cross the VPN by multicast (see ``vpn/wireguard.py``), and machines ask each other by unicast.
+A process announces all of its addresses, and others send to all of them. So the robot keeps all of
+its interfaces, with the VPN's as one of them, and other computers on its LAN work as before. A
+machine uses only the VPN interface, and sends only to addresses of that network: packets to the
+robot's LAN would leave the machine unencrypted. Announcements cross the VPN by multicast (see
+``vpn/wireguard.py``), and machines ask each other by unicast.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from fogros2.dds import DdsVendor, is_address, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
-#: Where Fast DDS looks for its profiles.
+#: Environment variable with the path of Fast DDS's profiles.
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
-#: Processes that a host is asked for: each has a port, which each participant asks in each
-#: interval. Who is asked answers, so only two that both come later don't find each other.
+#: Number of processes that a host is asked for. Each participant asks each of their ports in each
+#: interval. An asked process answers, so only two with higher numbers do not find each other.
 ASKED = 10
-#: Of this computer it costs no network to ask more; ROS 2 asks as many.
+#: The same for this computer, where asking uses no network; ROS 2 asks as many.
 ASKED_HERE = 32
-#: RTPS 2.5, 9.6.2.3: participant i of a domain is asked at 7410 + 250 * domain + 2 * i.
+#: RTPS 2.5, 9.6.2.3: participant i of a domain listens at 7410 + 250 * domain + 2 * i.
 PORT_BASE = 7410
 PORTS_PER_DOMAIN = 250
-#: RTPS 2.5, 9.6.2.4.
+#: RTPS 2.5, 9.6.2.4: multicast group of participant announcements.
 DISCOVERY_GROUP = '239.255.0.1'
-#: Seconds between a participant's announcements, which go to each one that it knows: in all they
-#: grow with the square of the participants.
+#: Seconds between announcements of a participant, which are sent to each known participant: the
+#: traffic grows with the square of their number.
 ANNOUNCEMENT = 3
-#: Seconds a silent participant is kept: what a cut may last without being discovered anew.
+#: Seconds after which a silent participant is dropped; shorter interruptions need no rediscovery.
 LEASE_DURATION = 60
-#: Bytes of receive buffer asked for; the kernel gives what its rmem_max allows.
+#: Requested receive buffer in bytes; the kernel limits it to its rmem_max.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Addresses of another participant that are kept. The default is 4, and a robot with containers
-#: easily has more: the VPN's, one of its newest, would be left out.
+#: Number of stored addresses of another participant. The default is 4, and a robot with containers
+#: easily has more; the VPN's, one of its newest, would be dropped.
 KEPT_ADDRESSES = 32
 LOOPBACK = '127.0.0.1'
-#: FASTDDS_BUILTIN_TRANSPORTS with which nodes reach those that have UDP alone.
+#: Values of FASTDDS_BUILTIN_TRANSPORTS that can reach nodes with UDP only.
 _REACHABLE = ('', 'DEFAULT', 'UDPV4')
 _PEER = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _UDP, _SHM = 'fogros2_udp', 'fogros2_shm'
@@ -57,23 +57,23 @@ _UDP, _SHM = 'fogros2_udp', 'fogros2_shm'
 
 class FastDds(DdsVendor):
     """
-    Renders a profile for every participant: what it has, or the VPN alone.
+    Write a profile for every participant: all interfaces, or the VPN only.
 
     :param domain: ROS_DOMAIN_ID, in which peers are asked.
     """
 
     rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
-    #: Where each process hears which nodes others have (``ros_discovery_info``), in every domain:
-    #: the middleware asks for a port of its own for that.
+    #: The middleware shares the nodes of each process (``ros_discovery_info``) at separate ports,
+    #: which are the same in every domain.
     ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
 
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:
         """
-        Return the interfaces of the robot's nodes; none stands for all that there are.
+        Return the interfaces of the robot's nodes; an empty list stands for all interfaces.
 
-        :raises DdsError: the user's environment keeps nodes from machines.
+        :raises DdsError: the user's environment prevents communication with machines.
         """
         if user.get('ROS_DISCOVERY_SERVER'):
             raise DdsError(
@@ -89,7 +89,7 @@ class FastDds(DdsVendor):
         return []
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
-        """Return the interface of a machine's nodes; beside it they share memory."""
+        """Return the interface of a machine's nodes; on the machine they use shared memory."""
         return [DdsInterface(vpn, multicast=True)]
 
     def render(
@@ -97,14 +97,13 @@ class FastDds(DdsVendor):
         user: Mapping[str, str] = MappingProxyType({}),
     ) -> str:
         """
-        Return the XML: the user's profiles, and in the default participant's what we add.
+        Return the XML: the user's profiles, with our settings in the default participant.
 
-        :param interfaces: none for all there are.
-        :param peers: hosts that are asked by unicast. Where an interface can multicast, that comes
-            beside it.
-        :param user: its FASTRTPS_DEFAULT_PROFILES_FILE is taken over, its ROS_STATIC_PEERS are
-            asked too.
-        :raises DdsError: the user's profiles can't be read, or have transports of their own.
+        :param interfaces: empty for all interfaces.
+        :param peers: hosts to ask by unicast, besides multicast if an interface supports it.
+        :param user: the user's environment variables: the profiles of
+            FASTRTPS_DEFAULT_PROFILES_FILE are included, and ROS_STATIC_PEERS are asked too.
+        :raises DdsError: the user's profiles cannot be read, or configure transports.
         """
         multicast = not interfaces or any(one.multicast for one in interfaces)
         root, profiles = _profiles(user.get(VARIABLE, ''))
@@ -121,7 +120,7 @@ class FastDds(DdsVendor):
                 _child(_child(discovery, name), 'sec').text = str(seconds)
         asked = list(dict.fromkeys([*peers, *static_peers(user)]))
         if multicast and (asked or interfaces):
-            # any peer at all takes the place of what is asked by default
+            # any initial peer replaces the default ones
             asked.insert(0, DISCOVERY_GROUP)
         if any(one.name == LOOPBACK for one in interfaces) or not multicast:
             asked.append(LOOPBACK)
@@ -131,7 +130,7 @@ class FastDds(DdsVendor):
             for host in asked:
                 listed.extend(self._locators(host))
         if not multicast:
-            # an address of its own, whatever it is, keeps it off the default group
+            # any configured address disables the default multicast group
             _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
         if interfaces:
             _own_transports(profiles, rtps, interfaces)
@@ -147,7 +146,7 @@ class FastDds(DdsVendor):
             raise DdsError(f"'{host}' is no host that can be asked for nodes",
                            'write addresses or names, with ; between them')
         if host == DISCOVERY_GROUP:
-            # its port is the domain's first, which Fast DDS fills in
+            # the domain's first port, which is Fast DDS's default for multicast
             return [_locator(host, PORT_BASE - 10 + PORTS_PER_DOMAIN * self.domain)]
         begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
         count = ASKED_HERE if host == LOOPBACK else ASKED
@@ -155,12 +154,12 @@ class FastDds(DdsVendor):
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
-        Return RMW_IMPLEMENTATION and the profile's place.
+        Return RMW_IMPLEMENTATION and the path of the profile.
 
-        What ROS_AUTOMATIC_DISCOVERY_RANGE says is in the profile already. The middleware would
-        add transports of its own to it, which listen on every interface.
+        The profile already contains the effect of ROS_AUTOMATIC_DISCOVERY_RANGE. With that
+        variable the middleware would add its own transports, which listen on every interface.
 
-        :raises DdsError: the user's environment turns discovery off.
+        :raises DdsError: the user's environment disables discovery.
         """
         if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
             raise DdsError(
@@ -179,7 +178,7 @@ def _here_only(user: Mapping[str, str]) -> bool:
 
 
 def _profiles(path: str) -> tuple[Element, Element]:
-    """Return the root of the user's profiles and the element that holds them; new ones for ''."""
+    """Return the root of the user's profiles and the ``profiles`` element; new ones for ''."""
     if not path:
         root = Element('dds', xmlns=NAMESPACE)
         return root, _child(root, 'profiles')
@@ -217,10 +216,10 @@ def _default_participant(profiles: Element) -> Element:
 def _own_transports(
     profiles: Element, rtps: Element, interfaces: Sequence[DdsInterface],
 ) -> None:
-    """Let participants use these interfaces and no other, and send to their networks alone."""
+    """Let participants use only these interfaces, and send only to their networks."""
     descriptors = profiles.find('transport_descriptors')
     if descriptors is None:
-        # transports come before the participants that name them
+        # transports have to precede the participants that use them
         descriptors = Element('transport_descriptors')
         profiles.insert(0, descriptors)
     udp = ElementTree.SubElement(descriptors, 'transport_descriptor')
@@ -255,6 +254,6 @@ def _child(parent: Element, name: str) -> Element:
 
 
 def _sort(rtps: Element) -> None:
-    """Put transports before what uses them, as the schema's examples have it."""
+    """Put transports first, as in the schema's examples."""
     order = ('userTransports', 'useBuiltinTransports')
     rtps[:] = sorted(rtps, key=lambda child: child.tag not in order)

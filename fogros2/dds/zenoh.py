@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Zenoh, ROS 2's ``rmw_zenoh_cpp``: one router per host, connected over the VPN.
+Configure Zenoh, ROS 2's ``rmw_zenoh_cpp``: one router per host, connected over the VPN.
 
-Nodes know the router of their host alone, at the host's address in the VPN: an address of this
-launch's own, so two launches, and a router that runs already, have their own each. The robot's
-router dials those of machines (nothing from the VPN reaches a TCP port of the robot), machines'
-routers dial each other, and the robot's joins the one that the user's other nodes have, and with
-it the robot's LAN.
+Nodes connect only to their host's router, at the host's VPN address. That address belongs to one
+launch, so it cannot conflict with other launches or with a router that runs already. The robot's
+router dials the machines' routers, because the robot admits no TCP from the VPN. The machines'
+routers dial each other. The robot's router also dials the router of the user's other nodes, and
+so reaches the robot's LAN.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from fogros2.dds import DdsVendor, Router, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
-#: TCP port of routers in the VPN; 7447 is the one that rmw_zenoh's own takes on all interfaces.
+#: TCP port of routers in the VPN; rmw_zenoh's own router uses 7447 on all interfaces.
 PORT = 7448
 USERS_ROUTER = 'tcp/127.0.0.1:7447'
-#: Milliseconds between attempts to dial a router, doubled up to the second.
+#: Milliseconds between attempts to dial a router: the first value, doubled up to the second.
 RETRY, RETRY_MAX = 250, 2000
-#: Milliseconds without a sign of life after which a link is taken for broken and dialled anew.
+#: Milliseconds without a sign of life after which a link counts as broken and is dialled again.
 LEASE = 10_000
-#: Milliseconds that a service or action call waits for its answer: as long as it takes.
+#: Time-out in milliseconds of a service or action call: practically none.
 QUERY_TIMEOUT = 600_000
 
 
 class Zenoh(DdsVendor):
     """
-    Renders the configurations of sessions and routers.
+    Write the configurations of sessions and routers.
 
-    :param domain: ROS_DOMAIN_ID, which rmw_zenoh has in its keys itself.
+    :param domain: ROS_DOMAIN_ID, which rmw_zenoh itself adds to its keys.
     """
 
     rmw: ClassVar[str] = 'rmw_zenoh_cpp'
@@ -46,9 +46,9 @@ class Zenoh(DdsVendor):
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:
         """
-        Return the address at which nodes meet the robot's router.
+        Return the address of the robot's router.
 
-        :raises DdsError: the user's environment leads nodes to another one.
+        :raises DdsError: the user's environment connects nodes to another router.
         """
         if user.get('ZENOH_SESSION_CONFIG_URI'):
             raise DdsError(
@@ -62,7 +62,7 @@ class Zenoh(DdsVendor):
         return [DdsInterface(vpn)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
-        """Return the address at which nodes meet the machine's router."""
+        """Return the address of the machine's router."""
         return [DdsInterface(vpn)]
 
     def render(
@@ -70,23 +70,23 @@ class Zenoh(DdsVendor):
         user: Mapping[str, str] = MappingProxyType({}),
     ) -> str:
         """
-        Return the configuration of nodes' sessions, JSON.
+        Return the configuration of the nodes' sessions as JSON.
 
-        :param interfaces: one, by its address.
-        :param peers: left out: the router dials them.
+        :param interfaces: exactly one, given by its address.
+        :param peers: ignored: the router dials them.
         """
         if len(interfaces) != 1:
             raise DdsError('nodes on zenoh need one address of a router')
         return _text({
             'mode': 'peer',
             'connect': {'endpoints': [_endpoint(interfaces[0].name)], **_PATIENT},
-            # others of the host learn it from the router, and talk without it
+            # other nodes of the host get this address from the router, then talk directly
             'listen': {'endpoints': ['tcp/127.0.0.1:0']},
             'scouting': {
                 'multicast': {'enabled': False},
                 'gossip': {'enabled': True, 'multihop': False,
                            'autoconnect': {'router': [], 'peer': ['router', 'peer']}}},
-            # latched topics are kept in order by it
+            # needed to keep the order of latched topics
             'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
             'queries_default_timeout': QUERY_TIMEOUT,
             'transport': _TRANSPORT,
@@ -98,8 +98,8 @@ class Zenoh(DdsVendor):
         """
         Return the host's router.
 
-        :param user: its ROS_STATIC_PEERS have routers too, at rmw_zenoh's own port. With
-            ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST the router keeps to the machines.
+        :param user: ROS_STATIC_PEERS have routers too, at rmw_zenoh's own port. With
+            ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST the router connects only to machines.
         """
         dialled = [_endpoint(other) for other in others]
         if user is not None and not _here_only(user):
@@ -108,7 +108,7 @@ class Zenoh(DdsVendor):
             'mode': 'router',
             'listen': {'endpoints': [_endpoint(address)]},
             'connect': {'endpoints': dialled, **_PATIENT},
-            # nobody else in reach of the VPN's interface is asked, and none of a LAN
+            # no multicast scouting, neither on the VPN nor on a LAN
             'scouting': {'multicast': {'enabled': False}, 'gossip': {'enabled': True}},
             'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
             'queries_default_timeout': QUERY_TIMEOUT,
@@ -117,9 +117,9 @@ class Zenoh(DdsVendor):
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
-        Return RMW_IMPLEMENTATION and the place of the sessions' configuration.
+        Return RMW_IMPLEMENTATION and the path of the sessions' configuration.
 
-        :raises DdsError: the user's environment turns discovery off.
+        :raises DdsError: the user's environment disables discovery.
         """
         if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
             raise DdsError(
@@ -128,14 +128,14 @@ class Zenoh(DdsVendor):
         return {'RMW_IMPLEMENTATION': self.rmw, 'ZENOH_SESSION_CONFIG_URI': path}
 
 
-#: A router that isn't there yet is dialled again and again, and nothing fails meanwhile.
+#: Dial a missing router repeatedly, without failing.
 _PATIENT: Mapping[str, Any] = {
     'timeout_ms': -1, 'exit_on_failure': False,
     'retry': {'period_init_ms': RETRY, 'period_max_ms': RETRY_MAX, 'period_increase_factor': 2}}
 _TRANSPORT: Mapping[str, Any] = {
     'unicast': {'open_timeout': 60_000, 'accept_timeout': 60_000, 'max_sessions': 10_000},
     'link': {'tx': {'lease': LEASE, 'keep_alive': 4}},
-    # hosts share none, and a machine's limits are small
+    # hosts share no memory, and a machine's limits are small
     'shared_memory': {'enabled': False}}
 
 

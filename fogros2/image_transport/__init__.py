@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The seam to image transports: the pair of nodes that carries a topic across the VPN encoded."""
+"""The plugin interface of image transports: a pair of nodes that sends a topic over the VPN."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from fogros2.model import NodeSpec, Stream
 
 
 class ImageTransport(abc.ABC):
-    """A way to encode a topic on one side and decode it on the other; pure but for ``check``."""
+    """Encode a topic on one side of the VPN and decode it on the other; pure except ``check``."""
 
-    #: Whether the pair carries camera info too, for streams that ask for it. Where it doesn't,
-    #: camera info keeps its name, and crosses the VPN as it is.
+    #: Whether the pair also carries camera info, for streams that request it. Otherwise camera
+    #: info keeps its name and crosses the VPN as an ordinary topic.
     camera_info: ClassVar[bool] = False
-    #: The options that a stream may have, None for any.
+    #: The valid options of a stream, None for any.
     options: ClassVar[Optional[frozenset[str]]] = None
 
     def check(self) -> None:
         """
-        Hold what this computer has against what a node of the pair needs; costs next to nothing.
+        Check that this computer has what a node of the pair needs; cheap.
 
-        :raises PrerequisiteError: something isn't installed.
+        :raises PrerequisiteError: something is not installed.
         """
 
     @abc.abstractmethod
     def encoder(self, stream: Stream) -> NodeSpec:
-        """Return the node beside the publisher: takes the topic, publishes the stream."""
+        """Return the publisher's node: it subscribes to the topic and publishes the stream."""
 
     @abc.abstractmethod
     def decoder(self, stream: Stream) -> NodeSpec:
-        """Return the node beside the subscriber: takes the stream, publishes the topic."""
+        """Return the subscriber's node: it subscribes to the stream and publishes the topic."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JPEG or PNG, each image by itself: option ``format``, and ``jpeg_quality`` (80)."""
+"""Send each image as JPEG or PNG: options ``format``, and ``jpeg_quality`` (default 80)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from fogros2.model import NodeSpec, Stream
 
 
 class Compressed(ImageTransport):
-    """``/camera`` crosses as ``/camera/compressed``, as ROS's own transport of that name."""
+    """Send ``/camera`` as ``/camera/compressed``, like ROS's own transport of that name."""
 
     camera_info = True
     options = OPTIONS | {'format', 'jpeg_quality'}
 
     def check(self) -> None:
-        """Look for PyAV, OpenCV and NumPy."""
+        """Check for PyAV, OpenCV and NumPy."""
         check_modules()
 
     def encoder(self, stream: Stream) -> NodeSpec:

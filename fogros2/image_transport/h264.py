@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""H.264, through ``image_transport_h264``: see doc/h264.md for its options."""
+"""Send images as H.264 by ``image_transport_h264``; doc/h264.md describes its options."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from fogros2.model import NodeSpec, Stream
 
 
 class H264(ImageTransport):
-    """``/camera`` crosses as ``/camera/h264``."""
+    """Send ``/camera`` as ``/camera/h264``."""
 
     camera_info = True
     options = OPTIONS | {'adapt', 'bitrate', 'encoder', 'gop', 'lossless', 'max_rate', 'preset',
                          'quality'}
 
     def check(self) -> None:
-        """Look for PyAV, OpenCV and NumPy."""
+        """Check for PyAV, OpenCV and NumPy."""
         check_modules()
 
     def encoder(self, stream: Stream) -> NodeSpec:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images as they are: for comparison, and for links that have room."""
+"""Send images unencoded: for comparison, and for fast links."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from fogros2.model import NodeSpec, Stream
 
 
 class Raw(ImageTransport):
-    """``/camera`` crosses as ``/camera/raw``, while a subscriber is there."""
+    """Send ``/camera`` as ``/camera/raw``, while there is a subscriber."""
 
     camera_info = True
     options = OPTIONS
 
     def check(self) -> None:
-        """Look for PyAV, OpenCV and NumPy."""
+        """Check for PyAV, OpenCV and NumPy."""
         check_modules()
 
     def encoder(self, stream: Stream) -> NodeSpec:
-        """Return the node that passes images on."""
+        """Return the node that sends images."""
         return node(stream, role='encoder', codec='raw', machine=stream.source, name='raw')
 
     def decoder(self, stream: Stream) -> NodeSpec:
-        """Return the node that takes them."""
+        """Return the node that receives images."""
         return node(stream, role='decoder', codec='raw', machine=stream.target, name='raw')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The transports of C++ ``image_transport``, through its program ``republish``."""
+"""Use the transports of C++ ``image_transport`` through its program ``republish``."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from fogros2.model import NodeSpec, Stream
 
 class Republish(ImageTransport):
     """
-    A transport whose plugin is installed on both sides.
+    A transport whose C++ plugin is installed on both sides.
 
     The stream's options are the plugin's parameters, such as ``quality=31`` for Theora, which
-    ``republish`` calls ``out.theora.quality``. One with a dot in it is taken for such a full name.
+    ``republish`` calls ``out.theora.quality``. An option with a dot is taken as such a full name.
     """
 
     plugin: ClassVar[str]
 
     def check(self) -> None:
         """
-        Look for the two packages in AMENT_PREFIX_PATH.
+        Check that AMENT_PREFIX_PATH contains the two packages.
 
-        :raises PrerequisiteError: one isn't there.
+        :raises PrerequisiteError: a package is missing.
         """
         prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
         for package in ('image_transport', f'{self.plugin}_image_transport'):
@@ -39,13 +39,13 @@ class Republish(ImageTransport):
                     f"apt install {apt}, here and on the machine; or stream by 'h264'")
 
     def encoder(self, stream: Stream) -> NodeSpec:
-        """Return republish from raw."""
+        """Return the ``republish`` node from raw."""
         image = local_topic(stream.topic, stream.source)
         return self._node(stream, 'encoder', stream.source, 'raw', self.plugin, 'out', {
             'in': image})
 
     def decoder(self, stream: Stream) -> NodeSpec:
-        """Return republish to raw."""
+        """Return the ``republish`` node to raw."""
         image = local_topic(stream.topic, stream.target)
         return self._node(stream, 'decoder', stream.target, self.plugin, 'raw', 'in', {
             'out': image})
@@ -61,7 +61,7 @@ class Republish(ImageTransport):
         for old, new in {**names, f'{side}/{self.plugin}': between}.items():
             words += ['-r', f'{old}:={new}']
         if role == 'encoder':
-            # cameras often publish by best effort, which hears nobody that wants more
+            # cameras often publish best effort, which a reliable subscription would not receive
             words += ['-p', f"qos_overrides.{names['in']}.subscription.reliability:=best_effort"]
             for key, value in stream.options.items():
                 if key != 'camera_info':
@@ -85,6 +85,6 @@ class Ffmpeg(Republish):
 
 
 class RepublishedCompressed(Republish):
-    """``compressed_image_transport``, where the C++ one is preferred to ours."""
+    """``compressed_image_transport``, for users who prefer the C++ implementation."""
 
     plugin = 'compressed'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a launch file says of streams to the nodes that carry them; pure but for plugins."""
+"""Convert a launch file's stream entries to streams and nodes; pure except plugins."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class StreamTopic:
             StreamTopic('/annotated', 'h264', 'to_robot', bitrate=2_000_000),
             StreamTopic('/map', 'h264', source=mapper)])
 
-    :param topic: the full name that publisher and subscriber use.
-    :param transport: 'h264', 'compressed', 'raw', or another that is installed.
-    :param direction: 'to_cloud' (the robot publishes, or ``source``) or 'to_robot'.
-    :param source: another machine of the launch, or its name, that publishes in the robot's place.
-    :param parameters: the transport's own; see doc/h264.md.
+    :param topic: the full name, which publisher and subscriber use.
+    :param transport: 'h264', 'compressed', 'raw', or another installed transport.
+    :param direction: 'to_cloud' (the robot or ``source`` publishes) or 'to_robot'.
+    :param source: another machine of the launch, or its name, that publishes instead of the robot.
+    :param parameters: options of the transport; see doc/h264.md.
     """
 
     topic: str
@@ -51,18 +51,18 @@ class StreamTopic:
             object.__setattr__(self, name, value)
 
 
-#: What launch files may write.
+#: A stream in a launch file.
 Entry = Union[StreamTopic, tuple[str, str]]
 
 
 def stream(entry: Entry, machine: str) -> Stream:
     """
-    Return the stream to or from ``machine`` that an entry asks for.
+    Convert an entry to the stream to or from ``machine``.
 
-    :param entry: its source, if it has one, as a name.
-    :raises ConfigurationError: not an entry; an unknown transport (the hint lists those there
-        are), direction or parameter; a topic that can't be carried.
-    :raises PrerequisiteError: the robot lacks what its end of the stream takes.
+    :param entry: with its source, if any, as a name.
+    :raises ConfigurationError: no valid entry; an unknown transport (the hint lists all),
+        direction or parameter; a topic that cannot be streamed.
+    :raises PrerequisiteError: the robot lacks what its end of the stream needs.
     """
     if isinstance(entry, tuple) and len(entry) == 2:
         entry = StreamTopic(*entry)
@@ -97,12 +97,12 @@ def stream(entry: Entry, machine: str) -> Stream:
 
 def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
     """
-    Return the nodes that carry streams, by the machine that they run on (None: the robot).
+    Return the nodes of streams, by the machine that they run on (None: the robot).
 
-    One that several streams need, an encoder whose topic goes to two machines, is there once.
+    A node that several streams need, such as an encoder for two machines, is returned once.
 
-    :raises ConfigurationError: two streams of a topic want it encoded in two ways.
-    :raises PrerequisiteError: a transport's own dependency isn't installed.
+    :raises ConfigurationError: two streams encode a topic in different ways.
+    :raises PrerequisiteError: a dependency of a transport is not installed.
     """
     found: dict[Optional[str], dict[str, NodeSpec]] = {}
     informed: dict[tuple[Optional[str], Optional[str], str], str] = {}
@@ -110,7 +110,7 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
         transport = _transport(one)
         decoded = one
         if transport.camera_info and carries_info(one):
-            # images beside each other have one camera info: it comes with the first of them
+            # images with the same parent share one camera info: send it with the first of them
             info = camera_info_topic(one.topic)
             if informed.setdefault((one.source, one.target, info), one.topic) != one.topic:
                 decoded = dataclasses.replace(one, options={**one.options, 'camera_info': False})
@@ -125,7 +125,7 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
 
 
 def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:
-    """Return how topics of streams are renamed for nodes on a host; nothing on the robot."""
+    """Return the new names of streamed topics for nodes on a host; empty on the robot."""
     return topics.remappings(
         [(one, _transport(one).camera_info) for one in streams], machine)
 

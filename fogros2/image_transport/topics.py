@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the topics of a stream are called, on the robot and on machines; pure.
+Name the topics of streams, on the robot and on machines; pure.
 
-On the robot a topic keeps its own name, so that drivers and viewers that a launch didn't start
-work as they are. On a machine, image and camera info get a name of that machine's own
-(``/camera`` becomes ``/fogros2/planner/camera``): the two sides would find each other across the
-VPN otherwise, and the raw images cross it. Between the two is the stream, beside the image that
-it comes from (``/camera/h264``, ``/fogros2/planner/annotated/h264``): so several hosts may publish
-one topic.
+On the robot a topic keeps its name, so that drivers and viewers outside the launch work unchanged.
+On a machine, image and camera info get a name that contains the machine (``/camera`` becomes
+``/fogros2/planner/camera``). With one name on both sides, DDS would connect them, and raw images
+would cross the VPN. The stream's name extends that of its source (``/camera/h264``,
+``/fogros2/planner/annotated/h264``), so several hosts may publish the same topic.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import NodeSpec, Stream
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
-#: Options of a Stream that are no parameters of the encoder.
+#: Options of a Stream that are parameters of the decoder, not of the encoder.
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
-#: What FogROS2 appends to a streamed topic's name on machines.
+#: Suffix that FogROS2 appends to the name of a streamed topic on machines.
 _CLOUD = '/cloud'
-#: Options that any stream of this project's nodes may have.
+#: Options of all streams that use this project's nodes.
 OPTIONS = frozenset({'camera_info', *_DECODER_PARAMETERS})
 
 
 def check(stream: Stream) -> None:
     """
-    Hold a stream against what can be carried.
+    Check that a stream is possible.
 
     :raises ConfigurationError: not a full topic name, or both ends on one host.
     """
@@ -47,30 +46,30 @@ def check(stream: Stream) -> None:
 
 
 def local_topic(topic: str, machine: Optional[str]) -> str:
-    """Return what the topic is called on a host: its own name on the robot (None)."""
+    """Return a topic's name on a host: its own name on the robot (None)."""
     if machine is None:
         return topic
     return f'/fogros2/{identifier(machine)}{topic}'
 
 
 def camera_info_topic(topic: str) -> str:
-    """Return where the camera of an image topic describes itself."""
+    """Return the camera info topic of an image topic."""
     return topic.rpartition('/')[0] + '/camera_info'
 
 
 def carries_info(stream: Stream) -> bool:
     """
-    Return whether camera info goes along: from the robot yes, else if the stream's options say so.
+    Return whether camera info is streamed: by default only from the robot; an option decides else.
 
-    An annotated image that comes back is often called like a sibling of the camera's: its camera
-    info would have the camera's own name, and go round in a circle.
+    An annotated image that comes back is often a sibling of the camera's image. Its camera info
+    would have the camera's own name, and return to its source.
     """
     return bool(stream.options.get('camera_info', stream.source is None))
 
 
 def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
     """
-    Return a label of one of a stream's nodes, unique on its host; its node's name; the stream.
+    Return a label of a stream's node, unique on its host; the node's name; the stream's topic.
 
     :param role: 'encoder' or 'decoder'.
     :param name: last part of the stream's topic.
@@ -85,9 +84,9 @@ def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
 
 def check_modules() -> None:
     """
-    Look whether image_transport_h264 can run here.
+    Check that image_transport_h264 can run on this computer.
 
-    :raises PrerequisiteError: it can't.
+    :raises PrerequisiteError: a Python module is missing.
     """
     lacking = [module.requirement for module in modules.lacking_here(modules.IMAGES)]
     if lacking:
@@ -100,12 +99,12 @@ def remappings(
     streams: Iterable[tuple[Stream, bool]], machine: Optional[str],
 ) -> dict[str, str]:
     """
-    Return how topics of streams are renamed for nodes on a host; nothing on the robot.
+    Return the new names of streamed topics for nodes on a host; empty on the robot.
 
-    For a node that subscribes to a topic or publishes it.
+    They apply to nodes that subscribe to a topic or publish it.
 
-    :param streams: each with whether its nodes carry camera info as well.
-    :param machine: where the nodes run, None for the robot.
+    :param streams: each with whether its nodes also carry camera info.
+    :param machine: the machine of the nodes, None for the robot.
     """
     names: dict[str, str] = {}
     if machine is None:
@@ -123,16 +122,16 @@ def rewrite(
     pairs: Iterable[tuple[str, str]], names: Mapping[str, str], namespace: str = '/',
 ) -> list[tuple[str, str]]:
     """
-    Return a node's remappings so that what they lead to ends under the new names.
+    Rewrite a node's remappings so that they lead to the new names.
 
-    ROS follows one rule for a name and no further, so ``image:=/camera`` has to say where
-    ``/camera`` has gone, and rules for those who use the topic's own name go behind: the first
-    rule that matches counts. A rule that leads to ``/camera/cloud`` means the machine's side of
-    ``/camera``: FogROS2's README has users write it so.
+    ROS applies only one rule to a name, so ``image:=/camera`` has to name the new place of
+    ``/camera``. Rules for nodes that use the topic's own name follow at the end, because the
+    first matching rule wins. A rule that leads to ``/camera/cloud`` means the machine's side of
+    ``/camera``, as in FogROS2's README.
 
-    :param pairs: the node's own, in order; from its group, SetRemap or itself.
+    :param pairs: the node's rules, in order: from its group, SetRemap, or itself.
     :param names: see ``remappings``.
-    :param namespace: the node's, that relative names are in.
+    :param namespace: the node's namespace, for relative names.
     """
     def renamed(name: str) -> str:
         full = absolute(name, namespace)
@@ -144,7 +143,7 @@ def rewrite(
 
 
 def absolute(name: str, namespace: str) -> str:
-    """Return a topic's full name; private ones (``~/x``) stay as they are."""
+    """Return a topic's full name; private names (``~/x``) are unchanged."""
     if name.startswith(('/', '~', 'rostopic://', 'rosservice://')):
         return name
     return f"/{namespace.strip('/')}/{name}".replace('//', '/')
@@ -154,13 +153,13 @@ def node(
     stream: Stream, *, role: str, codec: str, machine: Optional[str], name: str,
 ) -> NodeSpec:
     """
-    Return one of this project's pair of nodes.
+    Return one node of this project's encoder and decoder pair.
 
     :param role: 'encoder' or 'decoder'.
-    :param codec: what the nodes' parameter of that name takes.
-    :param machine: where it runs.
+    :param codec: value of the node's parameter ``codec``.
+    :param machine: the machine on which it runs, None for the robot.
     :param name: last part of the stream's topic; viewers look for 'compressed' there.
-    :raises ConfigurationError: see ``check``; or an option that has no parameter's form.
+    :raises ConfigurationError: see ``check``; or an option that cannot be a parameter.
     """
     check(stream)
     image = local_topic(stream.topic, machine)
@@ -181,7 +180,7 @@ def node(
 
 
 def identifier(text: str) -> str:
-    """Return a name as a part of ROS names: letters, digits and underscores, no digit first."""
+    """Convert a name to a part of a ROS name: letters, digits, underscores, no leading digit."""
     plain = re.sub('_+', '_', re.sub('[^A-Za-z0-9]', '_', text)).strip('_')
     return plain if plain[:1].isalpha() else f'm_{plain}'
 
@@ -190,6 +189,6 @@ def _yaml(key: str, value: Any) -> str:
     if not isinstance(value, (bool, int, float, str)):
         raise ConfigurationError(f"option '{key}' of a stream is {value!r}",
                                  'give a number, a text, true or false')
-    # JSON is YAML; 1e-05 and such would be text there
+    # JSON is valid YAML, but YAML reads 1e-05 as text
     return repr(value) if isinstance(value, float) and 'e' not in repr(value) else (
         f'{value:.20f}'.rstrip('0') if isinstance(value, float) else json.dumps(value))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The seam to the VPN: pure functions from interfaces and peers to commands."""
+"""The plugin interface of VPNs: pure functions from interfaces and peers to commands."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ class Vpn(abc.ABC):
     """
     A virtual private network between the robot and its machines.
 
-    The methods decide nothing at run time and do no I/O: they return commands, for the robot or
-    for a machine (the same ones), each idempotent, in order.
+    The methods are pure and do no I/O: they return idempotent commands, in order, for the robot
+    or for a machine.
     """
 
     @abc.abstractmethod
     def keys(self, interface: VpnInterface) -> Command:
-        """Return the command that makes the private key where missing and prints the public."""
+        """Return the command that creates the key pair if missing, and prints the public key."""
 
     @abc.abstractmethod
     def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what makes the interface, with these peers and no others, and brings it up."""
+        """Yield the commands that create the interface with exactly these peers, and enable it."""
 
     @abc.abstractmethod
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what replaces the peers of an interface that is up; sessions go on."""
+        """Yield the commands that replace the peers of a running interface; sessions continue."""
 
     @abc.abstractmethod
     def alive(self, interface: VpnInterface) -> Command:
-        """Return a cheap command that exits 0 while the interface's program runs."""
+        """Return a cheap command with exit status 0 while the interface's program runs."""
 
     @abc.abstractmethod
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what gets a VPN whose program died going again; the interface stays."""
+        """Yield the commands that restart a VPN whose program ended; the interface stays."""
 
     @abc.abstractmethod
     def status(self, interface: VpnInterface) -> Command:
-        """Return a command whose output ``parse_status`` understands."""
+        """Return the command whose output ``parse_status`` reads."""
 
     @abc.abstractmethod
     def parse_status(self, output: str) -> dict[str, dict[str, float]]:
         """
-        Return per peer (by public key) ``handshake`` (s since the epoch), ``received``, ``sent``.
+        Return by public key ``handshake`` (s since the epoch), ``received`` and ``sent`` (bytes).
 
-        The counters are bytes; a handshake of 0 means none so far.
+        A handshake of 0 means that there was none.
         """
 
     @abc.abstractmethod
     def down(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield what takes everything of ``up`` away, the key file too."""
+        """Yield the commands that undo ``up`` and delete the key file."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which subnet, addresses and port a launch's VPN takes: decided by what the hosts already use."""
+"""Choose the subnet, addresses and port of a launch's VPN, apart from those in use."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import socket
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command
 
-#: RFC 2544's range for benchmarks. Home and company networks (RFC 1918), carriers' NAT and
-#: Tailscale (100.64.0.0/10), clouds' VPCs and containers leave it alone, so that a launch does
-#: not collide by construction. Some proxies ("fake IP") sit in a part of it: that part is
-#: skipped, as are the subnets of other launches on the same robot.
+#: RFC 2544's range for benchmarks. Home and company networks (RFC 1918), providers' NAT and
+#: Tailscale (100.64.0.0/10), clouds' VPCs and containers do not use it, so a launch normally does
+#: not collide with them. Some proxies ("fake IP") use a part of it. That part is skipped, as are
+#: the subnets of other launches on the same robot.
 POOL = '198.18.0.0/15'
-#: Names another pool in CIDR form, for those who use this one otherwise.
+#: Variable with another pool in CIDR form, for users who need the default pool otherwise.
 POOL_VARIABLE = 'FOGROS2_VPN_POOL'
-#: Names the robot's own UDP port, for robots behind a router that forwards one: machines that have
-#: to dial the robot, such as pods that nobody outside can dial, find it there.
+#: Variable with the robot's UDP port, for robots behind a router that forwards a port. Machines
+#: that have to dial the robot, such as pods that cannot be dialled from outside, use that port.
 PORT_VARIABLE = 'FOGROS2_VPN_PORT'
-#: Bits of a launch's subnet: one robot and up to 253 machines.
+#: Prefix length of a launch's subnet: one robot and up to 253 machines.
 PREFIX = 24
-#: Shorter prefixes are some VPN's way to write "everything" (two halves, four quarters) and
-#: don't collide: the more specific route wins.
+#: Networks with a shorter prefix mean "everything" in some VPN (two halves, four quarters). They
+#: do not collide: the more specific route wins.
 EVERYTHING = 8
 
 _Network = ipaddress.IPv4Network
@@ -32,9 +32,9 @@ _Network = ipaddress.IPv4Network
 
 def pool_from(environment: Mapping[str, str]) -> str:
     """
-    Return the pool in CIDR form: the environment's, else :data:`POOL`.
+    Return the pool in CIDR form: the environment's, or :data:`POOL`.
 
-    :raises ConfigurationError: the environment's isn't an IPv4 network that holds a /24.
+    :raises ConfigurationError: the environment's pool is not an IPv4 network with room for a /24.
     """
     text = environment.get(POOL_VARIABLE) or POOL
     return str(_pool(text))
@@ -42,16 +42,16 @@ def pool_from(environment: Mapping[str, str]) -> str:
 
 def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> str:
     """
-    Return a /24 of the pool, in CIDR form, that overlaps nothing in use.
+    Choose a /24 of the pool that overlaps no network in use; return it in CIDR form.
 
-    The same launch id and surroundings give the same subnet; different ids start looking at
-    different places, so that launches that start at the same moment keep out of each other's way.
+    The same launch id and networks give the same subnet. Different ids start the search at
+    different subnets, so that launches that start together avoid each other.
 
-    :param used: networks and addresses in CIDR form, on the robot and on machines known so far;
-        IPv6 ones and those that mean "everything" don't count.
+    :param used: networks and addresses in CIDR form, on the robot and on known machines;
+        IPv6 networks and those that mean "everything" are ignored.
     :param launch_id: hexadecimal digits.
     :raises VpnError: the whole pool is in use.
-    :raises ConfigurationError: the pool isn't an IPv4 network that holds a /24.
+    :raises ConfigurationError: the pool is not an IPv4 network with room for a /24.
     """
     candidates = list(_pool(pool).subnets(new_prefix=PREFIX))
     taken = [network for network in map(_network, used) if network is not None]
@@ -66,9 +66,9 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
     """
-    Return those of the networks and addresses in use that overlap a launch's subnet.
+    Return the networks and addresses in use that overlap a launch's subnet.
 
-    :param used: as in :func:`choose_subnet`.
+    :param used: as for :func:`choose_subnet`.
     """
     ours = _Network(subnet)
     return [text for text in used
@@ -81,7 +81,7 @@ def addresses(subnet: str) -> Iterator[str]:
 
 
 def used_networks() -> Command:
-    """Return the command that shows what a host uses; :func:`parse_used` reads its output."""
+    """Return the command that prints a host's networks, for :func:`parse_used`."""
     return Command.script(
         'ip -json -4 route show table all; ip -json -4 addr show',
         what='look at the networks in use')
@@ -89,9 +89,9 @@ def used_networks() -> Command:
 
 def parse_used(output: str) -> list[str]:
     """
-    Return the networks and addresses in CIDR form that :func:`used_networks` printed.
+    Parse the output of :func:`used_networks` to networks in CIDR form.
 
-    :raises VpnError: it isn't what ``ip`` prints.
+    :raises VpnError: the output is not that of ``ip``.
     """
     found: set[str] = set()
     decoder = json.JSONDecoder()
@@ -114,12 +114,11 @@ def parse_used(output: str) -> list[str]:
 
 def choose_port(environment: Mapping[str, str] = {}) -> int:
     """
-    Return the robot's UDP port: the environment's, else one that is free on this computer now.
+    Return the robot's UDP port: the environment's, or one that is free on this computer now.
 
-    The latter comes out of the ephemeral range, which doesn't meet DDS's ports in ROS domains 0 to
-    101.
+    A free port comes from the ephemeral range, which has no DDS ports of ROS domains 0 to 101.
 
-    :raises ConfigurationError: the environment's is no port.
+    :raises ConfigurationError: the environment's value is not a port.
     """
     text = environment.get(PORT_VARIABLE, '').strip()
     if text:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-WireGuard whose interfaces on the robot may be made by a helper of root's, without a password.
+WireGuard whose interfaces on the robot a root helper can create, without a password.
 
-An administrator installs the helper and says who may use it (``packaging/vpn_helper``). The
-folder of its key shows which way an interface was made, in records of earlier launches too: below
-``KEYS`` it is the helper's, elsewhere root's commands make it. Machines' interfaces always are
-made by those.
+An administrator installs the helper and chooses its users (``packaging/vpn_helper``). The folder
+of an interface's key shows how the interface was created, also in records of earlier launches: the
+helper's keys are below ``KEYS``, and root's commands create all other interfaces. Root's commands
+always create the interfaces of machines.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn.wireguard import WireGuard
 
 HELPER = '/usr/libexec/fogros2/vpn'
-#: Whose members may use it.
+#: The group whose members may use the helper.
 GROUP = 'fogros2'
-#: What the helper answers to ``check`` if it means by a request what we do.
+#: The helper's answer to ``check`` if its protocol is the one of this module.
 PROTOCOL = '1'
-#: Where it keeps private keys, one folder for each interface; the user can't read them.
+#: Folder of the helper's private keys, one subfolder per interface; the user cannot read them.
 KEYS = '/run/fogros2-vpn'
 
 
 @functools.cache
 def permitted() -> bool:
-    """Return whether this user, who isn't root, may use the helper without a question."""
+    """Return whether this user is not root and may use the helper without a password."""
     if os.geteuid() == 0 or not Path(HELPER).exists() or process.which('sudo') is None:
         return False
     try:
@@ -43,12 +43,12 @@ def permitted() -> bool:
 
 
 def key_file(name: str) -> str:
-    """Return where the helper keeps the key of an interface."""
+    """Return the path of the helper's key for an interface."""
     return f'{KEYS}/{name}/key'
 
 
 def key_of(name: str) -> str:
-    """Return where the key of an interface that the helper has made is, '' if it has none."""
+    """Return the path of the key of an interface that the helper has created, '' otherwise."""
     return key_file(name) if Path(KEYS, name).exists() else ''
 
 
@@ -66,17 +66,17 @@ def _peers(peers: Sequence[Peer]) -> list[dict[str, object]]:
 
 
 class HelpedWireGuard(WireGuard):
-    """As WireGuard; an interface that is the helper's is asked of it."""
+    """WireGuard that uses the helper for an interface with a key below ``KEYS``."""
 
     def keys(self, interface: VpnInterface) -> Command:
-        """Return the command that makes the name ours, and prints the public key."""
+        """Return the command that reserves the interface's name, and prints the public key."""
         command = super().keys(interface)
         if not _made(interface):
             return command
         return _ask('keys', {'name': interface.name, 'pid': os.getpid()}, command.what)
 
     def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what makes the interface."""
+        """Yield the commands that create the interface."""
         for command in super().up(interface, peers):
             yield command if not _made(interface) else _ask('up', {
                 'name': interface.name, 'network': interface.network, 'port': interface.port,
@@ -84,11 +84,11 @@ class HelpedWireGuard(WireGuard):
                 'peers': _peers(peers)}, command.what)
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what makes these the peers."""
+        """Yield the commands that set the peers."""
         return self._with('peers', interface, super().peers(interface, peers), peers)
 
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what gets the interface's program going again."""
+        """Yield the commands that restart the interface's program."""
         return self._with('repair', interface, super().repair(interface, peers), peers)
 
     def _with(
@@ -100,14 +100,14 @@ class HelpedWireGuard(WireGuard):
                 verb, {'name': interface.name, 'peers': _peers(peers)}, command.what)
 
     def status(self, interface: VpnInterface) -> Command:
-        """Return the command that asks for counters."""
+        """Return the command that prints the counters."""
         command = super().status(interface)
         if not _made(interface):
             return command
         return _ask('status', {'name': interface.name}, command.what)
 
     def down(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield what takes the interface away, with its key."""
+        """Yield the commands that delete the interface and its key."""
         for command in super().down(interface):
             yield command if not _made(interface) else _ask(
                 'down', {'name': interface.name}, command.what)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Give the UDP sockets of a ``wireguard-go`` a receive buffer that holds several raw images.
+Enlarge the receive buffers of ``wireguard-go`` to hold several raw images.
 
-Releases before 2023 leave it at the kernel's default of 208 kB: less than 100 packets, of which a
-raw VGA image has 720. A setting of the kernel's would hold for all programs of the host, so the
-buffer is set from here: root may take a copy of another process's descriptor (pidfd_getfd(2)).
+Releases before 2023 use the kernel's default of 208 kB: less than 100 packets, while a raw VGA
+image has 720. A kernel setting would apply to all programs of the host. So this program copies the
+process's sockets, which root may do (pidfd_getfd(2)), and sets their buffers.
 
-Runs as python3 -c SOURCE NAME, NAME being the interface; imports nothing of fogros2.
+Runs as python3 -c SOURCE NAME, where NAME is the interface; imports nothing of fogros2.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import socket
 import sys
 import time
 
-#: What newer releases of wireguard-go ask for, bytes.
+#: Buffer size in bytes that newer releases of wireguard-go request.
 SIZE = 7 << 20
-#: Seconds that wireguard-go may take to open its sockets.
+#: Seconds that wireguard-go may need to open its sockets.
 PATIENCE = 2.0
-#: <asm-generic/unistd.h> and <asm-generic/socket.h>; Python names neither.
+#: <asm-generic/unistd.h> and <asm-generic/socket.h>; Python has neither.
 _PIDFD_GETFD, _SO_RCVBUFFORCE = 438, 33
 
 
@@ -37,14 +37,14 @@ def processes(interface: str) -> Iterator[int]:
                     and os.stat(path / 'ns/net').st_ino == here):
                 yield int(path.name)
         except OSError:
-            continue  # it has ended
+            continue  # the process has ended
 
 
 def sockets(process: int) -> Iterator[socket.socket]:
     """
     Yield copies of a process's UDP sockets.
 
-    :raises OSError: this user, or this kernel, may not copy them.
+    :raises OSError: this user, or this kernel, does not allow it.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     there = os.pidfd_open(process)
@@ -64,7 +64,7 @@ def sockets(process: int) -> Iterator[socket.socket]:
 
 
 def enlarge(process: int) -> int:
-    """Set the receive buffers of a process's UDP sockets; return how many it has."""
+    """Set the receive buffers of a process's UDP sockets; return the number of sockets."""
     count = 0
     for one in sockets(process):
         one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, SIZE)
@@ -73,7 +73,7 @@ def enlarge(process: int) -> int:
 
 
 def main() -> None:
-    """Set the buffers of an interface's process, once it has opened its sockets."""
+    """Set the buffers of an interface's process when it has opened its sockets."""
     for process in processes(sys.argv[1]):
         end = time.monotonic() + PATIENCE
         try:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-WireGuard, in the kernel where it has the module, else ``wireguard-go`` on a persistent TUN.
+WireGuard: in the kernel if it has the module, else ``wireguard-go`` on a persistent TUN.
 
-A machine whose own networks overlap the launch's (the robot's don't: that is how it was chosen)
-keeps them: it gets a route to each peer instead of one to the network (``host_routes``).
+A machine may have networks that overlap the launch's subnet; the robot has none, because it chose
+the subnet accordingly. Such a machine keeps its networks, and gets a route to each peer instead of
+one to the subnet (``host_routes``).
 
-Each host gets one short ``sh`` script per task, as each process costs milliseconds and a machine
-may be far away. A script is put together from steps, each written beside its undo; ``down`` runs
-the undos backwards.
+Each host gets one short ``sh`` script per task, because each process costs milliseconds and a
+machine may be far away. A script consists of steps, each written beside its undo; ``down`` runs
+the undo parts in reverse order.
 """
 
 from __future__ import annotations
@@ -23,26 +24,26 @@ from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn import Vpn
 
-#: Programs each host needs, and the Debian and Ubuntu packages they come in. ``wireguard-go`` is
-#: for kernels without the module alone, ``nft`` for guarded interfaces.
+#: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
+#: for kernels without the module, ``nft`` only for guarded interfaces.
 PACKAGES = {
     'wg': 'wireguard-tools', 'ip': 'iproute2', 'nft': 'nftables', 'wireguard-go': 'wireguard-go'}
-#: Seconds between packets that keep a NAT's mapping: routers forget one after 30 s or more.
+#: Interval of keepalive packets in seconds: routers keep a NAT mapping for 30 s or more.
 KEEPALIVE = 25
-#: RTPS 2.5, 9.6.2.3: ports of a domain begin at 7400 + 250 * domain and the next one's follow.
+#: RTPS 2.5, 9.6.2.3: the ports of a domain begin at 7400 + 250 * domain.
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250
-#: RTPS 2.5, 9.6.2.4: participants announce themselves to this group.
+#: RTPS 2.5, 9.6.2.4: multicast group of participant announcements.
 DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
-#: Packets that may wait for ``wireguard-go``; the kernel's default is 500. A raw VGA image has 720
-#: at once, and a busy processor lets several images wait.
+#: Packets that may queue for ``wireguard-go``; the kernel's default is 500. A raw VGA image has
+#: 720 packets at once, and on a busy processor several images queue.
 QUEUE = 3000
 
-#: Shell text that makes of ``wg show ... endpoints`` questions to ``ip -batch``, one for each host
-#: that is known.
+#: Shell text that turns ``wg show ... endpoints`` into requests to ``ip -batch``, one for each
+#: known host.
 _ASK = r"sed -n 's/^[^[:space:]]*[[:space:]]*\[*\([^][]*\)\]*:[0-9]*$/route get \1/p'"
-#: Shell text that makes of the answers the addresses of this computer that packets leave from.
+#: Shell text that turns the answers into this computer's source addresses to these hosts.
 _FROM = r"ip -force -batch - 2>/dev/null | sed -n 's/.* src \([^ ]*\).*/\1/p'"
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
 _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
@@ -50,7 +51,7 @@ _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
 
 @dataclasses.dataclass(frozen=True)
 class _Step:
-    """Shell text that does something, idempotent, and what undoes it ('' for nothing to do)."""
+    """Shell text of an idempotent step, and of its undo ('' for nothing to undo)."""
 
     do: str
     undo: str = ''
@@ -58,10 +59,10 @@ class _Step:
 
 class WireGuard(Vpn):
     """
-    The commands of a WireGuard interface; they need root and the programs of ``PACKAGES``.
+    Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
-    :param domain: ROS_DOMAIN_ID, whose DDS ports a guarded interface lets in.
-    :param ports: ranges of UDP ports that it lets in besides, first and last.
+    :param domain: ROS_DOMAIN_ID, whose DDS ports a guarded interface admits.
+    :param ports: further ranges of UDP ports to admit, as (first, last).
     """
 
     def __init__(self, domain: int = 0, ports: Sequence[tuple[int, int]] = ()) -> None:
@@ -71,10 +72,10 @@ class WireGuard(Vpn):
         self.ports = (dds_ports(domain), *ports)
 
     def keys(self, interface: VpnInterface) -> Command:
-        """Return the command that prints the public key; the private one is root's alone."""
+        """Return the command that prints the public key; only root can read the private key."""
         key = shlex.quote(interface.key_file)
         folder = shlex.quote(interface.key_file.rpartition('/')[0] or '.')
-        # written aside and moved, so that a key that is there is a whole one; -C follows no link
+        # written aside and moved, so an existing key is complete; -C follows no symbolic link
         return Command.script(
             f'umask 077; set -C\n'
             f'if [ ! -s {key} ]; then\n'
@@ -85,16 +86,16 @@ class WireGuard(Vpn):
 
     def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """
-        Yield one script: filter, interface, keys and peers, address.
+        Yield one script that creates the filter, the interface, keys and peers, and the address.
 
-        The filter is there before the interface.
+        The filter exists before the interface.
         """
         steps = self._steps(interface, peers)
         yield Command.script(
             '\n'.join(step.do for step in steps), sudo=True, what=_what('set', interface, 'up'))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
-        """Yield what makes these the peers, and leaves the sessions of those that stay."""
+        """Yield the commands that set the peers, and keep the sessions of remaining ones."""
         yield Command.script(
             '\n'.join([_configure(interface, peers), *_routes(interface, peers),
                        _buffer(interface)]), sudo=True,
@@ -102,16 +103,16 @@ class WireGuard(Vpn):
 
     def alive(self, interface: VpnInterface) -> Command:
         """
-        Return a command of a few milliseconds, which on the robot needs no root.
+        Return the health check: a few milliseconds, and no root on the robot.
 
-        A TUN has a carrier as long as a program has it open; a WireGuard interface of the kernel
-        always has. Without the interface, or where it is down, reading that fails.
+        A TUN has a carrier while a program has it open; a WireGuard interface of the kernel always
+        has one. Reading the carrier fails if the interface is missing or down.
 
-        On the robot it also fails when packets to a peer leave from another address than they
-        did: ``wireguard-go`` goes on sending from the former, 15 s long, and ``repair`` makes it
-        look again. Networks that lead to no peer may come and go. A machine notes where its peers
-        are, for ``repair``: behind its NAT the robot can't be dialled elsewhere, and would itself
-        notice the lost session after 15 s only.
+        On the robot the check also fails when the source address of packets to a peer has changed:
+        ``wireguard-go`` would use the old address for 15 s, and ``repair`` makes it look again.
+        Networks that lead to no peer may come and go. A machine notes its peers' endpoints for
+        ``repair``: without them it could not reach a robot behind NAT, which would notice the lost
+        session only after 15 s.
         """
         name = _name(interface)
         lines = [
@@ -129,16 +130,16 @@ class WireGuard(Vpn):
 
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """
-        Yield the script of ``up``, which leaves a TUN that is there in its place.
+        Yield the script of ``up``, which keeps an existing TUN.
 
-        Peers without an endpoint get the one that ``alive`` saw last.
+        Peers without an endpoint get the one that the health check noted last.
         """
         steps = self._steps(interface, peers, recall=True)
         yield Command.script(
             '\n'.join(step.do for step in steps), sudo=True, what=_what('repair', interface))
 
     def status(self, interface: VpnInterface) -> Command:
-        """Return a command that asks for counters alone: ``dump`` would print the private key."""
+        """Return a command that prints only counters: ``dump`` would print the private key."""
         name = _name(interface)
         return Command.script(
             f'wg show {name} latest-handshakes; wg show {name} transfer', sudo=True,
@@ -146,9 +147,9 @@ class WireGuard(Vpn):
 
     def parse_status(self, output: str) -> dict[str, dict[str, float]]:
         """
-        Return handshake, received and sent per peer.
+        Parse handshake, received and sent bytes of each peer.
 
-        :raises VpnError: the text isn't what ``status`` prints.
+        :raises VpnError: the text is not the output of :meth:`status`.
         """
         found: dict[str, dict[str, float]] = {}
         for line in output.splitlines():
@@ -167,7 +168,7 @@ class WireGuard(Vpn):
         return found
 
     def down(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield one script that undoes ``up`` backwards and goes on where a part fails."""
+        """Yield one script that undoes ``up`` in reverse order, and continues after errors."""
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
         lines = ['failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
@@ -185,10 +186,10 @@ class WireGuard(Vpn):
 
 def dds_ports(domain: int) -> tuple[int, int]:
     """
-    Return the first and last UDP port that DDS uses in a ROS domain.
+    Return the first and last UDP port of DDS in a ROS domain.
 
-    In it are multicast discovery (+0) and data (+1), and per participant i unicast discovery
-    (+10 + 2 i) and data (+11 + 2 i), i up to 119.
+    The range contains multicast discovery (+0) and data (+1), and for each participant i unicast
+    discovery (+10 + 2 i) and data (+11 + 2 i), i up to 119.
     """
     begin = PORT_BASE + PORTS_PER_DOMAIN * domain
     return begin, begin + PORTS_PER_DOMAIN - 1
@@ -208,15 +209,15 @@ def _name(interface: VpnInterface) -> str:
 
 def _guard(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
-    Return the step that keeps a hijacked machine from everything but DDS and ping.
+    Return the step that admits only DDS and ping from a machine, which may be hijacked.
 
-    One table, so that one delete is its undo. The table is replaced as a whole, in one
-    transaction: no moment without it. Another table's accept doesn't reach over a drop here, nor
-    an accept here over a drop there (a firewall of the user's own has to let the VPN in).
+    It uses one table, so that one delete is its undo. One transaction replaces the whole table,
+    so there is no moment without it. An accept in another table does not override a drop here,
+    nor an accept here a drop there (the user's own firewall has to admit the VPN).
     """
     name = _name(interface)
     let_in = ', '.join(f'{first}-{last}' for first, last in ports)
-    # an address check, as a peer may send to any address of this computer, a LAN's too
+    # check the address, because a peer may send to any address of this computer, a LAN's included
     rules = [
         f'table inet {name}',
         f'delete table inet {name}',
@@ -236,7 +237,7 @@ def _guard(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
         f'    oifname "{name}" drop',
         '  }',
         '}']
-    # the first line makes the table where it is missing, so that the second can't fail
+    # the first line creates the table if missing, so that the second cannot fail
     return _Step(
         f'{_print(rules)} | nft -f -',
         f'! command -v nft >/dev/null || '
@@ -245,14 +246,14 @@ def _guard(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
 
 def _link(interface: VpnInterface) -> _Step:
     """
-    Return the step that makes the interface.
+    Return the step that creates the interface.
 
-    ``wireguard-go`` exits when its socket goes, and makes the TUN itself where there is none; made
-    by ``ip tuntap`` it stays when that process dies, and so do the sockets of the nodes. Its
-    network namespace tells it from other processes of its name, such as those in containers.
+    ``wireguard-go`` exits when its socket is deleted, and creates a missing TUN itself. A TUN of
+    ``ip tuntap`` outlives that process, and so do the sockets of the nodes. The network namespace
+    distinguishes the process from others of its name, such as those in containers.
 
-    A port that somebody has is found before: ``wireguard-go`` may bind it after all has been set,
-    and tell nobody that it couldn't.
+    The step checks for a port in use first: ``wireguard-go`` may bind the port only after the
+    configuration, and then reports no error.
     """
     name = _name(interface)
     socket = f'/var/run/wireguard/{name}.sock'
@@ -291,16 +292,16 @@ def _configure(
     interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
 ) -> str:
     """
-    Return the text that feeds ``wg``: the key goes through the shell's own printf alone.
+    Return the text that configures ``wg``; only the shell's builtin printf handles the key.
 
-    ``syncconf`` replaces the peers as ``setconf`` does, but sessions of those that stay go on.
+    ``syncconf`` replaces the peers like ``setconf``, but keeps the sessions of remaining peers.
 
-    :param recall: fill in endpoints that aren't known from what ``alive`` noted.
+    :param recall: add the endpoints that the health check noted to peers without one.
     """
     key = shlex.quote(interface.key_file)
     lines = [f'read -r key <{key}']
     if recall:
-        # in the first configuration: a handshake that finds no endpoint is retried after 5 s
+        # in the first configuration: a handshake without endpoint would be retried after 5 s
         lines.append(
             f'seen() {{ while read -r peer at; do case "$peer $at" in "$1 ("*) ;; "$1 "*) '
             f'echo "Endpoint = $at";; esac; done 2>/dev/null <{_noted(interface)} || :; }}')
@@ -310,7 +311,7 @@ def _configure(
         _check(peer)
         allowed = f'{peer.address}/32'
         if number == 0:
-            # an address leads to one peer: the robot on machines, the only machine on most robots
+            # an address can belong to one peer only: the robot, or the first machine
             allowed += f', {DISCOVERY_GROUP}/32'
         config += [
             '[Peer]', f'PublicKey = {peer.public_key}', f'AllowedIPs = {allowed}',
@@ -324,7 +325,7 @@ def _configure(
     lines += [_print(config)] if config else []
     lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
     if interface.guarded:
-        # for ``alive``, which isn't root
+        # for the health check, which runs without root
         lines += [f'ask=$(wg show {_name(interface)} endpoints | {_ASK})',
                   f'(umask 022; {{ echo "#" $(echo "$ask" | {_FROM}); echo "$ask"; }} '
                   f'>{_noted(interface)})']
@@ -332,7 +333,7 @@ def _configure(
 
 
 def _check(peer: Peer) -> None:
-    """Keep what another host said about itself from saying more than its place in the VPN."""
+    """Check data that another host sent about itself, before it enters a script."""
     try:
         ipaddress.IPv4Address(peer.address)
     except ValueError as error:
@@ -344,8 +345,8 @@ def _check(peer: Peer) -> None:
 
 
 def _noted(interface: VpnInterface) -> str:
-    # not beside the key, whose folder may be the login user's: root wouldn't write where another
-    # can lay a link
+    # not beside the key, whose folder may belong to the login user: root must not write where
+    # another user can place a symbolic link
     return f'/run/{_name(interface)}.noted'
 
 
@@ -356,7 +357,7 @@ def _print(lines: Sequence[str]) -> str:
 def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     name = _name(interface)
     prefix = interface.network.rpartition('/')[2]
-    # without the network's route, one of the host's own that overlaps it goes on to hold
+    # without the subnet's route, the host's own overlapping network stays reachable
     alone = ' noprefixroute' if interface.host_routes else ''
     lines = [
         f'address replace {interface.address}/{prefix} dev {name}{alone}',
@@ -368,10 +369,10 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
 
 def _buffer(interface: VpnInterface) -> str:
     """
-    Return the text that enlarges the receive buffer of a ``wireguard-go``.
+    Return the text that enlarges the receive buffers of a ``wireguard-go``.
 
-    Each configuration opens its sockets anew. Without the right to do so the VPN works as well,
-    and loses more of large images.
+    It opens new sockets for each configuration. If the buffers cannot be set, the VPN works, but
+    loses more packets of large images.
     """
     name = _name(interface)
     source = Path(__file__).with_name('receive_buffer.py').read_text()
@@ -381,10 +382,10 @@ def _buffer(interface: VpnInterface) -> str:
 
 def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:
     """
-    Return what leads to each peer where the network as a whole isn't led into the VPN.
+    Return the commands that route each peer, if the subnet as a whole is not routed.
 
-    Such a route is the most specific there is, so it wins over any network of the host's own, and
-    takes no more of that than these addresses. One that the host has for itself is refused.
+    These routes are the most specific ones, so they win over the host's own networks, and take
+    only these addresses from them. :func:`_free` refuses an address that the host itself uses.
     """
     if not interface.host_routes:
         return []
@@ -394,8 +395,8 @@ def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:
 
 
 def _free(interface: VpnInterface, address: str) -> str:
-    """Return the text that fails if the host leads an address of the VPN elsewhere or has it."""
-    # the robot's interface of the same launch, where the machine is the robot itself, is no other
+    """Return the text that fails if the host already uses or routes an address of the VPN."""
+    # the robot's interface of the same launch is allowed: the machine may be the robot itself
     launch = re.sub('m[0-9]+$', '', _name(interface))
     exact = address.replace('.', '[.]')
     return (f"taken=$(ip -4 route show table all match {address} | grep -E '^(local )?{exact} ' "
