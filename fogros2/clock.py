@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The offset of a machine's clock against the robot's, measured as NTP does.
+Measure the offset of a machine's clock against the robot's, as NTP does.
 
-A robot's message comes back with the machine's time in it, which was taken somewhere between
-sending and receiving: RFC 5905, sections 8 and 10.
+The machine adds its time to the robot's message and returns it; that time lies between sending and
+receiving: RFC 5905, sections 8 and 10.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from collections import deque
 import dataclasses
 from typing import Optional
 
-#: Seconds of offset above which a launch warns: TF and message filters work to a few frames.
+#: Offset in seconds above which a launch warns: TF and message filters tolerate a few frames.
 LIMIT = 0.05
-#: Round trips that are compared; the shortest one has the least uncertainty.
+#: Number of round trips to compare; the shortest has the least uncertainty.
 SAMPLES = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class ClockOffset:
     """
-    A machine's clock compared with the robot's.
+    A machine's clock compared with the robot's clock.
 
-    :param seconds: positive where the machine's clock is ahead.
-    :param uncertainty: seconds, half the round trip: each way may have taken nearly all of it.
+    :param seconds: positive if the machine's clock is ahead.
+    :param uncertainty: half the round trip in seconds: one direction may have taken nearly all.
     """
 
     seconds: float
@@ -32,11 +32,11 @@ class ClockOffset:
 
     @property
     def exceeds(self) -> bool:
-        """Whether the offset is above the limit, whatever the ways took."""
+        """Whether the offset exceeds the limit for any distribution of the round trip."""
         return abs(self.seconds) - self.uncertainty > LIMIT
 
     def contradicts(self, other: ClockOffset) -> bool:
-        """Return whether a clock must have moved between two measurements."""
+        """Return whether the clock must have been changed between two measurements."""
         return abs(self.seconds - other.seconds) > self.uncertainty + other.uncertainty
 
     def __str__(self) -> str:
@@ -48,29 +48,29 @@ class ClockOffset:
 
 
 class OffsetFilter:
-    """Chooses the best of the last measurements."""
+    """Select the best of the recent measurements."""
 
     def __init__(self) -> None:
         self._samples: deque[ClockOffset] = deque(maxlen=SAMPLES)
 
     def add(self, round_trip: float, here: float, there: float) -> ClockOffset:
         """
-        Take a round trip and return the best measurement by now.
+        Add a round trip, and return the best current measurement.
 
-        :param round_trip: seconds, by a clock that nobody sets.
-        :param here: the robot's time when the answer came, seconds since the epoch.
-        :param there: the machine's time in the answer, seconds since the epoch.
+        :param round_trip: seconds, by a monotonic clock.
+        :param here: the robot's time when the answer arrived, in seconds since the epoch.
+        :param there: the machine's time in the answer, in seconds since the epoch.
         """
         sample = ClockOffset(there - (here - round_trip / 2), round_trip / 2)
         if any(sample.contradicts(other) for other in self._samples):
-            # somebody set a clock: what was measured before is over
+            # a clock was set: older measurements are invalid
             self._samples.clear()
         self._samples.append(sample)
         return min(reversed(self._samples), key=lambda one: one.uncertainty)
 
 
 class OffsetAlarm:
-    """Decides when an offset is worth a warning: once, and again after it had been repaired."""
+    """Decide when to warn of an offset: once, and again after it was corrected."""
 
     def __init__(self) -> None:
         self._warned = False

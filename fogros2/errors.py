@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What can go wrong, one tree::
+The tree of all errors with a known cause::
 
     FogError                     (a RuntimeError: ros2cli prints it as one line, exit status 1)
       ConfigurationError         the launch file, an argument or the environment is wrong
-        WorkspaceError           the workspace that should travel isn't one, or lacks a package
+        WorkspaceError           the workspace to send is not one, or lacks a package
       PrerequisiteError          this computer lacks a program, a right or a kernel feature
       ProviderError              a provider refused or failed
-        MachineNotFound          no such machine (any more)
-        Unsupported              the provider can't do this
+        MachineNotFound          the machine does not exist (any more)
+        Unsupported              the provider cannot do this
         NameTaken                another launch or another robot has a machine of that name
-      ShellError                 a machine can't be reached or a command there failed
-        ConnectError             no route, refused, timed out
-        HostKeyError             the machine isn't the one that was pinned
-        AuthenticationError      the machine doesn't take our key
+      ShellError                 a machine cannot be reached, or a command there failed
+        ConnectError             no route, refused, timed out, or lost
+        HostKeyError             the machine's host key is not the pinned one
+        AuthenticationError      the machine does not accept our key
         CommandError             a command exited with a status other than zero
       VpnError
       DdsError
       AgentError                 the agent refused or vanished
-        AgentAbsent              no agent listens on the machine, not yet or not any more
-      StoreError                 local state can't be read or written
-      DeadlineExceeded           a wait ran out of time
-      Cancelled                  the launch was asked to end while this ran
+        AgentAbsent              no agent listens on the machine (yet, or any more)
+      StoreError                 local state cannot be read or written
+      DeadlineExceeded           a wait has timed out
+      Cancelled                  the launch was asked to end during this
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class FogError(RuntimeError):
     A failure with a known cause.
 
     :param message: what failed, where and why, in one line.
-    :param hint: what to do about it, in one line; may be empty.
+    :param hint: the remedy, in one line; may be empty.
     """
 
-    #: Set by who was asked to make something: nothing was made, and there is nothing to look for.
+    #: Set by a provider's ``create``: nothing was created, so nothing has to be looked for.
     refused: bool = False
     #: Resources that the failed step could not clean up; reported with the error.
     undo_failures: tuple[FogError, ...] = ()
@@ -61,7 +61,7 @@ class ConfigurationError(FogError):
 
 
 class WorkspaceError(ConfigurationError):
-    """The workspace that should travel isn't one, or lacks a package."""
+    """The workspace to send is not one, or lacks a package."""
 
 
 class PrerequisiteError(FogError):
@@ -73,11 +73,11 @@ class ProviderError(FogError):
 
 
 class MachineNotFound(ProviderError):
-    """No such machine, or no longer."""
+    """The machine does not exist, or no longer exists."""
 
 
 class Unsupported(ProviderError):
-    """The provider can't do this."""
+    """The provider cannot do this."""
 
 
 class NameTaken(ProviderError):
@@ -85,7 +85,7 @@ class NameTaken(ProviderError):
 
 
 class ShellError(FogError):
-    """A machine can't be reached, or a command there failed."""
+    """A machine cannot be reached, or a command there failed."""
 
 
 class ConnectError(ShellError):
@@ -93,11 +93,11 @@ class ConnectError(ShellError):
 
 
 class HostKeyError(ShellError):
-    """The machine that answered isn't the one that was pinned."""
+    """The machine's host key is not the pinned one."""
 
 
 class AuthenticationError(ShellError):
-    """The machine doesn't take our key."""
+    """The machine does not accept our key."""
 
 
 class CommandError(ShellError):
@@ -117,31 +117,31 @@ class CommandError(ShellError):
 
 
 class VpnError(FogError):
-    """The VPN can't be set up, or doesn't carry."""
+    """The VPN cannot be set up, or carries no packets."""
 
 
 class DdsError(FogError):
-    """DDS can't be configured as asked."""
+    """DDS cannot be configured as requested."""
 
 
 class AgentError(FogError):
-    """The agent on the machine refused a command, or vanished."""
+    """The agent on the machine refused a request, or vanished."""
 
 
 class AgentAbsent(AgentError):
-    """No agent listens on the machine, not yet or not any more."""
+    """No agent listens on the machine, not yet or no longer."""
 
 
 class StoreError(FogError):
-    """Local state can't be read or written."""
+    """Local state cannot be read or written."""
 
 
 class DeadlineExceeded(FogError):
-    """A wait ran out of time."""
+    """A wait has timed out."""
 
 
 class Cancelled(FogError):
-    """The launch was asked to end while this ran."""
+    """The launch was asked to end during this."""
 
     def __init__(self, what: str = 'the deployment', hint: Optional[str] = None) -> None:
         super().__init__(f'{what} was cancelled', hint or '')

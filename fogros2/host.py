@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one round trip tells of a computer: a script that asks, a dataclass that holds it."""
+"""Inspect a computer in one round trip: a script that prints facts, a dataclass for them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Python:
     """
     An interpreter on a machine.
 
-    :param venv: whether it can make virtual environments (without pip).
+    :param venv: whether it can create virtual environments (without pip).
     """
 
     path: str
@@ -107,21 +107,20 @@ class Python:
 @dataclasses.dataclass(frozen=True)
 class HostFacts:
     """
-    What one round trip tells of a computer.
+    Facts about a computer, collected in one round trip.
 
-    :param system: ``ID`` of os-release (ubuntu, debian, ...), ``release`` its ``VERSION_ID``.
-    :param architecture: as ``uname -m`` has it.
+    :param system: ``ID`` of os-release (ubuntu, debian, ...); ``release`` is its ``VERSION_ID``.
+    :param architecture: output of ``uname -m``.
     :param libc: such as ``glibc 2.36``.
-    :param root: commands can run as root: the login user is root, or sudo asks nothing.
-    :param ros: prefixes of ROS 2 by distro, ``rmw`` the middlewares each has.
-    :param free_bytes: on the home's disk; None where unknown.
-    :param routes: IPv4 networks the computer has routes to, in CIDR form or as addresses.
-    :param network: tells the network that its processes have from any other's, '' where unknown:
-        the boot of its kernel and the network namespace.
-    :param installed: keys of embedded defaults that earlier launches have left complete.
-    :param environments: of the prefixes asked for, those that are there and work, each with a
-        signature of the packages in it.
-    :param cloud_launch: path of our launch file in one of them, '' where it isn't.
+    :param root: whether commands can run as root: as login user, or by sudo without a password.
+    :param ros: prefixes of ROS 2 by distribution; ``rmw`` has the middlewares of each.
+    :param free_bytes: free space on the home folder's disk, None if unknown.
+    :param routes: IPv4 networks with a route, in CIDR form or as addresses.
+    :param network: identifies the network of its processes, '' if unknown: the boot id of the
+        kernel and the network namespace.
+    :param installed: keys of embedded defaults that earlier launches have installed completely.
+    :param environments: by requested prefix that exists and works, a signature of its packages.
+    :param cloud_launch: path of our launch file in one of them, '' for none.
     """
 
     system: str = 'unknown'
@@ -148,35 +147,35 @@ class HostFacts:
 
     @property
     def python(self) -> Optional[Python]:
-        """The interpreter for the agent: the first that is new enough."""
+        """The interpreter for the agent: the first one that is new enough."""
         return next((p for p in self.pythons if p.version >= MIN_PYTHON), None)
 
     @property
     def has_ros(self) -> bool:
-        """Whether ROS 2 itself is there, with the middleware that launches use by default."""
+        """Whether ROS 2 itself is installed, with the default middleware of launches."""
         return self.has_rmw(RMW)
 
     def has_rmw(self, name: str) -> bool:
-        """Return whether ROS 2 itself is there, with that middleware."""
+        """Return whether ROS 2 itself is installed, with that middleware."""
         return name in self.rmw.get(DISTRO, ())
 
     @property
     def name(self) -> str:
-        """The system in words for messages."""
+        """The system's name for messages."""
         return f'{self.system} {self.release} {self.architecture}'
 
 
 def probe(environments: Sequence[str] = ()) -> Command:
     """
-    Return the command whose output ``parse_facts`` understands.
+    Return the command that inspects a computer, for :func:`parse_facts`.
 
-    :param environments: prefixes to look for: virtual environments, ROS 2's, overlays.
+    :param environments: prefixes to look for: virtual environments, ROS 2, overlays.
     """
     return Command(('sh', '-c', _PROBE, 'probe', *environments), what='look at the machine')
 
 
 def parse_facts(output: str) -> HostFacts:
-    """Return what the probe's output says; lines that others print in between are left out."""
+    """Parse the output of :func:`probe`; ignore other lines in it."""
     one: dict[str, str] = {}
     pythons: list[Python] = []
     programs: set[str] = set()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A launch's steps and clock offsets, kept in its folder while it runs for other programs to show.
+Write a launch's steps and clock offsets to a file in its folder, for other programs to show.
 
-A file of JSON lines, one for each event. It goes with the folder when the launch ends.
+The file has one JSON line per event. It is deleted with the folder when the launch ends.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from fogros2.report import (
 
 #: The file's name in the launch's folder.
 FILE = 'steps.jsonl'
-#: Seconds between two lines on how far a step is.
+#: Minimum interval in seconds between two progress lines of a step.
 PROGRESS_INTERVAL = 0.25
-#: Events that may wait for the folder; a launch that never makes one reports a handful.
+#: Maximum number of events that wait for the folder.
 _WAITING = 1000
 
 
 class Journal:
     """
-    A Reporter that writes down what it hands on; from any thread.
+    A Reporter that passes events on and writes them to a file; thread-safe.
 
-    A line that can't be written (a full disk, the folder gone at the end) is left out: what is
-    shown of a launch must not stop it.
+    It drops a line that cannot be written (full disk, folder deleted at the end): the display of
+    a launch must not stop the launch.
 
-    :param report: gets each event as it comes.
-    :param folder: the launch's; until it exists, events are held back.
+    :param report: receives each event.
+    :param folder: the launch's folder; events wait until it exists.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Journal:
         self._told: dict[tuple[str, str], float] = {}
 
     def __call__(self, event: Event) -> None:
-        """Hand an event on, and write it down."""
+        """Pass an event on, and write it to the file."""
         try:
             self._report(event)
         finally:
@@ -111,14 +111,14 @@ class Journal:
 @dataclasses.dataclass(frozen=True)
 class Step:
     """
-    A step as it stands.
+    The state of a step.
 
     :param machine: '' for the robot.
     :param begin: in seconds since the epoch.
     :param state: 'running', 'done' or 'failed'.
-    :param seconds: that it took, None while it runs.
-    :param detail: a few words, of one that failed the reason.
-    :param done: bytes of ``total``; both 0 where nobody counts.
+    :param seconds: its duration, None while it runs.
+    :param detail: a few words; for a failed step the reason.
+    :param done: bytes of ``total``; both 0 if unknown.
     """
 
     machine: str
@@ -133,9 +133,9 @@ class Step:
 
 def steps(lines: list[str]) -> list[Step]:
     """
-    Return what the lines of a journal tell, in the order in which the steps began.
+    Return the steps in the lines of a journal, in the order in which they began.
 
-    A line that is damaged is left out.
+    Damaged lines are ignored.
     """
     found: list[Step] = []
     for line in lines:
@@ -155,7 +155,7 @@ def steps(lines: list[str]) -> list[Step]:
             elif kind in ('done', 'failed'):
                 seconds = float(event['seconds'])
                 if index is None:
-                    # an undo that failed is reported only at the end
+                    # a failed undo step is reported only at its end
                     found.append(Step(machine, name, at - seconds))
                     index = len(found) - 1
                 found[index] = dataclasses.replace(
@@ -180,7 +180,7 @@ def clocks(lines: list[str]) -> dict[str, ClockOffset]:
 
 
 def read_clocks(folder: Path) -> dict[str, ClockOffset]:
-    """Return the offsets in the journal of a launch's folder, none where there is no journal."""
+    """Return the offsets in the journal of a launch's folder, empty without a journal."""
     try:
         return clocks((folder / FILE).read_text(errors='replace').splitlines())
     except OSError:

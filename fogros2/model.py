@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data that the parts of FogROS2 exchange: frozen dataclasses, no behaviour beyond JSON."""
+"""Data that the parts of FogROS2 exchange: frozen dataclasses, with JSON as only behaviour."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Bootstrap = Literal['auto', 'apt', 'embedded', 'none']
 RobotNodes = Literal['after_cloud', 'immediately']
 OnInterrupt = Literal['shutdown', 'robot']
 
-#: Seconds a machine lives at the most unless its launch file says otherwise.
+#: Maximum lifetime of a machine in seconds, unless its launch file sets another.
 DEFAULT_LIFETIME = 8 * 3600.0
-#: Seconds without a heartbeat after which the launch counts as gone.
+#: Default time in seconds without a heartbeat after which the launch counts as gone.
 DEFAULT_ROBOT_TIMEOUT = 120.0
 
 
 class MachineState(str, enum.Enum):
-    """Where a machine is in its life, in one vocabulary for all providers."""
+    """The state of a machine, with the same names for all providers."""
 
     PENDING = 'pending'
     RUNNING = 'running'
@@ -38,22 +38,22 @@ class MachineState(str, enum.Enum):
 @dataclasses.dataclass(frozen=True)
 class MachineSpec:
     """
-    What a launch file asks for: a description, not a machine.
+    A machine as a launch file requests it: a description, not a machine.
 
-    :param name: unique per robot; a DNS label (letters, digits, ``-``, at most 40 characters).
+    :param name: unique on a robot; a DNS label (letters, digits, ``-``, at most 40 characters).
     :param provider: name of an entry point in the group ``fogros2.provider``.
-    :param options: the provider's own settings; JSON types only.
-    :param workspace: absolute path of the colcon workspace that travels, or None for none.
-    :param underlays: workspaces below it, which travel too, the nearest first.
-    :param on_exit: what becomes of the machine when the launch ends.
-    :param lifetime: seconds after which the machine ends by itself, whatever happens.
+    :param options: the provider's own options; JSON types only.
+    :param workspace: absolute path of the colcon workspace to send, or None for none.
+    :param underlays: its underlay workspaces, which are sent too, the nearest first.
+    :param on_exit: what happens to the machine when the launch ends.
+    :param lifetime: seconds after which the machine ends by itself in any case.
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
-    :param environment: variables set for every node on the machine.
-    :param containers: ``docker run`` command lines started before the nodes.
-    :param on_interrupt: when the provider takes the machine away while its nodes run: end the
+    :param environment: variables of every node on the machine.
+    :param containers: ``docker run`` command lines that start before the nodes.
+    :param on_interrupt: when the provider reclaims the machine while its nodes run: end the
         launch, or run the nodes on the robot.
-    :param monitor_allow: networks (CIDR) that reach its bridge to Foxglove besides the robot.
-    :param apt: Debian packages that it has to have, ``pip`` Python packages as pip takes them.
+    :param monitor_allow: networks (CIDR) that may reach its Foxglove bridge, besides the robot.
+    :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     """
 
     name: str
@@ -76,26 +76,26 @@ class MachineSpec:
 
     @property
     def workspaces(self) -> tuple[str, ...]:
-        """All workspaces that travel, the one whose packages win first."""
+        """All workspaces to send; the packages of earlier ones win."""
         return (self.workspace, *self.underlays) if self.workspace else ()
 
     @property
     def monitored(self) -> bool:
-        """Whether a bridge to Foxglove starts with the first node, without another action."""
+        """Whether a Foxglove bridge starts with the first node."""
         return self.launch_foxglove or bool(self.monitor_allow)
 
 
 @dataclasses.dataclass(frozen=True)
 class Endpoint:
     """
-    How a Shell reaches a machine.
+    The address and login by which a Shell reaches a machine.
 
     :param kind: name of an entry point in the group ``fogros2.shell``: ssh, local, ...
     :param host: address or name; for kinds without one, the machine's id.
     :param user: login user; nodes run as this user.
     :param host_key: the host's public key in OpenSSH form (``ssh-ed25519 AAAA...``), pinned
-        before the first connection; None leaves the decision to ``known_hosts``.
-    :param key_file: private key to log in with; None for the user's own keys and agent.
+        before the first connection; None to use ``known_hosts``.
+    :param key_file: private key for the login; None for the user's own keys and agent.
     """
 
     kind: str
@@ -109,30 +109,30 @@ class Endpoint:
 @dataclasses.dataclass(frozen=True)
 class Machine:
     """
-    What a provider knows of a machine that exists.
+    A provider's report about an existing machine.
 
-    :param id: opaque to the core; carries its place (region, context, engine).
-    :param created: seconds since the epoch, or None where the provider does not know.
-    :param stopped: when it was stopped, likewise, for one that is.
+    :param id: opaque to the core; contains its location (region, context, engine).
+    :param created: seconds since the epoch, None if the provider does not know.
+    :param stopped: when a stopped machine was stopped, in the same form.
     :param shell: None until the machine can be reached.
-    :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' where it
-        can't, so that the machine has to dial the robot.
-    :param robot_host: where ``vpn_host`` is '': the robot's address as this machine can dial it
-        (UDP, the robot's VPN port), from an option or from the provider.
-    :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same.
-    :param inner_network: names the network in which ``inner_host`` means something (a cluster, a
-        VPC); two machines of one inner network dial each other there.
-    :param inner_host: the machine's address in it, '' without one.
-    :param place: region, context and namespace, engine: for people to read.
-    :param kind: what it is, such as an instance type: for people to read.
-    :param image: the image that it started from, '' where there is none or none is known.
-    :param key: the provider's name of its login key, likewise.
-    :param disk_gb: size of its disk, None where unknown.
+    :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' if it
+        cannot, so that the machine has to dial the robot.
+    :param robot_host: if ``vpn_host`` is '': address at which the machine reaches the robot's
+        VPN port (UDP), from an option or from the provider.
+    :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same port.
+    :param inner_network: name of the private network (a cluster, a VPC) to which ``inner_host``
+        belongs; two machines of the same private network dial each other there.
+    :param inner_host: the machine's private IP in that network, '' for none.
+    :param place: region, context and namespace, or engine; for people.
+    :param kind: the kind of machine, such as an instance type; for people.
+    :param image: the image that it started from, '' if there is none or it is unknown.
+    :param key: the provider's name of its login key, '' as for ``image``.
+    :param disk_gb: size of its disk in GB, None if unknown.
     :param owned: False for a computer that existed before and outlives the launch.
-    :param end_command: what the agent runs as root on the machine to end it; empty where it
-        must not be ended.
-    :param cost_per_hour: US dollars, None where unknown.
-    :param note: what the provider chose for it, and why: for people to read when it comes up.
+    :param end_command: command that the agent runs as root to end the machine; empty if the
+        machine must not be ended.
+    :param cost_per_hour: US dollars, None if unknown.
+    :param note: what the provider chose, and why; shown when the machine comes up.
     """
 
     id: str
@@ -162,10 +162,10 @@ class Machine:
 @dataclasses.dataclass(frozen=True)
 class Image:
     """
-    A disk image made of a machine, from which the next ones start.
+    A disk image made from a machine, for later machines.
 
-    :param id: opaque to the core; carries its place.
-    :param dependencies: hash of what is installed in it; a launch takes one that matches its own.
+    :param id: opaque to the core; contains its location.
+    :param dependencies: hash of the installed dependencies; a launch uses an image with its hash.
     """
 
     id: str
@@ -182,20 +182,20 @@ class Image:
 @dataclasses.dataclass(frozen=True)
 class CreateRequest:
     """
-    What the core tells a provider beside the spec.
+    The core's request to create a machine, in addition to the spec.
 
-    :param token: a uuid per attempt, stored before the call; the same token never creates twice.
+    :param token: a uuid per attempt, stored before the call; a token never creates two machines.
     :param authorized_key: public key (OpenSSH form) that the login user accepts.
-    :param tags: go onto everything that the provider creates.
-    :param vpn_port: UDP port to let in.
+    :param tags: tags for every resource that the provider creates.
+    :param vpn_port: UDP port to open.
     :param agent_config: the agent's first configuration, for providers that can start it at boot
-        (``agent_directory``); the provider adds ``user`` and the ``end_command`` it tells later.
-    :param dependencies: hash of what will have to be installed on it, by which an image that was
-        baked before is found; '' where nothing is known of it.
+        (``agent_directory``); the provider adds ``user`` and the ``end_command``.
+    :param dependencies: hash of the dependencies that the machine needs, by which the provider
+        finds a baked image; '' if unknown.
     :param application: container image of a web application that serves HTTP on port 8080, for
         providers that run one beside the machine (``Provider.application_port``); '' for none.
-    :param cancel: set when the launch is ending; for a ``create`` that takes long, as for an image
-        to be downloaded: what it then raises is Cancelled.
+    :param cancel: set when the launch is ending. A long ``create``, such as one that downloads
+        an image, then raises Cancelled.
     """
 
     token: str
@@ -211,12 +211,12 @@ class CreateRequest:
 @dataclasses.dataclass(frozen=True)
 class Command:
     """
-    A command line, on the robot or on a machine.
+    A command line, for the robot or a machine.
 
-    :param argv: the words; no shell reads them. Never holds a secret: see ``input``.
-    :param sudo: run as root (``sudo -n`` where the user isn't root).
-    :param input: bytes for the standard input; secrets travel here.
-    :param what: a few words for progress and errors, such as 'set the VPN up'.
+    :param argv: the words, without a shell. Must not contain secrets: see ``input``.
+    :param sudo: run as root (by ``sudo -n`` unless the user is root).
+    :param input: bytes for the standard input, which may contain secrets.
+    :param what: short description for progress and errors, such as 'set the VPN up'.
     """
 
     argv: tuple[str, ...]
@@ -227,13 +227,13 @@ class Command:
 
     @classmethod
     def script(cls, text: str, *, sudo: bool = False, what: str = '') -> Command:
-        """Return a command that runs ``text`` in ``sh``, stopping at the first error."""
+        """Return a command that runs ``text`` in ``sh`` and stops at the first error."""
         return cls(('sh', '-ec', text), sudo=sudo, what=what)
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What a command left: exit status, its output as text, how long it took (s)."""
+    """The result of a command: exit status, output as text, duration in seconds."""
 
     returncode: int
     stdout: str
@@ -243,7 +243,7 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class SyncReport:
-    """What a sync did: files and bytes sent over the wire, seconds."""
+    """The result of a sync: number of files and bytes sent over the network, seconds."""
 
     files: int
     bytes: int
@@ -253,10 +253,10 @@ class SyncReport:
 @dataclasses.dataclass(frozen=True)
 class Peer:
     """
-    One host's place in the VPN of a launch, as another host sees it.
+    A host in the VPN of a launch, as another host sees it.
 
     :param address: the host's address inside the VPN.
-    :param endpoint: ``host:port`` it can be dialled at, None behind NAT.
+    :param endpoint: ``host:port`` at which it can be dialled, None behind NAT.
     """
 
     name: str
@@ -273,11 +273,11 @@ class VpnInterface:
     :param name: at most 15 characters, ``fog<id>``.
     :param address: this host's address.
     :param network: the launch's subnet in CIDR form.
-    :param port: UDP port listened on.
-    :param key_file: where this host keeps its private key (0600); never leaves the host.
-    :param guarded: let in DDS and ping alone and forward nothing (the robot's side).
-    :param host_routes: lead to the peers' addresses alone: the host has a network of its own that
-        overlaps the launch's.
+    :param port: UDP port on which it listens.
+    :param key_file: path of the private key on this host (0600); the key never leaves the host.
+    :param guarded: admit only DDS and ping, and forward nothing (on the robot).
+    :param host_routes: route only the peers' addresses into the VPN, because a network of the
+        host overlaps the launch's subnet.
     """
 
     name: str
@@ -292,7 +292,7 @@ class VpnInterface:
 
 @dataclasses.dataclass(frozen=True)
 class DdsInterface:
-    """A network interface for DDS: name or address; larger ``priority`` is preferred."""
+    """A network interface for DDS, by name or address; a larger ``priority`` is preferred."""
 
     name: str
     priority: int = 0
@@ -305,7 +305,7 @@ class Stream:
     """
     A topic that crosses the VPN encoded.
 
-    :param topic: full topic name that publisher and subscriber use.
+    :param topic: full topic name, which publisher and subscriber use.
     :param transport: name of an entry point in the group ``fogros2.image_transport``.
     :param source: machine name of the publisher's side, None for the robot.
     :param target: machine name of the subscriber's side, None for the robot.
@@ -318,7 +318,7 @@ class Stream:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
-#: A piece of text, or {'share': package} / {'prefix': package}: resolved on the machine.
+#: A piece of text, or {'share': package} or {'prefix': package}, resolved on the machine.
 TextPart = Union[str, Mapping[str, str]]
 Text = Union[str, tuple[TextPart, ...]]
 
@@ -326,20 +326,20 @@ Text = Union[str, tuple[TextPart, ...]]
 @dataclasses.dataclass(frozen=True)
 class NodeSpec:
     """
-    One process for the machine to run; what travels instead of a launch action.
+    A process for a machine, sent in place of a launch action.
 
-    Strings are resolved on the robot; what only the machine knows stays a marker.
+    The robot resolves all strings; what only the machine knows stays a marker.
 
-    :param id: unique in the launch, chosen by the robot; events carry it.
-    :param name: what launch calls the process (``talker-1``); prefixes its output.
+    :param id: unique in the launch, chosen by the robot; events contain it.
+    :param name: launch's name of the process (``talker-1``); prefix of its output.
     :param package: with ``executable`` names a program of the ament index; '' when ``arguments``
-        holds the whole command line.
-    :param arguments: words after the executable, ``--ros-args`` and what follows included.
-    :param files: contents of files that travel; ``{'file': key}`` in a Text names one's path.
-    :param environment: variables on top of the machine's own.
+        contains the whole command line.
+    :param arguments: words after the executable, including ``--ros-args`` and its arguments.
+    :param files: contents of files to send; ``{'file': key}`` in a Text stands for the path.
+    :param environment: variables in addition to the machine's own.
     :param respawn_delay: seconds.
     :param image: container image that the process runs in, '' for the machine itself.
-    :param image_options: of ``docker run``, for that.
+    :param image_options: options of ``docker run`` for that image.
     """
 
     id: str
@@ -363,7 +363,7 @@ class NodeSpec:
 
 
 def to_json(data: Any) -> str:
-    """Return a dataclass of this module (or a plain JSON value) as compact JSON."""
+    """Convert a dataclass of this module, or a plain JSON value, to compact JSON."""
     return json.dumps(data, default=_plain, separators=(',', ':'), sort_keys=True)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pure decisions of a deployment: from specs, the robot's environment and facts to values."""
+"""Pure decisions of a deployment: specs, the robot's environment and facts in, values out."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from fogros2 import workspace
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError, WorkspaceError
 from fogros2.model import Machine, MachineSpec, Peer, VpnInterface
 
-#: Kept free below the machines' addresses: .0 is the network, .1 the robot.
+#: Number of the first machine's address; .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
-#: UDP port of the agent's heartbeat, on the VPN's address alone.
+#: UDP port of the agent's heartbeat, on the VPN address only.
 HEARTBEAT_PORT = 7399
 DEFAULT_RMW = 'rmw_cyclonedds_cpp'
-#: What a login shell has at least, without the user's own additions.
+#: The PATH of a login shell without the user's own additions.
 SYSTEM_PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
 
 _PATH_VARIABLES = (
     'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'PYTHONPATH',
     'LD_LIBRARY_PATH', 'PATH')
-#: Variables of the robot's that hold on any machine.
+#: Variables of the robot that are valid on any machine.
 PLAIN_VARIABLES = (
     'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_DOMAIN_ID',
     'ROS_AUTOMATIC_DISCOVERY_RANGE', 'RCUTILS_LOGGING_SEVERITY', 'RCUTILS_COLORIZED_OUTPUT',
@@ -36,9 +36,9 @@ PLAIN_VARIABLES = (
 
 def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
     """
-    Return variables with a user's on top; lists of folders come before those that are there.
+    Add a user's variables; lists of folders are prepended to existing lists.
 
-    :param base: what nodes need, ``given`` what a launch file says.
+    :param base: variables that nodes need; ``given`` are those of the launch file.
     """
     longer = {name: os.pathsep.join(filter(None, [given[name], base[name]]))
               for name in _PATH_VARIABLES if name in given and name in base}
@@ -47,9 +47,9 @@ def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str
 
 def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
     """
-    Return the RMW of all nodes of the launch: the user's, or Cyclone's.
+    Choose the RMW of all nodes of the launch: the user's, or Cyclone's.
 
-    :raises DdsError: the user's is one that there is no plugin for.
+    :raises DdsError: no plugin supports the user's RMW.
     """
     rmw = environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW
     if rmw not in known:
@@ -60,9 +60,9 @@ def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
 
 def rmw_of(name: str, known: Sequence[str]) -> str:
     """
-    Return the RMW that a launch file's ``dds=`` names: 'fastdds', or 'rmw_fastrtps_cpp'.
+    Return the RMW of a launch file's ``dds=``: 'fastdds', or 'rmw_fastrtps_cpp'.
 
-    :raises DdsError: there is no plugin for it.
+    :raises DdsError: no plugin supports it.
     """
     rmw = {'fastdds': 'rmw_fastrtps_cpp'}.get(name, name)
     rmw = rmw if rmw in known else f'rmw_{rmw}_cpp'
@@ -74,10 +74,10 @@ def rmw_of(name: str, known: Sequence[str]) -> str:
 
 def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -> None:
     """
-    Hold the launch's RMW against what the robot has and what its machines are asked to be.
+    Check that the launch's RMW is available on the robot and on its machines.
 
     :param prefixes: the robot's ament prefixes.
-    :raises DdsError: nodes here would not start, or would not understand those on a machine.
+    :raises DdsError: nodes here would not start, or would not communicate with a machine's nodes.
     """
     apt = f"ros-jazzy-{rmw.replace('_', '-')}"
     indices = [index for prefix in prefixes if (
@@ -104,7 +104,7 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
 
 
 def robot_interface(launch_id: str, network: str, port: int, key_file: str) -> VpnInterface:
-    """Return the robot's VPN interface: the first address, and guarded."""
+    """Return the robot's VPN interface: guarded, with the first address."""
     return VpnInterface(
         name=f'fog{launch_id}', address=_host(network, 1), network=network, port=port,
         key_file=key_file, guarded=True)
@@ -116,9 +116,9 @@ def machine_interface(
     """
     Return the VPN interface of the ``index``-th machine, counted from 0.
 
-    Its name differs from the robot's, so that a machine may be the robot itself.
+    Its name differs from the robot's, because a machine may be the robot itself.
 
-    :raises ConfigurationError: the subnet has no address left.
+    :raises ConfigurationError: the subnet has no free address.
     """
     return VpnInterface(
         name=f'fog{launch_id}m{index}', address=_host(network, FIRST_MACHINE + index),
@@ -135,19 +135,19 @@ def _host(network: str, number: int) -> str:
 
 
 def machine_port(launch_id: str) -> int:
-    """Return the UDP port of the machines' VPN, out of the dynamic range, by the launch's id."""
+    """Return the UDP port of the machines' VPN, in the dynamic range, derived from the id."""
     return 49152 + int(launch_id, 16) % 16000
 
 
 @dataclasses.dataclass(frozen=True)
 class Place:
     """
-    Where a machine is in the VPN, and the ways to it.
+    A machine's peer data in the VPN, and the endpoints that lead to the machine.
 
-    :param peer: as those outside see it; its endpoint is None where they can't dial it.
-    :param inner_network: names the network in which ``inner_endpoint`` means something.
-    :param inner_endpoint: ``host:port`` for machines of the same inner network.
-    :param robot_endpoint: ``host:port`` at which it dials the robot, None where the robot dials.
+    :param peer: as hosts outside see it; without endpoint if they cannot dial it.
+    :param inner_network: name of the private network of ``inner_endpoint``.
+    :param inner_endpoint: ``host:port`` for machines of the same private network.
+    :param robot_endpoint: ``host:port`` at which it dials the robot, None if the robot dials.
     """
 
     peer: Peer
@@ -157,17 +157,17 @@ class Place:
 
 
 def endpoint(host: str, port: int) -> str:
-    """Return ``host:port``, an IPv6 address in brackets."""
+    """Return ``host:port``, with an IPv6 address in brackets."""
     return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
 
 
 def place(machine: Machine, peer: Peer, port: int, robot_port: int) -> Place:
     """
-    Return where a machine is, by what its provider tells.
+    Determine how a machine is reached, from its provider's report.
 
     :param peer: the machine without an endpoint.
-    :param port: UDP port of its VPN interface, ``robot_port`` that of the robot's.
-    :raises VpnError: neither can the robot dial it, nor it the robot.
+    :param port: UDP port of its VPN interface; ``robot_port`` is the robot's.
+    :raises VpnError: neither the robot nor the machine can dial the other.
     """
     outside = inner = robot = None
     if machine.vpn_host:
@@ -187,9 +187,9 @@ def machine_peers(robot: Peer, own: Place, others: Iterable[Place]) -> list[Peer
     """
     Return a machine's peers: the robot, then the other machines.
 
-    The robot has an endpoint there only where it can't dial the machine: else it dials, from
-    behind whatever NAT it is. Machines of one inner network dial each other in it. Two machines
-    that nobody outside can dial have no way to each other unless they share such a network.
+    The robot has an endpoint only if the machine has to dial it; otherwise the robot dials,
+    possibly from behind a NAT. Machines of the same private network dial each other in it. Two
+    machines that cannot be dialled from outside need such a network to reach each other.
     """
     return [dataclasses.replace(robot, endpoint=own.robot_endpoint), *(
         dataclasses.replace(other.peer, endpoint=other.inner_endpoint)
@@ -199,19 +199,19 @@ def machine_peers(robot: Peer, own: Place, others: Iterable[Place]) -> list[Peer
 
 
 def price(per_hour: Decimal) -> str:
-    """Return a price in US dollars an hour as people read it."""
+    """Format a price in US dollars per hour."""
     return f'${per_hour.quantize(Decimal("0.0001"))} an hour'
 
 
 @dataclasses.dataclass(frozen=True)
 class Underlay:
     """
-    The ROS 2 environment that the robot's launch runs in, as paths that a machine may have too.
+    The ROS 2 environment of the robot's launch, as paths that a machine may have too.
 
     :param prefixes: ament prefixes and the Python environment, outside the workspace.
     :param ros2: path of the ``ros2`` program.
-    :param environment: variables that make nodes find all of it and the workspace's install
-        space; entries of other places (a user's own) are left out.
+    :param environment: variables by which nodes find these prefixes and the workspace's install
+        space; entries outside them, such as a user's own, are left out.
     :param rmw: the middleware of the launch's nodes.
     """
 
@@ -226,11 +226,11 @@ def underlay(
     prefix: str = sys.prefix,
 ) -> Underlay:
     """
-    Return the underlay that ``environment`` describes.
+    Determine the underlay from the variables in ``environment``.
 
-    :param workspaces: those that travel.
-    :param ros2: path of the ``ros2`` program that the robot would run.
-    :param prefix: the interpreter's own; a virtual environment is part of the underlay.
+    :param workspaces: the workspaces to send.
+    :param ros2: path of the robot's ``ros2`` program.
+    :param prefix: the interpreter's prefix; a virtual environment belongs to the underlay.
     """
     ament = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     outside = [p for p in ament if not _below(p, workspaces)]
@@ -259,11 +259,11 @@ def check_program(
     package: str, executable: str, prefixes: Sequence[str], travelling: Optional[str] = None,
 ) -> None:
     """
-    Look a node's program up in the ament index of the robot, and of the workspace that travels.
+    Check that a node's program is in the ament index of the robot, or in the workspace to send.
 
     :param prefixes: the robot's ament prefixes.
-    :param travelling: the workspace, which need not be sourced.
-    :raises WorkspaceError: no such package or executable, with the nearest name there is.
+    :param travelling: the workspace to send, which need not be sourced.
+    :raises WorkspaceError: no such package or executable; the hint names the nearest.
     """
     index = 'share/ament_index/resource_index/packages'
     prefixes = [*workspace.prefixes(travelling), *prefixes]
@@ -295,14 +295,14 @@ def _nearest(name: str, names: Sequence[str]) -> str:
 
 
 def ament_prefixes(environment: Mapping[str, str]) -> list[str]:
-    """Return the prefixes in which the robot's packages are, in their order."""
+    """Return the prefixes of the robot's packages, in their order."""
     paths = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     return list(dict.fromkeys([*paths, sys.prefix]))
 
 
 def agent_config(spec: MachineSpec, launch_id: str, directory: str,
                  end_command: Sequence[str]) -> dict[str, Any]:
-    """Return what arms an agent for a machine of this launch."""
+    """Return the agent's configuration for a machine of this launch."""
     return {
         'machine': spec.name, 'launch': launch_id, 'directory': directory,
         'on_exit': spec.on_exit, 'lifetime': spec.lifetime,

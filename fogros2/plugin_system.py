@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plugins: entry points looked up by group and name, imported when first asked for."""
+"""Load plugins: entry points, found by group and name, imported on first use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fogros2.errors import ConfigurationError, did_you_mean, PrerequisiteError
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-#: What a group's plugins are called in messages.
+#: What messages call the plugins of a group.
 GROUPS = {
     'fogros2.provider': 'provider',
     'fogros2.machine': 'provider',
@@ -21,30 +21,30 @@ GROUPS = {
     'fogros2.image_transport': 'image transport',
     'fogros2.monitor': 'monitor',
 }
-#: All packages that setup.py installs: a package index may have other projects of these names.
+#: All packages that setup.py installs; a package index may have unrelated projects of these names.
 OWN_PACKAGES = (
     'fogros2', 'fogros2_examples', 'fogros2_monitor', 'image_transport_h264', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=None)
 def _entry_points(group: str) -> dict[str, EntryPoint]:
-    # A tenth of the time that `from fogros2 import CloudNode` may take, so not before it's asked.
+    # Imported on first use: `from fogros2 import CloudNode` would take 10% longer.
     from importlib import metadata
 
     return {point.name: point for point in metadata.entry_points(group=group)}
 
 
 def names(group: str) -> list[str]:
-    """Return the names of the plugins of a group, sorted; imports none of them."""
+    """Return the sorted names of a group's plugins without importing them."""
     return sorted(_entry_points(group))
 
 
 def load(group: str, name: str) -> Any:
     """
-    Import and return the object that the entry point ``name`` of ``group`` names.
+    Import the object of the entry point ``name`` in ``group``, and return it.
 
-    :raises ConfigurationError: no such plugin; the hint holds the nearest names.
-    :raises PrerequisiteError: the plugin's own dependency isn't installed.
+    :raises ConfigurationError: no such plugin; the hint names the nearest.
+    :raises PrerequisiteError: a dependency of the plugin is not installed.
     """
     points = _entry_points(group)
     if name not in points:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands on this computer that we wait for: the only place that calls subprocess for them."""
+"""Run commands on this computer and wait for them; the only place that uses subprocess so."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, Prerequisi
 from fogros2.model import Command, Result
 
 HERE = 'this computer'
-#: Why sudo gives no root before its password was asked, and what to do about it.
+#: sudo's reason for refusing without a password, and the remedy.
 PASSWORD = 'sudo wants a password', 'run `sudo -v` first'
-#: launch empties ``os.environ`` for a moment whenever a scoped group ends, while our threads run.
+#: A copy: launch empties ``os.environ`` briefly when a scoped group ends, while threads run.
 _ENVIRONMENT = dict(os.environ)
 
 
 def argv(command: Command) -> list[str]:
-    """Return the words to execute here: with ``sudo -n`` in front where root is needed."""
+    """Return the words to execute, with ``sudo -n`` in front if root is needed."""
     if _through_sudo(command):
         return ['sudo', '-n', '--', *command.argv]
     return list(command.argv)
@@ -35,12 +35,12 @@ def start(
     command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
 ) -> subprocess.Popen[bytes]:
     """
-    Start a command here, its standard output a pipe, and don't wait for it.
+    Start a command on this computer, with a pipe as standard output; do not wait for it.
 
-    It gets a session of its own, so that a Ctrl-C in the terminal reaches the launch alone and
-    an undo isn't shot down by the signal that caused it. With sudo it gets a process group
-    instead, which Ctrl-C doesn't reach either: sudo keeps its ticket by the terminal, and in a
-    session without one it would ask for the password again.
+    It gets its own session, so that Ctrl-C in the terminal reaches only the launch and does not
+    kill an undo step. With sudo it gets a process group instead, which Ctrl-C does not reach
+    either: sudo binds its ticket to the terminal, and would ask for the password in a session
+    without one.
 
     :raises FileNotFoundError: there is no such program.
     """
@@ -61,32 +61,32 @@ def _through_sudo(command: Command) -> bool:
 
 def refresh_ticket(*, timeout: float = 10.0) -> bool:
     """
-    Put off the moment at which sudo wants the password again; False if it gives no root now.
+    Extend the time until sudo asks for a password again; return False if sudo refuses now.
 
-    Where sudo asks nobody for one, there is nothing to put off.
+    Without effect if sudo needs no password.
     """
     return not sudo_trouble(timeout=timeout)
 
 
 def ask_for_ticket(what: str) -> bool:
     """
-    Have sudo ask for the password at the terminal; False if nobody sits there or it is refused.
+    Let sudo ask for the password at the terminal; return False without one or if refused.
 
-    :param what: a few words that the question names, such as 'for the VPN interface'.
+    :param what: short text for the prompt, such as 'for the VPN interface'.
     """
     try:
-        # who is in the background would be stopped for reading
+        # a background process would be stopped when it reads
         if not os.isatty(0) or os.tcgetpgrp(0) != os.getpgrp():
             return False
     except OSError:
         return False
     prompt = f'[sudo] password for %p, {what}: '
-    # Ctrl-C at the question is for sudo as for us, so it stays in our group
+    # Ctrl-C at the prompt is for both, so sudo stays in this process group
     return subprocess.run(('sudo', '-v', '-p', prompt), env=_ENVIRONMENT).returncode == 0
 
 
 def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
-    """Return why sudo gives no root at this moment and what to do about it, None if it does."""
+    """Return why sudo refuses at the moment, and the remedy; None if it does not refuse."""
     if os.geteuid() == 0:
         return None
     asked = run(Command(('true',), sudo=True), timeout=timeout, check=False)
@@ -94,7 +94,7 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
         return None
     said = asked.stderr
     if 'password is required' in said:
-        # it says so to those, too, who may not use it at all; asked for a ticket alone it doesn't
+        # sudo gives this reason to users without rights, too; ``sudo -v`` distinguishes them
         said = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or said
     if 'password is required' in said or 'terminal is required' in said:
         return PASSWORD
@@ -109,7 +109,7 @@ def require(programs: Sequence[str], *, package_of: Optional[dict[str, str]] = N
     """
     Check that programs are installed.
 
-    :raises PrerequisiteError: names the missing ones and the packages to install.
+    :raises PrerequisiteError: names the missing programs and the packages to install.
     """
     missing = [p for p in programs if not which(p)]
     if missing:
@@ -120,7 +120,7 @@ def require(programs: Sequence[str], *, package_of: Optional[dict[str, str]] = N
 
 
 def which(program: str) -> Optional[str]:
-    """Return a program's path, looking into the sbin folders too, or None."""
+    """Return a program's path, also from the sbin folders, or None."""
     path = _ENVIRONMENT.get('PATH', os.defpath)
     return shutil.which(program, path=f'{path}:/usr/local/sbin:/usr/sbin:/sbin')
 
@@ -134,15 +134,15 @@ def run(
     on_output: Optional[Callable[[str], None]] = None,
 ) -> Result:
     """
-    Run a command here and wait for it; Ctrl-C doesn't reach it (see ``start``).
+    Run a command on this computer and wait for it; Ctrl-C does not reach it (see ``start``).
 
-    :param timeout: seconds, then the command's whole process group is killed.
+    :param timeout: seconds after which the command's whole process group is killed.
     :param check: raise CommandError for an exit status other than zero.
-    :param on_output: gets each line of standard output as it comes.
+    :param on_output: receives each line of standard output when it is printed.
     :raises CommandError: it failed and ``check`` is set.
-    :raises DeadlineExceeded: it ran out of time.
+    :raises DeadlineExceeded: it timed out.
     :raises Cancelled: ``cancel`` was set while it ran.
-    :raises PrerequisiteError: there is no such program, or it can't be started.
+    :raises PrerequisiteError: the program is missing, or cannot be started.
     """
     words = argv(command)
     begin = time.monotonic()
@@ -179,7 +179,7 @@ def run(
             child.stdin.write(command.input)
             child.stdin.close()
         except BrokenPipeError:
-            pass  # the command ended without reading; its exit status says why
+            pass  # the command ended without reading its input; the exit status shows why
 
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
     if command.input:
@@ -190,7 +190,7 @@ def run(
     while True:
         left = deadline - time.monotonic()
         try:
-            # without a cancel event there is nothing to look at meanwhile
+            # without a cancel event, no polling is needed
             child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
             break
         except subprocess.TimeoutExpired:
@@ -203,7 +203,7 @@ def run(
                 raise Cancelled(what) from None
             raise DeadlineExceeded(f'{what} took longer than {timeout:g} s') from None
     for thread in threads:
-        # a daemon that the command left behind may hold the pipe open
+        # a daemon that the command left may keep the pipe open
         thread.join(2.0)
     result = Result(
         child.returncode, output['stdout'].decode(errors='replace'),
@@ -218,10 +218,10 @@ def run(
 
 def end(child: subprocess.Popen[bytes], *, sudo: bool) -> None:
     """
-    Terminate, then kill what ``start`` started, with all that it started itself.
+    Terminate, then kill a process that ``start`` started, with its children.
 
-    :param sudo: it was started through sudo. What runs there is root's, and a signal to its
-        group would reach sudo alone, which passes on SIGTERM to the first process only.
+    :param sudo: it was started by sudo and runs as root. A signal to its group would reach only
+        sudo, which passes SIGTERM on to the first process only.
     """
     for number in (signal.SIGTERM, signal.SIGKILL):
         try:
@@ -248,8 +248,8 @@ def _signal_as_root(group: int, number: signal.Signals) -> None:
         killer.kill()
         killer.wait()
     if killer.returncode != 0:
-        # the ticket is over, or there is nobody left
+        # the ticket has expired, or the processes have ended
         try:
             os.killpg(group, number)
         except PermissionError:
-            pass  # root's, as the helper of the VPN is, which has a time limit of its own
+            pass  # they belong to root, such as the VPN helper, which has its own time limit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress: the core emits these events; a logger, a progress bar or a test's list takes them."""
+"""Progress events of the core, for a logger, a progress bar or a test's list."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fogros2.clock import ClockOffset
 
 @dataclasses.dataclass(frozen=True)
 class StepStarted:
-    """A step of the deployment begins; ``machine`` is '' for the robot itself."""
+    """A step of the deployment begins; ``machine`` is '' for the robot."""
 
     machine: str
     step: str
@@ -22,7 +22,7 @@ class StepStarted:
 
 @dataclasses.dataclass(frozen=True)
 class StepDone:
-    """A step is over after ``seconds``; ``detail`` is a few words for people."""
+    """A step has ended after ``seconds``; ``detail`` is a short text for people."""
 
     machine: str
     step: str
@@ -33,9 +33,9 @@ class StepDone:
 @dataclasses.dataclass(frozen=True)
 class StepFailed:
     """
-    A step failed after ``seconds``; an undo that failed is one too.
+    A step or an undo step failed after ``seconds``.
 
-    :param fatal: the error goes on up and will be reported there too; otherwise this is all.
+    :param fatal: the error also propagates, and is reported there too; otherwise only here.
     """
 
     machine: str
@@ -47,7 +47,7 @@ class StepFailed:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a long step is: ``done`` of ``total`` bytes (total 0: unknown)."""
+    """The progress of a long step: ``done`` of ``total`` bytes (total 0: unknown)."""
 
     machine: str
     step: str
@@ -57,7 +57,7 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class OutputLine:
-    """A line from a step's program on the machine, worth showing at debug level."""
+    """A line of output of a step's program on the machine, for the debug level."""
 
     machine: str
     line: str
@@ -65,7 +65,7 @@ class OutputLine:
 
 @dataclasses.dataclass(frozen=True)
 class ClockMeasured:
-    """The offset of a machine's clock changed; ``warn`` once it is above the limit."""
+    """The offset of a machine's clock changed; ``warn`` when it exceeds the limit."""
 
     machine: str
     offset: ClockOffset
@@ -77,7 +77,7 @@ Reporter = Callable[[Event], None]
 
 
 def silent(event: Event) -> None:
-    """Take an event and show nothing."""
+    """Ignore an event."""
 
 
 @contextlib.contextmanager
@@ -85,11 +85,11 @@ def step(
     report: Reporter, machine: str, name: str, *, fatal: bool = True,
 ) -> Iterator[list[str]]:
     """
-    Report a step's start and end around the block; yields a list that takes the detail words.
+    Report the start and end of a block as a step; yield a list for words of the detail.
 
-    An exception is reported as StepFailed and goes on up.
+    An exception is reported as StepFailed and propagates.
 
-    :param fatal: whether the exception's handler reports it once more.
+    :param fatal: whether the exception's handler reports it too.
     """
     detail: list[str] = []
     report(StepStarted(machine, name))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Local state: one folder per machine and per launch below the XDG state home.
+Keep local state: one folder per machine and per launch, below the XDG state home.
 
-A cache, not the truth: a provider's tags say which machines exist. Folders are 0700, files 0600
-and replaced atomically.
+It is only a cache: the provider's tags show which machines exist. Folders have mode 0700, files
+mode 0600; files are replaced atomically.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 
 def state_home() -> Path:
-    """Return FogROS2's state folder; ``FOGROS2_STATE_HOME`` overrides the XDG one."""
+    """Return FogROS2's state folder; ``FOGROS2_STATE_HOME`` overrides the XDG default."""
     own = os.environ.get('FOGROS2_STATE_HOME')
     if own:
         return Path(own)
@@ -39,9 +39,9 @@ def state_home() -> Path:
 
 def check_name(name: str) -> str:
     """
-    Return ``name`` if a machine can be called so.
+    Check that ``name`` is a valid name of a machine; return it.
 
-    :raises ConfigurationError: it isn't a DNS label of at most 40 characters.
+    :raises ConfigurationError: it is not a DNS label of at most 40 characters.
     """
     if not _NAME.fullmatch(name):
         raise ConfigurationError(
@@ -51,19 +51,19 @@ def check_name(name: str) -> str:
 
 
 def process_start(pid: int) -> Optional[int]:
-    """Return the start time of a process in clock ticks since boot, None if there is none."""
+    """Return a process's start time in clock ticks since boot, None without such a process."""
     try:
         stat = Path(f'/proc/{pid}/stat').read_text()
     except OSError:
         return None
-    # the command's name, in parentheses, may hold spaces
+    # the command's name, in parentheses, may contain spaces
     fields = stat.rpartition(')')[2].split()
     return None if fields[0] == 'Z' else int(fields[19])
 
 
 @functools.lru_cache(maxsize=1)
 def boot_id() -> str:
-    """Return the id of this computer's present boot, '' where there is none to be had."""
+    """Return the id of this computer's current boot, '' if it is unknown."""
     try:
         return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
     except OSError:
@@ -72,11 +72,11 @@ def boot_id() -> str:
 
 def process_alive(pid: int, start: int, boot: str = '') -> bool:
     """
-    Return whether a process is the one that was noted.
+    Return whether a recorded process still runs.
 
-    :param start: as :func:`process_start` had it.
-    :param boot: as :func:`boot_id` had it: after a boot, process ids and clock begin anew; ''
-        where it wasn't noted.
+    :param start: recorded result of :func:`process_start`.
+    :param boot: recorded result of :func:`boot_id`, because process ids and clock restart at
+        each boot; '' if none was recorded.
     """
     return bool(pid) and boot in ('', boot_id()) and process_start(pid) == start
 
@@ -84,29 +84,29 @@ def process_alive(pid: int, start: int, boot: str = '') -> bool:
 @dataclasses.dataclass(frozen=True)
 class Record:
     """
-    What the robot remembers of a machine.
+    The robot's record of a machine.
 
-    :param machine_id: the provider's id, None until ``create`` returned.
+    :param machine_id: the provider's id, None until ``create`` has returned.
     :param token: uuid of the creation attempt, stored before it.
-    :param created: seconds since the epoch when the creation was asked for.
-    :param armed: when its lifetime last began: a launch that reuses it begins it anew.
-    :param launch: id of the launch that has the machine, '' when none has.
-    :param last: id of the launch that has it or had it last: its agent may not know of its end.
-    :param asked: the provider's options as they were asked for; those of ``spec`` have every open
-        choice made ('cheapest', 'nearest'). None in records of before: the same.
-    :param pid: process of that launch, with ``pid_start`` (clock ticks) and ``boot`` (the boot's
-        id) against reuse of ids.
-    :param shell: how the machine is reached from outside the VPN.
-    :param host_key: the one that the machine made itself, '' where the provider's tells.
+    :param created: when the creation was requested, in seconds since the epoch.
+    :param armed: when its lifetime last restarted; a launch that reuses the machine restarts it.
+    :param launch: id of the launch that uses the machine, '' for none.
+    :param last: id of the launch that used it last; its agent may not know that this one ended.
+    :param asked: the provider's options as requested; in ``spec`` all open choices ('cheapest',
+        'nearest') are made. None in older records, where they are the same.
+    :param pid: process of that launch; ``pid_start`` (clock ticks) and ``boot`` (id of the boot)
+        detect a reused process id.
+    :param shell: how to reach the machine from outside the VPN.
+    :param host_key: the key that the machine generated, '' if the provider's key is used.
     :param vpn: the machine's own VPN interface.
     :param public_key: the machine's VPN public key.
-    :param robot_vpn: the robot's side of it.
+    :param robot_vpn: the robot's VPN interface.
     :param agent: the agent's folder on the machine.
     :param python: interpreter on the machine that runs the agent.
-    :param monitor: TCP port of its bridge to Foxglove, 0 for none.
-    :param monitor_open: where others than the robot reach that bridge (``host:port``), '' where
-        they don't.
-    :param damage: why the record can't be read, '' when it can.
+    :param monitor: TCP port of its Foxglove bridge, 0 for none.
+    :param monitor_open: where external clients reach that bridge (``host:port``), '' if they
+        cannot.
+    :param damage: why the record cannot be read, '' if it can.
     """
 
     name: str
@@ -136,12 +136,12 @@ class Record:
 
     @property
     def launch_alive(self) -> bool:
-        """Whether the launch that took the machine still runs."""
+        """Whether the launch that uses the machine still runs."""
         return process_alive(self.pid, self.pid_start, self.boot)
 
     @property
     def asked_options(self) -> Mapping[str, Any]:
-        """The provider's options as they were asked for."""
+        """The provider's options as the launch file requested them."""
         return self.spec.options if self.asked is None else self.asked
 
 
@@ -154,18 +154,18 @@ class MachineDirectory:
 
     @property
     def key_file(self) -> Path:
-        """Where the private login key is."""
+        """Path of the private login key."""
         return self.path / 'id_ed25519'
 
     def exists(self) -> bool:
-        """Return whether there is a record."""
+        """Return whether the machine has a record."""
         return (self.path / 'record.json').exists()
 
     def load(self) -> Record:
         """
         Read the record.
 
-        :raises StoreError: there is none, or it is damaged.
+        :raises StoreError: there is no record, or it is damaged.
         """
         path = self.path / 'record.json'
         try:
@@ -179,19 +179,19 @@ class MachineDirectory:
                 f'ros2 fog delete {self.name} finds the machine by its tags') from error
 
     def save(self, record: Record) -> Record:
-        """Write the record in place of the one before, and return it."""
+        """Replace the record on disk, and return it."""
         write_private(self.path / 'record.json', model.to_json(record).encode())
         return record
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """
-        Hold the machine's name on this robot, for as long as a launch or a verb works on it.
+        Lock the machine's name on this robot while a launch or a verb works on the machine.
 
-        :raises NameTaken: somebody else holds it.
-        :raises StoreError: the disk is full, or the folder isn't ours.
+        :raises NameTaken: another process holds the lock.
+        :raises StoreError: the disk is full, or the folder is not writable.
         """
-        # beside the folder, not in it: deleting the folder must not free the name half-way
+        # beside the folder: deleting the folder must not release the lock early
         path = self.path.with_name(f'.{self.name}.lock')
         _make_folder(path.parent)
         with contextlib.ExitStack() as undo:
@@ -208,7 +208,7 @@ class MachineDirectory:
                     raise NameTaken(
                         f"another launch on this robot has the machine '{self.name}'",
                         'give the machine another name=, or end that launch') from None
-                # who held it before may have removed the file that we opened meanwhile
+                # a former holder may have removed the file between open and lock
                 with contextlib.suppress(FileNotFoundError):
                     if os.path.samestat(os.fstat(handle.fileno()), path.stat()):
                         break
@@ -216,7 +216,7 @@ class MachineDirectory:
             yield
 
     def delete(self) -> None:
-        """Remove the folder with everything in it."""
+        """Remove the folder with its content."""
         shutil.rmtree(self.path, ignore_errors=True)
 
 
@@ -231,11 +231,11 @@ class Store:
         return MachineDirectory(self.root / 'machines' / check_name(name))
 
     def launch(self, launch_id: str) -> Path:
-        """Return a launch's folder (0700), made if needed."""
+        """Return a launch's folder (0700); create it if needed."""
         return _make_folder(self.root / 'launches' / launch_id)
 
     def machines(self) -> list[Record]:
-        """Return all records, sorted by name; a damaged one says so in ``damage``."""
+        """Return all records, sorted by name; a damaged one has ``damage``."""
         records = []
         folder = self.root / 'machines'
         for path in sorted(folder.iterdir()) if folder.is_dir() else []:
@@ -249,7 +249,7 @@ class Store:
         return records
 
     def sweep(self) -> None:
-        """Remove the locks of launches that were killed."""
+        """Remove the locks that killed launches left."""
         for path in (self.root / 'machines').glob('.*.lock'):
             with contextlib.suppress(NameTaken, ConfigurationError):
                 with self.machine(path.name[1:-len('.lock')]).lock():
@@ -257,15 +257,15 @@ class Store:
 
 
 def robot_name() -> str:
-    """Return this robot's name in tags: the host's name and the user's id."""
+    """Return this robot's name in tags: host name and user id."""
     return f'{os.uname().nodename}-{os.getuid()}'
 
 
 def write_private(path: Path, data: bytes) -> None:
     """
-    Write a file of mode 0600 in a folder of mode 0700, in place of the one before, or not at all.
+    Write a file (0600) atomically, in a folder (0700) that is created if needed.
 
-    :raises StoreError: the disk is full, or the folder isn't ours.
+    :raises StoreError: the disk is full, or the folder is not writable.
     """
     _make_folder(path.parent)
     try:
@@ -286,7 +286,7 @@ def write_private(path: Path, data: bytes) -> None:
 
 def _make_folder(path: Path) -> Path:
     try:
-        # mkdir's parents=True would give the ones above the usual mode
+        # parents=True would create the parent folders with the default mode
         for folder in reversed([path, *path.parents]):
             if not folder.exists():
                 folder.mkdir(mode=0o700, exist_ok=True)
@@ -297,7 +297,7 @@ def _make_folder(path: Path) -> Path:
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
-    """Return the Record that ``model.to_json`` wrote; unknown keys of a later version are left."""
+    """Read a Record that ``model.to_json`` wrote; ignore unknown keys of later versions."""
     known = {f.name for f in dataclasses.fields(Record)}
     values = {key: value for key, value in data.items() if key in known}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time: the deadlines of a deployment, the only polling loop, and calls that a cancel leaves."""
+"""Time-outs of a deployment, the only polling loop, and calls that a cancel abandons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar('T')
 
 @dataclasses.dataclass(frozen=True)
 class Timeouts:
-    """How long each part of a deployment may take, in seconds."""
+    """The time-out of each part of a deployment, in seconds."""
 
     boot: float = 300.0
     ssh: float = 60.0
@@ -42,13 +42,13 @@ def wait_until(
     first: float = 0.0,
 ) -> T:
     """
-    Call ``probe`` until it returns something other than None or False, and return that.
+    Call ``probe`` until it returns something other than None or False; return that value.
 
-    The pauses grow from ``interval`` to ``longest`` (seconds), so a fast machine is seen at once
-    and a slow one isn't flooded.
+    The pauses grow from ``interval`` to ``longest`` (seconds): a fast machine is noticed at once,
+    and a slow one gets few requests.
 
     :param what: completes 'timed out after 30 s waiting for ...'.
-    :param first: seconds before the first call, for what never is there at once.
+    :param first: seconds before the first call, if it cannot succeed at once.
     :raises DeadlineExceeded: after ``timeout`` seconds.
     :raises Cancelled: as soon as ``cancel`` is set.
     """
@@ -73,16 +73,16 @@ def cancellable(
     grace: Callable[[], float] = lambda: 1.0, late: Optional[Callable[[T], None]] = None,
 ) -> T:
     """
-    Return what a blocking call returns, or raise what it raises.
+    Run a blocking call that a cancel abandons; return its result or raise its error.
 
-    The call runs in a thread of its own, which is left alone after a cancel.
+    The call runs in a separate thread, which continues after a cancel.
 
     :param cancel: None to call in this thread.
     :param what: completes '... was cancelled'.
-    :param grace: returns the seconds that the call gets once ``cancel`` is set; it may be making
-        something, which can be undone only when it is known.
-    :param late: gets the result of a call that was left alone.
-    :raises Cancelled: ``cancel`` was set before, or the call had not returned in time.
+    :param grace: returns the seconds that the call gets after ``cancel`` is set; it may create
+        a resource, which can be removed only when its id is known.
+    :param late: receives the result of an abandoned call.
+    :raises Cancelled: ``cancel`` was set before, or the call did not return in time.
     """
     if cancel is None:
         return call()
@@ -100,7 +100,7 @@ def cancellable(
         if late is not None and done.exception() is None:
             late(done.result())
 
-    # no pool: the interpreter would wait for its threads at its end
+    # no pool: at exit the interpreter would wait for its threads
     threading.Thread(target=run, name='fog-call', daemon=True).start()
     until: Optional[float] = None
     while not futures.wait([answer], 0.05).done:
