@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The seam to a machine's command line: run, put, sync, open."""
+"""The plugin interface to a machine's command line: run, put, sync, open."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from fogros2.model import Command, Endpoint, Result, SyncReport
 
 
 class Stream(Protocol):
-    """Both ends of a program that runs on the machine, line by line."""
+    """Standard input and output of a program on a machine, line by line."""
 
     def write(self, data: bytes) -> None:
         """
-        Send to its standard input.
+        Send bytes to the program's standard input.
 
-        :raises ConnectError: the connection is gone.
+        :raises ConnectError: the connection is lost.
         """
 
     def readline(self) -> bytes:
-        """Return its next line of output with the newline, b'' once it or the link has ended."""
+        """Return the next line of output with its newline, b'' after the end or a lost link."""
 
     def close(self) -> None:
-        """End it; a ``readline`` in another thread returns b''."""
+        """End the program; a ``readline`` in another thread returns b''."""
 
 
 class Shell(Protocol):
     """
-    A machine's command line; one connection, kept, opened again after a loss; thread-safe.
+    A machine's command line over one connection, which is reopened after a loss; thread-safe.
 
-    ``Command.sudo`` runs as root: ``sudo -n`` unless the login user is root already.
+    ``Command.sudo`` runs the command as root: by ``sudo -n``, unless the login user is root.
     """
 
     def run(
@@ -42,17 +42,20 @@ class Shell(Protocol):
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
         """
-        Run a command there and wait for it.
+        Run a command on the machine, and wait for its end.
 
-        :raises CommandError: it exited with a status other than zero, and ``check`` is set.
-        :raises ConnectError: the machine can't be reached.
-        :raises HostKeyError: another host key than the pinned one.
-        :raises AuthenticationError: our key was refused.
-        :raises DeadlineExceeded: out of time.
+        :param timeout: seconds until the command must have ended.
+        :param on_output: callback for each line of standard output.
+        :raises CommandError: the exit status is not zero, and ``check`` is set.
+        :raises ConnectError: the machine cannot be reached, or the connection was lost.
+        :raises HostKeyError: the host key differs from the pinned one.
+        :raises AuthenticationError: the machine refused our key.
+        :raises DeadlineExceeded: the command took longer than ``timeout`` seconds.
+        :raises Cancelled: ``cancel`` was set.
         """
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file there (folders made as needed): aside first, then moved into place."""
+        """Write a file atomically (to a temporary file, then renamed); create its folders."""
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
@@ -60,32 +63,33 @@ class Shell(Protocol):
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
         """
-        Make the folder ``target`` there equal ``source`` here but for ``excludes``.
+        Make the folder ``target`` on the machine equal to the local ``source``.
 
-        :param excludes: rsync patterns; what matches is neither sent nor deleted there.
-        :param includes: rsync patterns that win over ``excludes``.
-        :param on_progress: gets bytes done and bytes in all (0: unknown).
+        :param excludes: rsync patterns; matching files are neither sent nor deleted.
+        :param includes: rsync patterns with precedence over ``excludes``.
+        :param timeout: seconds.
+        :param on_progress: callback with the bytes sent and the total bytes (0: unknown).
         """
 
     def open(self, command: Command) -> Stream:
-        """Start a program there and return its streams; it ends with the stream."""
+        """Start a program on the machine; closing the returned stream ends the program."""
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """
-        Give the user's terminal to the login shell there, or to ``command``.
+        Connect the user's terminal to the login shell, or to ``command``.
 
-        Returns the exit status.
+        Return the exit status.
         """
 
     def close(self) -> None:
-        """Drop the connection; the next call would open it again."""
+        """Close the connection; the next call opens a new one."""
 
 
 def warm(kind: str) -> None:
     """
-    Begin to load what shells of a kind need, without waiting for it.
+    Start to import the libraries of a kind of shell in the background.
 
-    :raises PrerequisiteError: it isn't installed.
+    :raises PrerequisiteError: a library is not installed.
     """
     begin = getattr(plugin_system.load('fogros2.shell', kind), 'warm', None)
     if begin is not None:
@@ -94,10 +98,10 @@ def warm(kind: str) -> None:
 
 def connect(endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> Shell:
     """
-    Return the Shell for an endpoint, by its kind; connects when first used.
+    Return the Shell of an endpoint by the endpoint's kind; it connects at the first use.
 
     :param name: the machine's name, for messages.
-    :param timeout: seconds one attempt to connect may take.
+    :param timeout: time-out of one attempt to connect, in seconds.
     """
     shell: Shell = plugin_system.load('fogros2.shell', endpoint.kind)(
         endpoint, name=name, timeout=timeout)

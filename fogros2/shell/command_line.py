@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands as one line for a remote shell, and what came of them; pure."""
+"""Build command lines for a remote shell, and check the results of commands; pure."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _ANNOUNCE = 'echo $$; exec "$@"'
 
 def words(command: Command, *, root: bool) -> list[str]:
     """
-    Return the words that run a command: with sudo and the environment in front as needed.
+    Return a command's argument list, with sudo and the environment in front if necessary.
 
-    :param root: whether the login user is root already.
+    :param root: whether the login user is root.
     """
     line = [f'{name}={value}' for name, value in command.environment.items()]
     found = ['env', *line, *command.argv] if line else list(command.argv)
@@ -23,24 +23,24 @@ def words(command: Command, *, root: bool) -> list[str]:
 
 
 def remote_line(command: Command, *, user: str) -> str:
-    """Return the line that the login shell of ``user`` has to run."""
+    """Return a command as a line for the login shell of ``user``."""
     return ' '.join(shlex.quote(word) for word in words(command, root=user == 'root'))
 
 
 def announced_line(command: Command, *, user: str) -> str:
-    """Return the same line, which first prints the number of the process it becomes."""
+    """Return the line of a command that first prints its process id."""
     return f'exec sh -c {shlex.quote(_ANNOUNCE)} sh {remote_line(command, user=user)}'
 
 
 def end_script(pid: int) -> str:
-    """Return a script that ends a process and its group: asks first, then doesn't."""
+    """Return a script that ends a process group: SIGTERM, and SIGKILL after two seconds."""
     return (f'kill -s TERM -- -{pid} || exit 0; n=0; '
             f'while [ $n -lt 20 ] && kill -s 0 -- -{pid}; do sleep 0.1; n=$((n + 1)); done; '
             f'kill -s KILL -- -{pid}')
 
 
 def remote_path(path: str) -> str:
-    """Return a path for a remote shell; a leading ``~/`` is the login user's home."""
+    """Quote a path for a remote shell; a leading ``~/`` is the login user's home."""
     if path == '~':
         return '"$HOME"'
     if path.startswith('~/'):
@@ -49,7 +49,7 @@ def remote_path(path: str) -> str:
 
 
 def write_script(target: str, mode: int) -> str:
-    """Return a script that puts its standard input into a file: aside first, then in place."""
+    """Return a script that writes its standard input to a file, atomically by a rename."""
     path = remote_path(target)
     return (
         f'umask 077; target={path}; mkdir -p -- "$(dirname -- "$target")"; '
@@ -58,16 +58,16 @@ def write_script(target: str, mode: int) -> str:
 
 
 def writing(data: bytes, target: str, mode: int) -> Command:
-    """Return the command that writes a file (folders made as needed)."""
+    """Return the command that writes a file and creates its folders."""
     return Command(('sh', '-ec', write_script(target, mode)), input=data,
                    what=f'writing {target}')
 
 
 def checked(command: Command, result: Result, where: str) -> Result:
     """
-    Return the result.
+    Return the result if the command succeeded.
 
-    :raises CommandError: it isn't one of success.
+    :raises CommandError: the exit status is not zero.
     """
     if result.returncode != 0:
         raise CommandError(
@@ -76,7 +76,7 @@ def checked(command: Command, result: Result, where: str) -> Result:
 
 
 def hint_for(returncode: int, stderr: str, where: str) -> str:
-    """Return the remedy for a failure that many commands share, or ''."""
+    """Return the remedy for a common failure of commands, or ''."""
     if 'No space left on device' in stderr or 'Disk quota exceeded' in stderr:
         return f'the disk of {where} is full'
     if 'password is required' in stderr or 'a terminal is required' in stderr:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's host key: one that was handed over gives way to one that never left the machine."""
+"""Replace a machine's host key that travelled by a key that never left the machine."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from fogros2.model import Command
 
 _KEY = re.compile('ssh-ed25519 [A-Za-z0-9+/]+={0,2}')
 
-# The listening server is the outermost sshd above us; its title has its own command line, and so
-# the configuration that names its keys. One that systemd holds the socket for is started anew, as
-# its sessions go on; else SIGHUP makes it read its keys again.
+# The listening server is the outermost sshd among our parent processes. Its process title has its
+# command line, which names the configuration and so the keys. If systemd holds the socket, the
+# script restarts the service, whose sessions continue; otherwise SIGHUP reloads the keys.
 _RENEW = r"""
 listener= server=sshd config= pid=$$
 PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
@@ -53,16 +53,16 @@ def renew() -> Command:
     """
     Return the command that gives a machine's SSH server a new Ed25519 host key.
 
-    It prints the public half; the connection that it runs over goes on.
+    The command prints the public key. The connection that it runs over stays open.
     """
     return Command.script(_RENEW, sudo=True, what='make a host key')
 
 
 def parse(output: str) -> str:
     """
-    Return the public key (``ssh-ed25519 AAAA...``) that :func:`renew` printed.
+    Return the public key (``ssh-ed25519 AAAA...``) in the output of :func:`renew`.
 
-    :raises HostKeyError: there is none.
+    :raises HostKeyError: the output has no key.
     """
     for line in output.splitlines():
         key = ' '.join(line.split()[:2])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A pod's command line through the API server: no SSH server in the image, no port to reach.
+Run commands in a pod through the API server: the image needs no SSH server, the pod no open port.
 
-One ``exec`` carries all commands (see ``kubernetes_mux``), so each takes one way there and back.
+One ``exec`` carries all commands (see ``kubernetes_mux``), so a command takes one round trip.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from fogros2.shell.kubernetes_link import Link
 from fogros2.shell.lines import LineStream, Output
 from fogros2.waiting import cancellable, wait_until
 
-#: Seconds after a command's end in which something it left behind may hold its output open.
+#: Seconds to wait for further output after a command's end, as its children may still write.
 _DRAIN = 2.0
-#: Input up to this size fits into a channel's window: no thread needed to feed it.
+#: Largest input in bytes that fits into a channel's window, and needs no thread.
 _INLINE = 1 << 20
-#: Seconds that one attempt to connect may take.
+#: Time-out of one attempt to connect, in seconds.
 _ATTEMPT = 10.0
 
 
@@ -40,12 +40,12 @@ class KubernetesShell:
     A Shell for endpoints of kind 'kubernetes', whose host is ``namespace/pod@context``.
 
     :param name: the machine's name, for messages.
-    :param timeout: seconds one attempt to connect may take.
+    :param timeout: seconds for which to try to connect.
     """
 
     @staticmethod
     def warm() -> None:
-        """Begin to import the client; see :func:`fogros2.shell.warm`."""
+        """Start to import the client; see :func:`fogros2.shell.warm`."""
         threading.Thread(target=_load, name='fog-load', daemon=True).start()
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
@@ -55,7 +55,7 @@ class KubernetesShell:
         self._timeout = timeout
         self._lock = threading.Lock()
         self._link: Optional[Link] = None
-        # one attempt to connect at a time, on which close() doesn't wait
+        # Only one thread connects at a time; close() does not wait for this lock.
         self._connecting = threading.Lock()
         self._closings = 0
 
@@ -64,7 +64,7 @@ class KubernetesShell:
     def _connected(
         self, timeout: float, cancel: Optional[threading.Event] = None,
     ) -> Link:
-        """Return the connection, which is opened as needed; waits for an API server's restart."""
+        """Return the connection; open it if necessary, and wait for a restarting API server."""
         until = time.monotonic() + min(self._timeout, timeout)
         link, _ = self._known()
         if link is not None:
@@ -91,7 +91,7 @@ class KubernetesShell:
             self._connecting.release()
 
     def _known(self) -> tuple[Optional[Link], int]:
-        """Return the connection if there is one, and how often there was none any more."""
+        """Return the connection if it is alive, and the number of calls of close()."""
         with self._lock:
             link = self._link
             return link if link is not None and link.alive else None, self._closings
@@ -122,13 +122,13 @@ class KubernetesShell:
             try:
                 return link.open(command)
             except ConnectError:
-                # lost, as we find out only now, and nothing has been begun
+                # The connection was lost before, so the command has not started: retry once.
                 if attempt == 2:
                     raise
         raise AssertionError('the second attempt returns or raises')
 
     def close(self) -> None:
-        """Drop the connection; the next call would open it again."""
+        """Close the connection; the next call opens a new one."""
         with self._lock:
             link, self._link = self._link, None
             self._closings += 1
@@ -142,7 +142,7 @@ class KubernetesShell:
         cancel: Optional[threading.Event] = None,
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
-        """Run a command there and wait for it; see the protocol."""
+        """Run a command in the pod, and wait for its end; see the protocol."""
         begin = time.monotonic()
         what = command.what or command.argv[0]
         if cancel is not None and cancel.is_set():
@@ -164,7 +164,7 @@ class KubernetesShell:
         self, channel: Channel, output: Output, deadline: float,
         cancel: Optional[threading.Event], what: str,
     ) -> None:
-        """Read until both streams have ended and the command too, or the time is up."""
+        """Read until both streams and the command have ended, or the time is up."""
         quiet_since = 0.0
         while True:
             now = time.monotonic()
@@ -185,13 +185,13 @@ class KubernetesShell:
             elif out or err:
                 quiet_since = 0.0
             elif channel.exit_status is not None:
-                # it has ended; what it left in the background holds its output open
+                # The command has ended, but its background processes hold its output open.
                 quiet_since = quiet_since or now
                 if now - quiet_since >= _DRAIN:
                     return
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file there (folders made as needed): aside first, then moved into place."""
+        """Write a file atomically, and create its folders; see the protocol."""
         self.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
@@ -199,21 +199,21 @@ class KubernetesShell:
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Make the folder ``target`` there equal ``source`` here; see the protocol."""
+        """Make the folder ``target`` in the pod equal to ``source``; see the protocol."""
         return sync.to_machine(
             self, source, target, excludes=excludes, includes=includes, timeout=timeout,
             cancel=cancel, on_progress=on_progress)
 
     def start(self, line: str) -> Channel:
         """
-        Start a command line there and return its channel.
+        Start a command line in the pod, and return its channel.
 
-        :raises ConnectError: the machine can't be reached.
+        :raises ConnectError: the pod cannot be reached.
         """
         return self._open(Command(('sh', '-c', line)), self._timeout)
 
     def open(self, command: Command) -> Stream:
-        """Start a program there and return its streams; it ends with the stream."""
+        """Start a program in the pod; closing the returned stream ends the program."""
         channel = self._open(command, self._timeout)
         stream = LineStream(channel, self.name, channel.discard_errors)
         if command.input:
@@ -221,7 +221,7 @@ class KubernetesShell:
         return stream
 
     def interactive(self, command: Optional[Command] = None) -> int:
-        """Give the user's terminal to the login shell there, or to ``command``."""
+        """Connect the user's terminal to the login shell, or to ``command``."""
         there = terminal.size()
         channel = self._connected(self._timeout).open(
             command or Command(()), terminal=there, login=command is None)
@@ -238,7 +238,7 @@ def _load() -> None:
 def _feed(channel: Channel, data: bytes) -> Optional[threading.Thread]:
     def send() -> None:
         with contextlib.suppress(OSError, FogError):
-            # it may end without reading; its exit status says why
+            # The command may end before it reads all input; its exit status has the reason.
             channel.sendall(data)
             channel.shutdown_write()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One command in a pod, as the robot sees it: what it has written, what it will still take."""
+"""Hold the robot's state of one command in a pod: its output, its input window, its exit."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from fogros2.shell import kubernetes_mux as mux
 
 
 class Sender(Protocol):
-    """What a channel's frames go through."""
+    """The sender of a channel's frames."""
 
     def send(self, kind: int, number: int, payload: bytes = b'', /) -> None:
-        """Send a frame, now or as soon as the connection is back."""
+        """Send a frame; raise ConnectError if the connection is lost."""
 
     def forget(self, number: int, /) -> None:
-        """Let a command go."""
+        """Close a command's channel."""
 
 
 class Channel:
-    """One command in the pod; the methods are those of paramiko's that are used here."""
+    """One command in the pod, with the used methods of paramiko's Channel."""
 
     def __init__(self, link: Sender, number: int) -> None:
         self._link = link
@@ -39,7 +39,7 @@ class Channel:
     # -- from the link --------------------------------------------------------------------------
 
     def take(self, kind: int, payload: bytes) -> None:
-        """Take a frame."""
+        """Process a frame from the pod."""
         with self._changed:
             if kind == mux.EXIT:
                 self._status, = struct.unpack('>i', payload)
@@ -52,7 +52,7 @@ class Channel:
             self._changed.notify_all()
 
     def lose(self, error: FogError) -> None:
-        """Note that nothing more will come."""
+        """Record that the connection is lost, so that no more frames will arrive."""
         with self._changed:
             self._lost = error
             self._changed.notify_all()
@@ -66,9 +66,10 @@ class Channel:
 
     def read(self, timeout: Optional[float]) -> tuple[bytes, bytes, bool]:
         """
-        Wait for output, and return it: standard output, standard error, whether both have ended.
+        Wait for output; return standard output, standard error, and whether both have ended.
 
-        :raises ConnectError: the pod was lost, and all that came before has been returned.
+        :param timeout: seconds to wait; None: no time-out.
+        :raises ConnectError: the connection is lost, and all earlier output was returned.
         """
         with self._changed:
             self._changed.wait_for(
@@ -81,11 +82,11 @@ class Channel:
         return out, err, ended
 
     def recv(self, size: int) -> bytes:
-        """Return some of its standard output, b'' at the end."""
+        """Return up to ``size`` bytes of standard output, b'' at its end."""
         return self._receive(mux.OUT, size)
 
     def recv_stderr(self, size: int) -> bytes:
-        """Return some of its standard error, b'' at the end."""
+        """Return up to ``size`` bytes of standard error, b'' at its end."""
         return self._receive(mux.ERR, size)
 
     def _receive(self, kind: int, size: int) -> bytes:
@@ -97,7 +98,7 @@ class Channel:
         return data
 
     def discard_errors(self) -> None:
-        """Drop what it wrote to standard error: unread, it would stop the program."""
+        """Discard standard error; unread output would fill the window and stop the program."""
         with self._changed:
             size = len(self._pop(mux.ERR, 0))
         self._pay(size)
@@ -118,22 +119,22 @@ class Channel:
         return self._closed or self._lost is not None
 
     def wait_exit(self, timeout: float) -> bool:
-        """Return whether the command has exited, or is lost, after so many seconds at most."""
+        """Wait up to ``timeout`` seconds; return whether the command exited or is lost."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self._status is not None or self._over(), timeout)
 
     def recv_exit_status(self) -> int:
-        """Wait for it to exit and return its status; -1 if that is never to be known."""
+        """Wait for the exit, and return the exit status; -1 if it will never be known."""
         with self._changed:
             self._changed.wait_for(lambda: self._status is not None or self._over())
             return -1 if self._status is None else self._status
 
     def sendall(self, data: bytes) -> None:
         """
-        Send to its standard input, as fast as it reads.
+        Send to standard input, as fast as the command reads.
 
-        :raises OSError: it is lost or closed.
+        :raises OSError: the command has ended, or the channel is lost or closed.
         """
         rest = memoryview(data)
         while rest:
@@ -148,18 +149,18 @@ class Channel:
             rest = rest[len(piece):]
 
     def shutdown_write(self) -> None:
-        """End its standard input."""
+        """Close the command's standard input."""
         self._link.send(mux.IN, self._number)
 
     def resize_pty(self, columns: int, rows: int) -> None:
-        """Tell it the terminal's size."""
+        """Send the terminal's new size."""
         self._link.send(mux.RESIZE, self._number, struct.pack('>HH', rows, columns))
 
     def settimeout(self, timeout: Optional[float]) -> None:
-        """Take the one that there is: none."""
+        """Do nothing; the method exists for paramiko's interface."""
 
     def close(self) -> None:
-        """Let it go; it ends if it runs still."""
+        """Close the channel, which ends a running command."""
         with self._changed:
             if self._closed:
                 return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's end of a pod's multiplexer: one ``exec``, many channels."""
+"""Connect the robot to a pod's multiplexer: one ``exec``, many channels."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from fogros2.shell.kubernetes_channel import Channel
 if TYPE_CHECKING:
     import websocket
 
-#: Seconds of silence after which the pod is asked for a word.
+#: Seconds of silence after which the robot sends a ping.
 ASK = 15.0
-#: Seconds for which a frame may stand still half-way, in or out: its thread holds the lock, so a
-#: cut in the middle of it would block all other threads, the end of the launch too.
+#: Time-out of a partly transferred frame, in seconds. Its thread holds the lock, so a cut in the
+#: middle of a frame would block all other threads, including the end of the launch.
 STALL = 10.0
 _STDIN, _STDOUT, _STDERR, _ERROR = range(4)
-#: Reads the program from its standard input, of which it is the beginning.
+#: Program that reads the multiplexer's source from the start of its standard input.
 _LOADER = ('import os,sys;n={size};s=b""\n'
            'while len(s)<n:\n'
            ' d=os.read(0,n-len(s))\n'
@@ -45,8 +45,8 @@ class Link:
     A connection to a pod's multiplexer; thread-safe.
 
     :param name: the machine's name, for messages.
-    :param timeout: seconds in which it has to stand.
-    :raises ConnectError: it doesn't.
+    :param timeout: time-out of the connection's set-up, in seconds.
+    :raises ConnectError: the pod cannot be reached.
     """
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float) -> None:
@@ -64,16 +64,16 @@ class Link:
 
     @property
     def alive(self) -> bool:
-        """Whether commands can be begun."""
+        """Whether new commands can start."""
         return self._error is None
 
     def open(self, command: Command, *, terminal: Optional[tuple[int, int, str]] = None,
              login: bool = False) -> Channel:
         """
-        Begin a command in the pod.
+        Start a command in the pod.
 
-        :param terminal: rows, columns and kind of the terminal it gets.
-        :param login: the user's login shell in place of the command.
+        :param terminal: rows, columns and type of the command's terminal; None: no terminal.
+        :param login: start the user's login shell instead of the command.
         :raises ConnectError: the connection is lost.
         """
         what = {
@@ -97,7 +97,7 @@ class Link:
 
     @contextlib.contextmanager
     def _using(self) -> Iterator[websocket.WebSocket]:
-        """Hold the connection alone; its first error ends it for everybody."""
+        """Lock the connection; the first error ends the connection for all threads."""
         with self._lock:
             if self._error is not None:
                 raise self._error
@@ -112,13 +112,13 @@ class Link:
         return ConnectError(f"the connection to '{self._name}' was lost: {error}")
 
     def _wake(self) -> None:
-        """Wake the reader, which closes the connection."""
+        """Wake the reading thread, which closes the connection."""
         if self._socket.sock is not None:
             with contextlib.suppress(OSError):
                 self._socket.sock.shutdown(2)
 
     def forget(self, number: int) -> None:
-        """Let a command go."""
+        """Close a command's channel."""
         with self._lock:
             known = self._channels.pop(number, None)
         if known is not None:
@@ -126,7 +126,7 @@ class Link:
                 self.send(mux.CLOSE, number)
 
     def close(self) -> None:
-        """End the connection and what runs over it."""
+        """Close the connection, and end its commands."""
         self._closed = True
         with contextlib.suppress(FogError):
             self.send(mux.GONE, 0)
@@ -136,7 +136,7 @@ class Link:
     # -- the connection -------------------------------------------------------------------------
 
     def _connect(self, timeout: float) -> websocket.WebSocket:
-        """Begin an ``exec``, and wait for the multiplexer's first frame."""
+        """Start an ``exec``, and wait for the multiplexer's first frame."""
         source = _source()
         words = ['python3', '-ISc', _LOADER.format(size=len(source))]
         api = kubernetes_client.connect(self._context)
@@ -151,7 +151,7 @@ class Link:
             raise ConnectError(f"'{self._name}' can't be reached: {error.args[0]}", error.hint) \
                 from error
         try:
-            # in pieces: some API servers take small frames alone
+            # In pieces, because some API servers accept only small frames.
             for begin in range(0, len(source), mux.CHUNK):
                 link.send_binary(bytes([_STDIN]) + source[begin:begin + mux.CHUNK])
             self._greeting(link, time.monotonic() + timeout)
@@ -233,7 +233,7 @@ class Link:
 
     def _serve(self) -> None:
         """
-        Hand out what comes.
+        Dispatch the frames from the pod to their channels.
 
         :raises ConnectError: the connection is lost or closed.
         """
@@ -250,7 +250,7 @@ class Link:
                     raise ConnectError(f"'{self._name}' has fallen silent")
                 self.send(mux.PING, 0)
                 continue
-            # not while another thread writes: TLS keeps one state for both
+            # Under the lock, because TLS has one state for reading and writing.
             with self._using() as link:
                 data = _bytes(link.recv())
             if not data:
@@ -284,9 +284,9 @@ class Link:
 
 def parse_host(host: str) -> tuple[str, str, str]:
     """
-    Return context, namespace and pod of an endpoint's host.
+    Parse an endpoint's host into context, namespace and pod.
 
-    :raises ConnectError: it isn't one of a pod.
+    :raises ConnectError: the host names no pod.
 
     >>> parse_host('robots/fogros2-talker-x7c2p@arn:aws:eks:eu-north-1:1:cluster/a')
     ('arn:aws:eks:eu-north-1:1:cluster/a', 'robots', 'fogros2-talker-x7c2p')

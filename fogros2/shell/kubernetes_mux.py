@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs in a pod, as root: many commands over the one stream that ``exec`` gives.
+Run in a pod as root, and multiplex many commands over the stream of one ``exec``.
 
-``exec`` takes a tenth of a second each time and knows no end of input. So one ``exec`` runs this
-program, which runs commands as asked and ends with the connection. Standard library alone; its
-source comes over its standard input.
+Each ``exec`` takes a tenth of a second, and cannot end a command's input. So one ``exec`` runs
+this program. The program runs commands on request, and ends with the connection. It uses only the
+standard library; the robot sends its source over its standard input.
 
-Frames, both ways: type, channel, length, payload.
+Frames in both directions: type, channel, length, payload.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ import subprocess
 import termios
 import time
 
-TYPE_CHECKING = False  # each pod would wait for typing itself
+TYPE_CHECKING = False  # importing it from typing would delay each pod
 if TYPE_CHECKING:
     from typing import Any
 
 HEADER = struct.Struct('>BII')
 OUT, ERR, EXIT, OPEN, IN, CLOSE, WINDOW, RESIZE = range(1, 9)
-#: Of the connection, on no channel.
+#: Frames of the connection, without a channel.
 HELLO, PING, PONG, GONE = range(64, 68)
-#: Bytes that may be under way on a channel, each way.
+#: Maximum unacknowledged bytes of a channel in each direction.
 CREDIT = 4 << 20
 CHUNK = 1 << 15
-#: Seconds of silence after which a connection counts as lost.
+#: Seconds of silence after which the connection counts as lost.
 SILENCE = 60.0
 _STDIN, _STDOUT = 0, 1
 
 
 class Process:
-    """A command and the ends of its streams."""
+    """A command, and our ends of its streams."""
 
     def __init__(
         self, number: int, child: subprocess.Popen[bytes], stdin: int, streams: dict[int, int],
@@ -53,7 +53,7 @@ class Process:
         self.child = child
         self.stdin = stdin
         self.terminal = terminal
-        #: Descriptor -> type of its frames.
+        #: Frame type by file descriptor.
         self.streams = streams
         self.waiting: collections.deque[bytes] = collections.deque()
         self.credit = CREDIT
@@ -62,7 +62,7 @@ class Process:
         self.killed_at = 0.0
 
     def signal(self, name: signal.Signals) -> None:
-        """Signal the process and what it started."""
+        """Send a signal to the command's process group."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.child.pid, name)
 
@@ -88,11 +88,11 @@ class Multiplexer:
         self.send(HELLO, 0)
 
     def listen_to(self, stream: int, call: Callable[[], None]) -> None:
-        """Call a function when there is something to read."""
+        """Register a function to call when a stream is readable."""
         self.selector.register(stream, selectors.EVENT_READ, call)
 
     def run(self) -> None:
-        """Serve until the connection has ended, then end the commands."""
+        """Serve until the connection ends, then end all commands."""
         while self.connected and time.monotonic() - self.heard < SILENCE:
             for key, _ in self.selector.select(1.0):
                 if key.fileobj in self.selector.get_map():
@@ -110,7 +110,7 @@ class Multiplexer:
     # -- the connection -------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Read frames, and do what they say."""
+        """Read frames from the robot, and process them."""
         try:
             data = os.read(_STDIN, 1 << 18)
         except BlockingIOError:
@@ -132,7 +132,7 @@ class Multiplexer:
             self.take(kind, number, payload)
 
     def take(self, kind: int, number: int, payload: bytes) -> None:
-        """Do what a frame says."""
+        """Process a frame from the robot."""
         process = self.processes.get(number)
         if kind == OPEN:
             self.open(number, json.loads(payload))
@@ -141,7 +141,7 @@ class Multiplexer:
         elif kind == GONE:
             self.connected = False
         elif process is None:
-            pass  # it was closed meanwhile
+            pass  # the command was closed meanwhile
         elif kind == IN:
             process.waiting.append(payload)
             self.feed(process)
@@ -163,7 +163,7 @@ class Multiplexer:
         self.want_write()
 
     def want_write(self) -> None:
-        """Write as much as the connection takes, and the rest as soon as it takes more."""
+        """Write as much as possible, and the rest when the connection is writable again."""
         try:
             while self.outgoing:
                 data = self.outgoing[0]
@@ -185,7 +185,7 @@ class Multiplexer:
     # -- commands -------------------------------------------------------------------------------
 
     def open(self, number: int, what: dict[str, Any]) -> None:
-        """Begin a command."""
+        """Start a command."""
         try:
             process = begin(number, what)
         except (OSError, KeyError, ValueError, subprocess.SubprocessError) as error:
@@ -198,24 +198,24 @@ class Multiplexer:
             return
         self.processes[number] = process
         if process.terminal:
-            self.send(ERR, number)  # has one stream for both
+            self.send(ERR, number)  # a terminal has only one output stream
         self.listen(process)
 
     def listen(self, process: Process) -> None:
-        """Read what a command writes."""
+        """Start to read a command's output."""
         process.paused = False
         for stream in process.streams:
             self.listen_to(stream, functools.partial(self.output, process, stream))
 
     def output(self, process: Process, stream: int) -> None:
-        """Pass on what a command has written."""
+        """Forward a command's output."""
         kind = process.streams[stream]
         try:
             data = os.read(stream, CHUNK)
         except BlockingIOError:
             return
         except OSError:
-            data = b''  # a terminal whose last user has gone
+            data = b''  # the terminal has no more users
         self.send(kind, process.number, data)
         if not data:
             self.selector.unregister(stream)
@@ -230,7 +230,7 @@ class Multiplexer:
                 self.selector.unregister(each)
 
     def feed(self, process: Process) -> None:
-        """Hand a command its input as it takes it."""
+        """Write waiting input to a command as far as the command reads it."""
         stdin = process.stdin
         if stdin < 0:
             process.waiting.clear()
@@ -254,18 +254,18 @@ class Multiplexer:
                 self.send(WINDOW, process.number, struct.pack('>I', taken))
             return
         except OSError:
-            done = True  # it has closed its input; its exit status says why
+            done = True  # the command closed its input; its exit status has the reason
         if taken:
             self.send(WINDOW, process.number, struct.pack('>I', taken))
         with contextlib.suppress(KeyError):
             self.selector.unregister(stdin)
-        if done and not process.terminal:  # whose end of input is a character
+        if done and not process.terminal:  # a terminal's end of input is a character
             process.stdin = -1
             process.waiting.clear()
             os.close(stdin)
 
     def reap(self) -> None:
-        """Note which commands have exited."""
+        """Record the commands that have exited."""
         with contextlib.suppress(BlockingIOError):
             os.read(self.woken, 4096)
         for process in (*self.processes.values(), *self.ending):
@@ -273,18 +273,18 @@ class Multiplexer:
                 process.exited = True
                 if process.number in self.processes:
                     code = process.child.returncode
-                    # of a signal, as a shell has it
+                    # A signal becomes an exit status as in a shell.
                     self.send(EXIT, process.number,
                               struct.pack('>i', code if code >= 0 else 128 - code))
                     self.finish(process)
 
     def finish(self, process: Process) -> None:
-        """Forget a command that has exited and whose streams have ended."""
+        """Close a command that has exited and whose streams have ended."""
         if process.exited and not process.streams:
             self.close(process)
 
     def close(self, process: Process) -> None:
-        """Let a command go; end it if it runs."""
+        """Close a command's streams, and end the command if it still runs."""
         del self.processes[process.number]
         for stream in (*process.streams, *([process.stdin] if process.stdin >= 0 else [])):
             with contextlib.suppress(KeyError):
@@ -292,7 +292,7 @@ class Multiplexer:
             os.close(stream)
         process.streams = {}
         process.stdin = -1
-        # what it left in the background on purpose has a group of its own
+        # Intentional background processes have their own process groups, and stay.
         if not process.exited:
             process.signal(signal.SIGTERM)
             process.killed_at = time.monotonic()
@@ -300,18 +300,18 @@ class Multiplexer:
 
 
 def frame(kind: int, number: int, payload: bytes) -> bytes:
-    """Return a frame's bytes."""
+    """Serialise a frame."""
     return HEADER.pack(kind, number, len(payload)) + payload
 
 
 def begin(number: int, what: dict[str, Any]) -> Process:
-    """Start a command and return it."""
+    """Start a command."""
     user = pwd.getpwnam('root' if what['root'] else what['user'])
     environment = {
         **os.environ, 'HOME': user.pw_dir, 'USER': user.pw_name, 'LOGNAME': user.pw_name,
         'SHELL': user.pw_shell or '/bin/sh', **what['env']}
     if user.pw_uid != 0:
-        # tells that root's rights are to be had without sudo
+        # Announces that commands can become root without sudo.
         environment['FOGROS2_ROOT'] = 'yes'
     options: dict[str, Any] = {
         'env': environment, 'cwd': user.pw_dir if os.path.isdir(user.pw_dir) else '/',

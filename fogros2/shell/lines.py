@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a program on a machine writes, line by line, over whichever channel leads to it."""
+"""Read a remote program's output line by line, over any kind of channel."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
 
-#: Bytes of one line of a program there at the most: a machine can't fill the robot's memory.
+#: Maximum bytes of a line, so that a machine cannot fill the robot's memory.
 MAX_LINE = 32 << 20
 _CHUNK = 1 << 16
 
 
 class Channel(Protocol):
-    """What a shell has for each program that it runs; failures are OSErrors or FogErrors."""
+    """A shell's channel to a program; its errors are OSErrors or FogErrors."""
 
     def recv(self, size: int, /) -> bytes:
-        """Wait for some of its standard output, and return it; b'' at the end."""
+        """Wait for standard output, and return up to ``size`` bytes; b'' at the end."""
 
     def sendall(self, data: bytes, /) -> None:
-        """Send to its standard input, as fast as it reads."""
+        """Send to standard input, as fast as the program reads."""
 
     def close(self) -> None:
-        """Let it go; it ends if it runs still."""
+        """Close the channel, which ends a running program."""
 
 
 class LineStream:
     """
-    Both ends of a program that runs on a machine, line by line.
+    Standard input and output of a program on a machine, line by line.
 
     :param name: the machine's name, for messages.
-    :param discard_errors: drops what it wrote to standard error: unread, that would fill the
+    :param discard_errors: callback that discards standard error; unread output would fill the
         channel's window and stop the program.
     """
 
@@ -43,16 +43,16 @@ class LineStream:
         self._buffer = b''
 
     def write(self, data: bytes) -> None:
-        """Send to its standard input."""
+        """Send bytes to the program's standard input."""
         try:
             self._channel.sendall(data)
         except (OSError, EOFError) as error:
-            # paramiko says so, without a word, of one that ends meanwhile
+            # paramiko's error for a program that ends meanwhile has no text.
             why = str(error) or 'it ended'
             raise ConnectError(f"the connection to '{self._name}' is gone: {why}") from error
 
     def readline(self) -> bytes:
-        """Return its next line of output with the newline, b'' at the end."""
+        """Return the next line of output with its newline, b'' at the end."""
         parts = [self._buffer]
         size = len(self._buffer)
         while b'\n' not in parts[-1]:
@@ -73,15 +73,15 @@ class LineStream:
         return line + b'\n'
 
     def close(self) -> None:
-        """End it; a ``readline`` in another thread returns b''."""
+        """End the program; a ``readline`` in another thread returns b''."""
         self._channel.close()
 
 
 class Output:
     """
-    What a command wrote, and its lines as they become whole.
+    Collect a command's output, and pass complete lines on.
 
-    :param on_output: gets each line of standard output.
+    :param on_output: callback for each line of standard output.
     """
 
     def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
@@ -91,7 +91,7 @@ class Output:
         self._rest = b''
 
     def add(self, out: bytes = b'', err: bytes = b'') -> None:
-        """Take what has arrived of standard output and standard error."""
+        """Add new standard output and standard error."""
         self._out.append(out)
         self._err.append(err)
         if self._on_output is not None and out:
@@ -100,7 +100,7 @@ class Output:
                 self._on_output(line.decode(errors='replace'))
 
     def text(self) -> tuple[str, str]:
-        """Return standard output and standard error; the last line goes out, if not whole."""
+        """Return standard output and standard error; pass an incomplete last line on."""
         if self._on_output is not None and self._rest:
             self._on_output(self._rest.decode(errors='replace'))
             self._rest = b''

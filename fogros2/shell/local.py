@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""This computer's own command line as a Shell, for what runs beside the robot's nodes."""
+"""Run commands on this computer through the Shell interface, beside the robot's nodes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fogros2.shell import command_line, Stream, sync
 
 
 class LocalShell:
-    """A Shell for endpoints of kind 'local'; nothing to connect, nothing to lose."""
+    """A Shell for endpoints of kind 'local'; it has no connection."""
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint
@@ -30,12 +30,12 @@ class LocalShell:
         cancel: Optional[threading.Event] = None,
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
-        """Run a command and wait for it; see the protocol."""
+        """Run a command, and wait for its end; see the protocol."""
         return process.run(
             command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file (folders made as needed): aside first, then moved into place."""
+        """Write a file atomically, and create its folders; see the protocol."""
         process.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
@@ -43,13 +43,13 @@ class LocalShell:
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Make the folder ``target`` equal ``source``; see the protocol."""
+        """Make the folder ``target`` equal to ``source``; see the protocol."""
         return sync.to_folder(
             source, target, excludes=excludes, includes=includes, timeout=timeout,
             cancel=cancel, on_progress=on_progress)
 
     def open(self, command: Command) -> Stream:
-        """Start a program and return its streams; it ends with the stream."""
+        """Start a program; closing the returned stream ends the program."""
         try:
             child = process.start(
                 command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -69,17 +69,17 @@ class LocalShell:
         return subprocess.call(words, env=environment)
 
     def close(self) -> None:
-        """There is no connection to drop."""
+        """Do nothing: there is no connection."""
 
 
 class LocalStream:
-    """Both ends of a program on this computer, line by line."""
+    """Standard input and output of a program on this computer, line by line."""
 
     def __init__(self, child: subprocess.Popen[bytes]) -> None:
         self._child = child
 
     def write(self, data: bytes) -> None:
-        """Send to its standard input."""
+        """Send bytes to the program's standard input."""
         assert self._child.stdin is not None
         try:
             self._child.stdin.write(data)
@@ -88,18 +88,18 @@ class LocalStream:
             raise ConnectError(f'the program has ended: {error}') from error
 
     def readline(self) -> bytes:
-        """Return its next line of output with the newline, b'' at the end."""
+        """Return the next line of output with its newline, b'' at the end."""
         assert self._child.stdout is not None
         return self._child.stdout.readline()
 
     def close(self) -> None:
-        """End it; a ``readline`` in another thread returns b''."""
+        """End the program; a ``readline`` in another thread returns b''."""
         self._child.terminate()
         if self._child.stdin is not None:
             try:
                 self._child.stdin.close()
             except BrokenPipeError:
-                pass  # it ended without reading all
+                pass  # the program ended before it read all input
         try:
             self._child.wait(2.0)
         except subprocess.TimeoutExpired:

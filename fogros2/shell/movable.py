@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shell whose machine can be reached another way from some moment on."""
+"""Change the shell of a machine while the shell is in use."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Optional
 from fogros2.model import Command, Result, SyncReport
 from fogros2.shell import Shell, Stream
 
-#: Seconds that a shell which is left may take to end what runs on it.
+#: Seconds to wait for the commands on a shell that is replaced.
 PATIENCE = 3.0
 
 
 class MovableShell:
     """
-    A Shell that hands everything to another one, which can be replaced.
+    A Shell that forwards all calls to another Shell, which can be replaced.
 
-    :param shell: the one to begin with.
+    :param shell: the first shell.
     """
 
     def __init__(self, shell: Shell) -> None:
@@ -31,10 +31,10 @@ class MovableShell:
 
     def move(self, shell: Shell) -> None:
         """
-        Take another shell to the same machine from now on, and close the one before.
+        Use another shell to the same machine from now on, and close the previous one.
 
-        Streams that are open end. What runs at this moment is waited for, some seconds at the
-        most: on a shell that was closed it would connect anew, where nobody lets it in any more.
+        Open streams end. The method waits up to ``PATIENCE`` seconds for running commands: on a
+        closed shell, they would connect again, although the firewall no longer admits them.
         """
         with self._news:
             before, self._shell = self._shell, shell
@@ -58,13 +58,13 @@ class MovableShell:
         cancel: Optional[threading.Event] = None,
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
-        """Run a command there and wait for it; see the protocol."""
+        """Run a command on the machine, and wait for its end; see the protocol."""
         with self._current() as shell:
             return shell.run(
                 command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file there (folders made as needed): aside first, then moved into place."""
+        """Write a file atomically, and create its folders; see the protocol."""
         with self._current() as shell:
             shell.put(data, target, mode=mode, timeout=timeout)
 
@@ -73,21 +73,21 @@ class MovableShell:
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Make the folder ``target`` there equal ``source`` here; see the protocol."""
+        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
         with self._current() as shell:
             return shell.sync(
                 source, target, excludes=excludes, timeout=timeout, includes=includes,
                 cancel=cancel, on_progress=on_progress)
 
     def open(self, command: Command) -> Stream:
-        """Start a program there and return its streams; it ends with the stream."""
+        """Start a program on the machine; closing the returned stream ends the program."""
         with self._current() as shell:
             return shell.open(command)
 
     def interactive(self, command: Optional[Command] = None) -> int:
-        """Give the user's terminal to the login shell there, or to ``command``."""
+        """Connect the user's terminal to the login shell, or to ``command``."""
         return self._shell.interactive(command)
 
     def close(self) -> None:
-        """Drop the connection; the next call would open it again."""
+        """Close the connection; the next call opens a new one."""
         self._shell.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of this computer over a channel: rsync's (``rsh.py`` is its end) or a terminal's."""
+"""Relay local streams over a channel: rsync's (``rsh.py`` is its end) or a terminal's."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ _HELPER = Path(__file__).with_name('rsh.py')
 
 
 class Channel(Protocol):
-    """A program on a machine, as paramiko's channels have it."""
+    """A program on a machine, with the interface of paramiko's channels."""
 
     def sendall(self, data: bytes, /) -> None:
-        """Send to its standard input."""
+        """Send to standard input."""
 
     def shutdown_write(self) -> None:
-        """End its standard input."""
+        """Close standard input."""
 
     def recv(self, size: int, /) -> bytes:
-        """Return some of its standard output, b'' at the end."""
+        """Return up to ``size`` bytes of standard output, b'' at its end."""
 
     def recv_stderr(self, size: int, /) -> bytes:
-        """Return some of its standard error, b'' at the end."""
+        """Return up to ``size`` bytes of standard error, b'' at its end."""
 
     def recv_exit_status(self) -> int:
-        """Wait for it to exit; -1 where that is never to be known."""
+        """Wait for the exit, and return the exit status; -1 if it will never be known."""
 
     def settimeout(self, timeout: float | None, /) -> None:
-        """Take how long a read may last, None for ever."""
+        """Set the time-out of reads in seconds, None: no time-out."""
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the channel."""
 
 
 @contextlib.contextmanager
 def remote_shell(start: Callable[[str], Channel]) -> Iterator[tuple[str, list[FogError]]]:
     """
-    Yield the value of rsync's ``-e``, and a list that takes what fails on our side.
+    Yield the value of rsync's ``-e``, and a list that collects errors of the relay.
 
-    :param start: starts a command line on the machine.
+    :param start: function that starts a command line on the machine.
     """
     failures: list[FogError] = []
     name = f'fogros2-{secrets.token_hex(16)}'
@@ -64,7 +64,7 @@ def remote_shell(start: Callable[[str], Channel]) -> Iterator[tuple[str, list[Fo
         yield f"'{sys.executable}' -I -S '{_HELPER}' {name}", failures
     finally:
         with contextlib.suppress(OSError):
-            listener.shutdown(socket.SHUT_RDWR)  # wakes an accept that nobody came to
+            listener.shutdown(socket.SHUT_RDWR)  # wakes accept() if rsync never connected
         listener.close()
         thread.join(5.0)
 
@@ -75,7 +75,7 @@ def _serve(
     try:
         link, _ = listener.accept()
     except OSError:
-        return  # rsync never got that far
+        return  # rsync ended before it connected
     with link:
         peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
         if struct.unpack('3i', peer)[1] != os.geteuid():
@@ -87,20 +87,20 @@ def _serve(
         except FogError as error:
             failures.append(error)
         except OSError:
-            pass  # rsync has gone; its own exit status says why
+            pass  # rsync has ended; its own exit status has the reason
         finally:
             for stream in streams:
                 os.close(stream)
 
 
 def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
-    """Move bytes until the machine's side ends; return its exit status (255: lost)."""
+    """Relay bytes until the remote program ends; return its exit status (255: lost)."""
     ended, end = os.pipe()
 
     def up() -> None:
         with contextlib.suppress(OSError, EOFError, FogError):
             while ended not in select.select([stdin, ended], [], [])[0]:
-                # more than a packet at once: sendall cuts it, and a read is a system call
+                # Large reads save system calls; sendall() splits them into packets.
                 data = os.read(stdin, 1 << 18)
                 if not data:
                     channel.shutdown_write()
@@ -124,7 +124,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
             threads[1].join(5.0)
             status = int(channel.recv_exit_status())
     finally:
-        os.close(end)  # wakes the thread that reads
+        os.close(end)  # wakes the thread that reads standard input
         threads[0].join(5.0)
         os.close(ended)
     return status if 0 <= status < 256 else 255

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What rsync calls as its remote shell: hands its streams to the process that called rsync.
+Pass rsync's streams to the process that called rsync; rsync calls this as its remote shell.
 
-That process has a connection to the machine already, which saves a second one, with its own
-login. Run by path, standard library only: ``python3 -I -S rsh.py SOCKET HOST WORD...``.
+That process already has a connection to the machine, which saves a second login. Run by path, with
+only the standard library: ``python3 -I -S rsh.py SOCKET HOST WORD...``.
 """
 
 import os
@@ -12,9 +12,9 @@ import sys
 
 
 def main() -> int:
-    """Hand over the streams and the command line; return the exit status that comes back."""
+    """Send the streams and the command line; return the exit status of the command."""
     link = socket.socket(socket.AF_UNIX)
-    # a name without a file: nothing to leave behind
+    # An abstract socket has no file to clean up.
     link.connect('\0' + sys.argv[1])
     socket.send_fds(link, [' '.join(sys.argv[3:]).encode()], [0, 1, 2])
     os.close(0)

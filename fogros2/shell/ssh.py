@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's command line by SSH: one connection, many channels, opened again after a loss."""
+"""Run commands on a machine by SSH: one connection, many channels, reopened after a loss."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from fogros2.waiting import wait_until
 if TYPE_CHECKING:
     import paramiko
 
-#: Seconds after a command's end in which something it left behind may hold its output open.
+#: Seconds to wait for further output after a command's end, as its children may still write.
 _DRAIN = 2.0
-#: Input up to this size fits into a channel's window: no thread needed to feed it.
+#: Largest input in bytes that fits into a channel's window, and needs no thread.
 _INLINE = 1 << 16
-#: Seconds that one attempt to connect, or to open a session, may take: a cancel isn't seen sooner.
+#: Time-out of one attempt to connect or to open a session, in seconds; a cancel waits for it.
 _ATTEMPT = 10.0
 
 
@@ -38,12 +38,12 @@ class SSHShell:
     A Shell for endpoints of kind 'ssh'.
 
     :param name: the machine's name, for messages.
-    :param timeout: seconds one attempt to connect may take.
+    :param timeout: seconds for which to try to connect.
     """
 
     @staticmethod
     def warm() -> None:
-        """Begin to import paramiko; see :func:`fogros2.shell.warm`."""
+        """Start to import paramiko; see :func:`fogros2.shell.warm`."""
         ssh_connection.warm()
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
@@ -53,7 +53,7 @@ class SSHShell:
         self._timeout = timeout
         self._lock = threading.Lock()
         self._transport: Optional[paramiko.Transport] = None
-        # one attempt to connect at a time, on which close() doesn't wait
+        # Only one thread connects at a time; close() does not wait for this lock.
         self._connecting = threading.Lock()
         self._closings = 0
 
@@ -63,11 +63,11 @@ class SSHShell:
         self, timeout: Optional[float] = None, cancel: Optional[threading.Event] = None,
     ) -> paramiko.Channel:
         """
-        Return a new channel of the connection, which is opened as needed.
+        Open a channel; open the connection first if necessary.
 
-        :param timeout: seconds it may take, at most those of the constructor.
-        :raises ConnectError: the machine can't be reached.
-        :raises DeadlineExceeded: it takes no more channels, or answers no more.
+        :param timeout: seconds, at most the constructor's time-out.
+        :raises ConnectError: the machine cannot be reached, or no longer answers.
+        :raises DeadlineExceeded: the server refused further sessions until the time-out.
         """
         patience = min(self._timeout, timeout or self._timeout)
         refused = False
@@ -88,16 +88,16 @@ class SSHShell:
                                "check the robot's network") from error
 
     def _try_channel(self, patience: float) -> tuple[Optional[paramiko.Channel], bool]:
-        """Return a new channel, or None and whether it was the server who gave none."""
+        """Return a channel, or None and whether the server answered with a refusal."""
         transport = self._connected(patience)
         import paramiko
         begin = time.monotonic()
         try:
             return transport.open_session(window_size=1 << 22, timeout=patience), False
         except (paramiko.SSHException, EOFError, OSError):
-            # Lost, as we find out only now, and nothing has been started yet; or as many
-            # sessions as the server allows, and one of ours will end. What is raised doesn't
-            # tell: paramiko keeps one exception for all threads. Nor does is_active().
+            # Either the connection was lost before, and no command has started. Or the server
+            # allows no more sessions, and one of ours will end. Neither the exception (paramiko
+            # keeps one for all threads) nor is_active() tells which.
             silent = time.monotonic() - begin >= patience
             if silent or not transport.is_alive():
                 self._drop(transport)
@@ -135,7 +135,7 @@ class SSHShell:
         transport.close()
 
     def close(self) -> None:
-        """Drop the connection; the next call would open it again."""
+        """Close the connection; the next call opens a new one."""
         with self._lock:
             transport, self._transport = self._transport, None
             self._closings += 1
@@ -149,7 +149,7 @@ class SSHShell:
         cancel: Optional[threading.Event] = None,
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
-        """Run a command there and wait for it; see the protocol."""
+        """Run a command on the machine, and wait for its end; see the protocol."""
         line = command_line.announced_line(command, user=self.user)
         begin = time.monotonic()
         if cancel is not None and cancel.is_set():
@@ -175,10 +175,10 @@ class SSHShell:
         cancel: Optional[threading.Event] = None,
     ) -> paramiko.Channel:
         """
-        Start a command line there and return its channel.
+        Start a command line on the machine, and return its channel.
 
-        :param timeout: seconds until it runs, at most those of the constructor.
-        :raises ConnectError: the machine can't be reached.
+        :param timeout: seconds until it runs, at most the constructor's time-out.
+        :raises ConnectError: the machine cannot be reached.
         """
         import paramiko
 
@@ -189,7 +189,7 @@ class SSHShell:
                 return channel
             except (paramiko.SSHException, EOFError, OSError) as error:
                 transport = channel.get_transport()
-                # of a connection that another thread closed is_alive() may still say yes
+                # If another thread closed the connection, is_alive() may still return True.
                 lost = isinstance(error, (EOFError, OSError)) or not transport.is_alive()
                 if attempt == 2 or not lost:
                     raise ConnectError(f"'{self.name}' can not start a command: {error}") \
@@ -218,7 +218,7 @@ class SSHShell:
                     output.add(err=errors)
                     quiet_since = 0.0
                 elif channel.exit_status_ready():
-                    # it has ended; what it left in the background holds its output open
+                    # The command has ended, but its background processes hold its output open.
                     quiet_since = quiet_since or now
                     if now - quiet_since >= _DRAIN:
                         return
@@ -227,7 +227,7 @@ class SSHShell:
             quiet_since = 0.0
             if data:
                 continue
-            # the end of standard output; standard error ends with the channel
+            # Standard output has ended; standard error ends with the channel.
             channel.settimeout(max(0.05, min(_DRAIN, deadline - now)))
             try:
                 while more := channel.recv_stderr(1 << 16):
@@ -244,20 +244,20 @@ class SSHShell:
             raise ConnectError(f"the connection to '{self.name}' was lost while "
                                f'{_what(command)} ran there', "check the robot's network")
         status = channel.recv_exit_status()
-        if status == -1 and not channel.eof_received:  # a signal ended it, if there was one
+        if status == -1 and not channel.eof_received:  # with eof, a signal ended the command
             raise ConnectError(f"the connection to '{self.name}' was lost while "
                                f'{_what(command)} ran there', "check the robot's network")
         return int(status)
 
     def _end(self, pid: int, sudo: bool) -> None:
-        """End what a command that was given up started: closing its streams doesn't."""
+        """Kill the processes of an abandoned command; closing its streams does not end them."""
         if pid:
-            with contextlib.suppress(FogError):  # the machine may be what doesn't answer
+            with contextlib.suppress(FogError):  # the machine itself may not answer
                 self.run(Command(('sh', '-c', command_line.end_script(pid)), sudo=sudo),
                          timeout=3.0, check=False)
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file there (folders made as needed): aside first, then moved into place."""
+        """Write a file atomically, and create its folders; see the protocol."""
         self.run(command_line.writing(data, target, mode), timeout=timeout)
 
     def sync(
@@ -265,20 +265,20 @@ class SSHShell:
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Make the folder ``target`` there equal ``source`` here; see the protocol."""
+        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
         return sync.to_machine(
             self, source, target, excludes=excludes, includes=includes, timeout=timeout,
             cancel=cancel, on_progress=on_progress)
 
     def open(self, command: Command) -> Stream:
-        """Start a program there and return its streams; it ends with the stream."""
+        """Start a program on the machine; closing the returned stream ends the program."""
         channel = self.start(command_line.remote_line(command, user=self.user), _ATTEMPT)
         _feed(channel, command.input, end=False)
         channel.settimeout(None)
         return LineStream(channel, self.name, functools.partial(_take_errors, channel))
 
     def interactive(self, command: Optional[Command] = None) -> int:
-        """Give the user's terminal to the login shell there, or to ``command``."""
+        """Connect the user's terminal to the login shell, or to ``command``."""
         import paramiko
 
         channel, there = self.channel(), terminal.size()
@@ -297,13 +297,13 @@ class SSHShell:
 
 
 class _Announced(Output):
-    """The output of a command whose first line isn't its own: the number of its process."""
+    """The output of a command whose first line is its process id, see ``announced_line``."""
 
     _head: Optional[bytes] = b''
     pid = 0
 
     def add(self, out: bytes = b'', err: bytes = b'') -> None:
-        """Take what has arrived."""
+        """Add new standard output and standard error."""
         if self._head is not None:
             first, newline, out = (self._head + out).partition(b'\n')
             self._head = None if newline else first
@@ -313,7 +313,7 @@ class _Announced(Output):
 
 
 def _take_errors(channel: paramiko.Channel) -> bytes:
-    """Return what is there of standard error."""
+    """Return the standard error that has arrived."""
     parts = []
     while channel.recv_stderr_ready():
         parts.append(channel.recv_stderr(1 << 16))
@@ -331,13 +331,13 @@ def _feed(
         rest = memoryview(data)
         try:
             while rest:
-                # the reader's time-out is the channel's, and meant for reading alone
+                # The time-out belongs to the channel, but is meant only for reads.
                 with contextlib.suppress(TimeoutError):
                     rest = rest[channel.send(bytes(rest[:1 << 15])):]
             if end:
                 channel.shutdown_write()
         except (OSError, EOFError):
-            pass  # it ended without reading; its exit status says why
+            pass  # the command ended before it read all input; its exit status has the reason
 
     if len(data) <= _INLINE:
         send()
@@ -348,5 +348,5 @@ def _feed(
 
 
 def _pause(channel: paramiko.Channel, until: float) -> None:
-    """Wait a little for the exit status, which may come after the output's end."""
+    """Wait a little for the exit status, which may arrive after the end of the output."""
     channel.status_event.wait(max(0.0, until - time.monotonic()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An authenticated SSH connection to a machine whose host key is known beforehand."""
+"""Open an authenticated SSH connection to a machine whose host key is already known."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from fogros2.model import Endpoint
 if TYPE_CHECKING:
     import paramiko
 
-#: In this order; what the installed paramiko lacks is left out.
+#: In order of preference; entries that the installed paramiko lacks are skipped.
 CIPHERS = ('aes128-gcm@openssh.com', 'aes256-gcm@openssh.com', 'aes128-ctr', 'aes256-ctr')
 KEX = ('curve25519-sha256@libssh.org', 'ecdh-sha2-nistp256', 'diffie-hellman-group14-sha256',
        'diffie-hellman-group-exchange-sha256')
 KNOWN_HOSTS = (Path('~/.ssh/known_hosts'), Path('/etc/ssh/ssh_known_hosts'))
 OWN_KEYS = ('id_ed25519', 'id_ecdsa', 'id_rsa')
-#: Seconds of silence after which a packet goes out, and after which an unanswered one ends it:
-#: a cut of half a minute is survived, a robot with another address connects anew.
+#: Seconds of silence after which a packet is sent, and after which an unanswered packet ends the
+#: connection: it survives a cut of 30 s, and a robot with a new address connects again.
 KEEPALIVE = 15
 USER_TIMEOUT = 60
 _IMPORT = threading.Lock()
@@ -37,12 +37,12 @@ class PromptSocket(socket.socket):
     """
     A TCP socket that acknowledges at once.
 
-    While a session is set up, sshd sends small packets with Nagle's algorithm on: each would
-    wait for our delayed acknowledgement, 40 ms by Linux's default.
+    During the set-up of a session, sshd sends small packets with Nagle's algorithm on. Each packet
+    would wait for our delayed acknowledgement, 40 ms by Linux's default.
     """
 
     def recv(self, size: int, flags: int = 0) -> bytes:
-        """Receive, and acknowledge without delay."""
+        """Receive, and acknowledge at once."""
         data = super().recv(size, flags)
         if data:
             self.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
@@ -51,9 +51,9 @@ class PromptSocket(socket.socket):
 
 def warm() -> threading.Thread:
     """
-    Import paramiko in a thread, so that the first connection needn't wait for it.
+    Import paramiko in a thread, so that the first connection need not wait for it.
 
-    :raises PrerequisiteError: it isn't installed.
+    :raises PrerequisiteError: paramiko is not installed.
     """
     if importlib.util.find_spec('paramiko') is None:
         raise PrerequisiteError("the Python package 'paramiko' is missing here",
@@ -66,27 +66,27 @@ def warm() -> threading.Thread:
 def _import() -> None:
     with _IMPORT:
         if 'paramiko' not in sys.modules and 'invoke' not in sys.modules:
-            # paramiko can do without, and imports it, a third of the time it takes, for a
-            # keyword of ssh_config files that nobody reads here
+            # paramiko imports 'invoke' only for a keyword of ssh_config files, which this
+            # project never reads, and works without it. The import takes a third of its time.
             sys.modules['invoke'] = None  # type: ignore[assignment]
             try:
                 import paramiko
             finally:
                 del sys.modules['invoke']
     import paramiko
-    # its threads log what we raise; a handler-less logger would print it
+    # paramiko's threads log errors that we raise; without a handler, Python would print them.
     logger = logging.getLogger(paramiko.__name__)
     if logger.level == logging.NOTSET:
         logger.setLevel(logging.CRITICAL)
 
 
 def user_of(endpoint: Endpoint) -> str:
-    """Return the login user: the endpoint's, or this process's."""
+    """Return the endpoint's login user, else the user of this process."""
     return endpoint.user or getpass.getuser()
 
 
 def host_label(endpoint: Endpoint) -> str:
-    """Return how ``known_hosts`` names the machine."""
+    """Return the machine's name in ``known_hosts``."""
     if endpoint.port == 22:
         return endpoint.host
     return f'[{endpoint.host}]:{endpoint.port}'
@@ -94,13 +94,13 @@ def host_label(endpoint: Endpoint) -> str:
 
 def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transport:
     """
-    Return a connection that is encrypted, with the right machine, and logged in.
+    Open an encrypted connection, verify the host key, and log in.
 
     :param name: the machine's name, for messages.
     :param timeout: seconds for each of TCP, key exchange and login.
-    :raises ConnectError: refused, no route, no answer, no SSH server.
-    :raises HostKeyError: another key than the pinned one, or an unknown one.
-    :raises AuthenticationError: no key of ours is accepted.
+    :raises ConnectError: connection refused, no route, no answer, or no SSH server.
+    :raises HostKeyError: the host key is unknown, or differs from the pinned one.
+    :raises AuthenticationError: the server accepts none of our keys.
     """
     _import()
     import paramiko
@@ -149,7 +149,7 @@ def _dial(endpoint: Endpoint, name: str, timeout: float) -> PromptSocket:
 
 
 def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
-    """Restrict what is negotiated to what is fast, safe and, for the host key, known."""
+    """Restrict the negotiation to fast and safe algorithms, and to the types of known keys."""
     options = transport.get_security_options()
     options.ciphers = [c for c in CIPHERS if c in options.ciphers] or options.ciphers
     options.kex = [k for k in KEX if k in options.kex] or options.kex
@@ -164,7 +164,7 @@ def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
 
 def known_keys(endpoint: Endpoint) -> list[str]:
     """
-    Return the host keys to accept (``type base64``): the pinned one or known_hosts' ones.
+    Return the accepted host keys (``type base64``): the pinned one, or those of known_hosts.
 
     :raises HostKeyError: the pinned key is no key, or known_hosts cannot be read.
     """
@@ -221,7 +221,7 @@ def _log_in(transport: paramiko.Transport, endpoint: Endpoint, name: str) -> Non
             return
         except paramiko.AuthenticationException:
             if not transport.is_active():
-                break  # the server has had enough of our keys
+                break  # the server allows no further keys
     where = endpoint.key_file or "the user's own keys"
     raise AuthenticationError(
         f"'{name}' ({user}@{endpoint.host}) does not accept {where}" if tried else
@@ -238,21 +238,21 @@ def _keys(endpoint: Endpoint, name: str) -> Iterator[paramiko.PKey]:
     try:
         yield from paramiko.Agent().get_keys()
     except paramiko.SSHException:
-        pass  # an agent that doesn't speak to us is like none
+        pass  # ignore an agent that does not answer
     for own in OWN_KEYS:
         path = Path('~/.ssh', own).expanduser()
         if path.is_file():
             try:
                 yield load_key(path, name)
             except AuthenticationError:
-                continue  # one with a passphrase: the agent's part
+                continue  # a key with a passphrase must come from the agent
 
 
 def load_key(path: Path, name: str) -> paramiko.PKey:
     """
-    Return a private key.
+    Load a private key.
 
-    :raises AuthenticationError: it can't be read, or has a passphrase.
+    :raises AuthenticationError: the key cannot be read, or has a passphrase.
     """
     import paramiko
     if not os.access(path, os.R_OK):
@@ -265,7 +265,7 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
             raise AuthenticationError(f'the key {path} has a passphrase',
                                       f'ssh-add {path}') from error
         except (paramiko.SSHException, ValueError, IndexError):
-            continue  # of another type
+            continue  # another type of key
     raise AuthenticationError(f'{path} is no private key that SSH knows', 'check key=')
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's terminal on a machine: raw keys there, screen here, the window's size followed."""
+"""Connect the user's terminal to a program on a machine: raw keys, output, and window size."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from fogros2.shell import relay
 
 
 class Terminal(relay.Channel, Protocol):
-    """A program on a machine, which may have a terminal there."""
+    """A program on a machine, with or without a terminal."""
 
     def resize_pty(self, width: int, height: int, /) -> None:
-        """Take a new size."""
+        """Set a new size, in characters."""
 
 
 def size() -> Optional[tuple[int, int, str]]:
-    """Return rows, columns and kind of this process's terminal, None without one."""
+    """Return rows, columns and type of this process's terminal, None without a terminal."""
     if not (os.isatty(0) and os.isatty(1)):
         return None
     columns, rows = os.get_terminal_size(0)
-    # one that tells no size, as of a program that only plays one, gets the usual
+    # A terminal without a size, such as a simulated one, gets the usual size.
     return rows or 24, columns or 80, os.environ.get('TERM', 'dumb')
 
 
 def attach(channel: Terminal, *, keys: bool) -> int:
     """
-    Connect standard input and output with a program on a machine until it ends.
+    Connect standard input and output to a program on a machine until the program ends.
 
-    :param keys: whether both sides have a terminal; else bytes go as they are.
-    :return: its exit status; 255 if the connection was lost, as ssh has it.
+    :param keys: whether both sides have a terminal; otherwise bytes are relayed unchanged.
+    :return: exit status of the program; 255 if the connection was lost, as in ssh.
     """
     with contextlib.ExitStack() as undo:
         if keys:
@@ -48,9 +48,9 @@ def attach(channel: Terminal, *, keys: bool) -> int:
 
 @contextlib.contextmanager
 def _raw() -> Iterator[None]:
-    """Hand keys over as they are pressed, as long as the block runs."""
+    """Set the terminal to raw mode for the block, so that each key is sent at once."""
     before = termios.tcgetattr(0)
-    tty.setraw(0, termios.TCSADRAIN)  # what was typed ahead is kept
+    tty.setraw(0, termios.TCSADRAIN)  # keeps input that was typed ahead
     try:
         yield
     finally:
@@ -59,13 +59,13 @@ def _raw() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _following_size(channel: Terminal) -> Iterator[None]:
-    """Tell a terminal over there each new size of this one, as long as the block runs."""
+    """Send each new size of this terminal to the remote terminal during the block."""
     def resized(number: int, frame: Optional[FrameType]) -> None:
         columns, rows = os.get_terminal_size(0)
         channel.resize_pty(columns, rows)
 
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals reach the main thread alone
+        yield  # only the main thread can handle signals
         return
     before = signal.signal(signal.SIGWINCH, resized)
     try:
