@@ -120,7 +120,7 @@ class Entry:
 
     @property
     def monitor(self) -> str:
-        """The address of the Foxglove bridge for this robot, with its token; '' if none runs."""
+        """The Foxglove bridge's address for this robot, without its token; '' if none runs."""
         record = self.record
         if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
             return ''

@@ -127,7 +127,7 @@ def has_application(port: int, token: str) -> bool:
 
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:
-    """Return port and token of the bridge of a machine replaced by this robot, or None."""
+    """Return port and token of the bridge of a machine that this robot replaces, or None."""
     folder = monitor_addresses.on_robot(Store(), name)
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])

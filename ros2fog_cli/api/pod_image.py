@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build the image that saves pods the installation: it contains what a launch would install."""
+"""Build an image for pods that contains everything that a launch would install."""
 
 from __future__ import annotations
 

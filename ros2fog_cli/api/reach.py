@@ -266,7 +266,7 @@ def hush() -> None:
 
 def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
     """
-    Return the environment variables that let another terminal join a launch, None if it is over.
+    Return the variables to join a launch from another terminal, None if the launch is over.
 
     :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's.
     """
