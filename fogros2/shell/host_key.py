@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replace a machine's host key that travelled by a key that never left the machine."""
+"""Replace a host key that was sent to a machine by a key that never leaves the machine."""
 
 from __future__ import annotations
 
