@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run commands on this computer and wait for them; the only place that uses subprocess so."""
+"""Run commands on this computer and wait for them; only this module does so by subprocess."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class Record:
     :param created: when the creation was requested, in seconds since the epoch.
     :param armed: when its lifetime last restarted; a launch that reuses the machine restarts it.
     :param launch: id of the launch that uses the machine, '' for none.
-    :param last: id of the launch that used it last; its agent may not know that this one ended.
+    :param last: id of the launch that used it last; the agent may not know that launch's end.
     :param asked: the provider's options as requested; in ``spec`` all open choices ('cheapest',
         'nearest') are made. None in older records, where they are the same.
     :param pid: process of that launch; ``pid_start`` (clock ticks) and ``boot`` (id of the boot)

@@ -25,7 +25,7 @@ _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
 
 def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
     """Return whether an entity loads components."""
-    # compare names: importing the class takes longer than a launch without components should
+    # compare names: importing the class is slow, and most launches load no components
     return any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__)
 
 

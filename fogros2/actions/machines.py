@@ -47,6 +47,7 @@ class CloudInstance:
 
     :param ros_workspace: colcon workspace that is sent to the machine; None for the one whose
         install space comes first in COLCON_PREFIX_PATH (or AMENT_PREFIX_PATH), '' for none.
+        Its sourced underlays are sent too.
     :param working_dir_base: accepted for FogROS2's launch files; only :meth:`info` shows it. The
         records of machines are below FOGROS2_STATE_HOME.
     :param launch_foxglove: serve the machine's topics to Foxglove.

@@ -126,7 +126,7 @@ class KubeInstance(CloudInstance):
     """
     A pod of a Kubernetes cluster, created for the launch in the context's namespace.
 
-    :param container_image: needs Python 3.10 and ``sh``; with ROS 2, no installation is needed.
+    :param container_image: needs Python 3.10 or newer and ``sh``; ROS 2 in it saves time.
     :param zone: preferred zone of the pod.
     :param mcpu: CPU request and limit in thousandths of a CPU; 0 for none.
     :param mb: memory request and limit in MiB; 0 for none.

@@ -63,8 +63,8 @@ class FastDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
-    #: The middleware shares the nodes of each process (``ros_discovery_info``) at separate ports,
-    #: which are the same in every domain.
+    #: Ports at which each process receives the node lists of others (``ros_discovery_info``).
+    #: They are the same in every domain, because the middleware itself sets the port.
     ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
 
     def robot_interfaces(

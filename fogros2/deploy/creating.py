@@ -179,7 +179,7 @@ class Creation:
         try:
             under = job.launch.underlay(job.spec.workspaces)
         except PrerequisiteError:
-            return ''  # the step that needs it says so
+            return ''  # the step that needs ROS 2 raises the same error
         return bootstrap.dependencies(
             job.spec, under, [package for package, _ in job.launch.programs(job.name)])
 

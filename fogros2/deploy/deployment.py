@@ -130,7 +130,7 @@ class Deployment:
     def sync(
         self, shell: Shell, ros: bootstrap.RosInstall, installed: Future[bootstrap.RosInstall],
     ) -> None:
-        """Send the workspace; build it on the machine if needed, after the installation."""
+        """Send the workspaces; build them on the machine if needed, after the installation."""
         job = self.job
         if job.spec.workspace is None:
             return

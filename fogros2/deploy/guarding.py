@@ -113,7 +113,7 @@ class Guard:
                 timeout=job.timeouts.agent, cancel=job.cancel,
                 what=f"the agent of '{job.name}'")
             job.undo.callback(agent.close)
-            # a busy machine, whose nodes are heard meanwhile, has more time to answer
+            # a busy machine gets more time to answer, as long as it sends anything
             job.ask = lambda seconds: agent.request('ping', timeout=3 * seconds, silent=seconds)
             self.undo_nodes(agent)
             self._rearming = _Rearming(agent, job.launch.id, job.spec.robot_timeout / 4)

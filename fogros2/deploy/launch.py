@@ -229,7 +229,7 @@ class Launch:
 
     def underlay(self, workspaces: Sequence[str]) -> plan.Underlay:
         """
-        Return the robot's own ROS 2 as paths, and workspaces; the first need not be sourced.
+        Return the paths of the robot's ROS 2 and of workspaces; the first need not be sourced.
 
         :raises PrerequisiteError: the robot has no ROS 2.
         """

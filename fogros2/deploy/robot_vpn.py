@@ -66,8 +66,8 @@ class RobotVpn:
             if not self._up:
                 launch = self._launch
                 if self._stop.is_set():
-                    # a late thread that still updates a machine's peers: nobody would take the
-                    # interface down a second time
+                    # a thread that still updates a machine's peers may come late; nothing would
+                    # take the interface down a second time
                     raise Cancelled('the VPN interface')
                 with step(launch.report, '', 'VPN interface') as detail:
                     launch.undo.callback(launch.attempt, '', 'VPN interface', self._take_down)

@@ -59,10 +59,11 @@ def camera_info_topic(topic: str) -> str:
 
 def carries_info(stream: Stream) -> bool:
     """
-    Return whether camera info is streamed: by default only from the robot; an option decides else.
+    Return whether camera info is streamed: by default, only from the robot.
 
-    An annotated image that comes back is often a sibling of the camera's image. Its camera info
-    would have the camera's own name, and return to its source.
+    The stream's option ``camera_info`` overrides the default. An annotated image that comes back
+    is often a sibling of the camera's image. Its camera info would have the camera's own name,
+    and return to its source.
     """
     return bool(stream.options.get('camera_info', stream.source is None))
 

@@ -24,7 +24,7 @@ class StreamTopicEverywhere(Action):
     """
     Stream a topic between the robot and every machine of the launch.
 
-    Inside a node or a CloudGroup the stream belongs to that one only: it uses just ``entry``.
+    Inside a node or a CloudGroup the stream belongs to that one only, which reads ``entry``.
     """
 
     def __init__(self, entry: StreamTopic, **kwargs: Any) -> None:
