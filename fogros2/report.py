@@ -72,7 +72,16 @@ class ClockMeasured:
     warn: bool = False
 
 
-Event = Union[StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured]
+@dataclasses.dataclass(frozen=True)
+class Warned:
+    """Something may fail later that the launch does not end for; ``remedy`` is one line."""
+
+    machine: str
+    text: str
+    remedy: str
+
+
+Event = Union[StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured, Warned]
 Reporter = Callable[[Event], None]
 
 

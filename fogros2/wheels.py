@@ -127,6 +127,15 @@ def _collect(folder: Path) -> Wheels:
         dict(listed.values()))
 
 
+def names() -> list[str]:
+    """
+    Return the distributions that ``collect`` packs, without packing any.
+
+    :raises ConfigurationError: fogros2 isn't installed, it only lies on the path.
+    """
+    return [locked.name_of(distribution.name) for distribution in _closure()]
+
+
 def runs_on(needed: str, libc: str) -> bool:
     """Return whether a C library (such as ``glibc 2.36``) takes what needs at least another."""
     def parts(text: str) -> tuple[str, tuple[int, ...]]:

@@ -408,7 +408,7 @@ def _look_through(install: Path, root: Path, sources: Sequence[Path]) -> _Found:
             if entry.is_symlink():
                 reached.append(_target(entry.path))
             elif entry.name.endswith(('.egg-link', '.pth')):
-                reached.extend(_written_paths(Path(entry.path)))
+                reached.extend(written_paths(Path(entry.path)))
             elif '/lib/' in entry.path or '/bin/' in entry.path or _LIBRARY.search(entry.name):
                 _note_compiled(entry.path, compiled)
             if not python and '/site-packages/' in entry.path:
@@ -467,7 +467,7 @@ def _target(link: str) -> Path:
     return Path(os.path.normpath(os.path.join(os.path.dirname(link), os.readlink(link))))
 
 
-def _written_paths(file: Path) -> Iterator[Path]:
+def written_paths(file: Path) -> Iterator[Path]:
     """Yield the folders that a development install has written into a file instead of a link."""
     for line in file.read_text(errors='replace').splitlines():
         if line.startswith('/') and os.path.isdir(line):

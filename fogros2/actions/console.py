@@ -18,6 +18,7 @@ from fogros2.report import (
     StepDone,
     StepFailed,
     StepStarted,
+    Warned,
 )
 
 _WIDTH = 24
@@ -71,6 +72,8 @@ class Console:
                         'stamp matching between the two fail')
                 self._logger.warning(
                     f'{what}\nsynchronise both clocks: sudo apt-get install chrony')
+            elif isinstance(event, Warned):
+                self._logger.warning(f'{event.text}\n{event.remedy}')
             self._draw()
 
     def table(self) -> None:

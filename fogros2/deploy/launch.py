@@ -23,6 +23,7 @@ from fogros2 import (
     plugin_system,
     process,
     ros2_daemon,
+    undeclared,
     wheels,
     workspace,
 )
@@ -123,11 +124,17 @@ class Launch:
                 containers.check(containers.parse(line), self._rmw)
             if spec.containers or images.get(spec.name):
                 machines.check_containers(spec)
-            if spec.workspace is not None:
-                workspace.inspect(Path(spec.workspace))
+            chain = [workspace.inspect(path) for path in spec.workspaces]
             for package, executable in programs.get(spec.name, ()):
                 if not spec.options.get('image'):
                     plan.check_program(package, executable, prefixes, spec.workspace)
+            # a step that cannot do without reports what is wrong
+            with contextlib.suppress(FogError, OSError):
+                warned = undeclared.warning(
+                    spec, chain, {package for package, _ in programs.get(spec.name, ())},
+                    prefixes, machines.shown(spec))
+                if warned:
+                    self.report(warned)
         choosing = [spec for spec in specs if not self._may_be_kept(spec)]
         with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
             for choice in [pool.submit(self._choose, spec) for spec in choosing]:

@@ -126,6 +126,10 @@ class Provider(abc.ABC):
         """
         return ''
 
+    def shown(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the folders of this computer that a machine of a spec has too."""
+        return ()
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return what a machine of a resolved spec will cost (US dollars), None if unknown."""
         return None

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import json
 import os
@@ -131,6 +131,12 @@ class ContainerProvider(Provider):
             return os.uname().machine
         engine = container_engine.select(options.engine, options.image)
         return container_engine.architecture(engine, options.image) or os.uname().machine
+
+    def shown(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the system's folders and those of ROS 2, which take the place of an image."""
+        options = Options.parse(spec.options)
+        return () if options.image or options.isolated else (
+            *container_root.system_mounts(), *container_root.environment_mounts(*spec.workspaces))
 
     def check_containers(self, spec: MachineSpec) -> None:
         """Look whether the machine is to be made with the rights for it."""

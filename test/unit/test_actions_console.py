@@ -18,6 +18,7 @@ from fogros2.report import (
     StepDone,
     StepFailed,
     StepStarted,
+    Warned,
 )
 
 
@@ -107,3 +108,8 @@ def test_progress_on_a_terminal_only():
         assert ('2.0 kB' in stream.getvalue()) == drawn
         console.close()
         assert stream.getvalue() == '' or stream.getvalue().endswith('\r\x1b[K')
+
+
+def test_warning_has_its_remedy_on_a_line_of_its_own(lines):
+    Console(io.StringIO())(Warned('planner', 'it may lack x', "add pip=['x']"))
+    assert lines == [('WARNING', "it may lack x\nadd pip=['x']")]

@@ -22,7 +22,8 @@ LAYERS = [
     {'kubernetes_client'},
     {'store', 'journal', 'plan', 'host', 'provider', 'shell', 'vpn', 'dds', 'image_transport',
      'agent_client', 'agent', 'cloud_launch', 'monitor_addresses', 'workspace', 'wheels', 'locked',
-     'modules', 'dependencies', 'bootstrap', 'container_scripts', 'containers', 'ros2_daemon'},
+     'modules', 'dependencies', 'undeclared', 'bootstrap', 'container_scripts', 'containers',
+     'ros2_daemon'},
     {'deploy', 'testing'},
     {'actions'},
 ]

@@ -15,11 +15,12 @@ from fogros2.deploy import launch as launches
 from fogros2.deploy.creating import Creation
 from fogros2.deploy.job import Job
 from fogros2.deploy.robot_vpn import RobotVpn
-from fogros2.errors import NameTaken, ProviderError, WorkspaceError
+from fogros2.errors import ConfigurationError, NameTaken, ProviderError, WorkspaceError
 from fogros2.model import MachineSpec, VpnInterface
-from fogros2.report import StepDone, StepFailed, StepStarted
+from fogros2.report import StepDone, StepFailed, StepStarted, Warned
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider
+from rigs.pip_site import distribution, package
 
 SPEC = MachineSpec('planner', 'fake', {'size': 'cheapest'})
 PRICES = {'large': Decimal(2), 'small': Decimal('0.5')}
@@ -101,6 +102,31 @@ def test_compiled_workspace_is_refused_before_creation(launch, provider, tmp_pat
         launch.prepare([spec])
     assert asked == [{'size': 'small'}] * 2  # of the machine that was chosen
     assert 'create' not in provider.calls
+
+
+def test_undeclared_pip_packages_are_reported_before_creation(
+        launch, provider, events, tmp_path, monkeypatch):
+    distribution(tmp_path, 'fogt-one', 'fogt_one.py')
+    monkeypatch.syspath_prepend(tmp_path)
+    package(tmp_path / 'ws', 'rob_tools', 'import fogt_one')
+    launch.prepare([dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws'))])
+    (warned,) = [event for event in events if isinstance(event, Warned)]
+    assert (warned.machine, warned.remedy) == (
+        'planner', "add pip=['fogt-one'] to machine 'planner'")
+    assert 'create' not in provider.calls
+
+
+@pytest.mark.parametrize('error', [ConfigurationError('not installed'), PermissionError()])
+def test_launch_goes_on_where_packages_cannot_be_looked_at(
+        launch, provider, events, tmp_path, monkeypatch, error):
+    def names():
+        raise error
+
+    monkeypatch.setattr('fogros2.wheels.names', names)
+    package(tmp_path / 'ws', 'rob_tools')
+    launch.prepare([dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws'))])
+    assert not [event for event in events if isinstance(event, Warned)]
+    assert 'resolve' in provider.calls
 
 
 def test_several_choices_are_told_in_words(provider):
