@@ -224,7 +224,8 @@ def plan(
     if not can_build:
         raise WorkspaceError(
             f"{root} would have to be built on machine '{name}' ({reason}), which has no colcon",
-            'run colcon build here first')
+            'choose a machine with the processor, system and ROS 2 that it was built for, or one '
+            'with colcon and rosdep' if workspace.installed else 'run colcon build here first')
     return WorkspacePlan(
         root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)), workspace.linked_sources,
         tuple(_build(workspace, ros_setup)), setup, reason)
