@@ -293,7 +293,7 @@ def test_a_node_looks_at_its_parameters_first(node, asked, said):
 
 @pytest.mark.parametrize(('package', 'executable'), [
     (path.parts[-3], path.name) for path in sorted(ROOT.glob('*/scripts/*'))
-    if path.is_file() and path.parts[-3] != 'fogros2'])
+    if path.is_file() and path.parts[-3] != 'fogros2_monitor'])
 def test_a_node_is_interrupted_while_it_starts(package, executable, tmp_path):
     """As by another one's end: it has nothing to say, and nobody looks for a fault of its."""
     (tmp_path / 'rclpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
