@@ -139,10 +139,17 @@ class Job:
         return output
 
     def tidy(self, shell: Shell, commands: Iterable[Command]) -> None:
-        """Run commands on the machine on the way down, with short time-outs."""
+        """Run commands on the machine on the way down; each of them may run twice."""
         for command in commands:
+            seconds = self.patience(min(self.timeouts.vpn, SILENT))
             try:
-                shell.run(command, timeout=self.patience(min(self.timeouts.vpn, SILENT)))
+                try:
+                    shell.run(command, timeout=seconds)
+                except ConnectError:
+                    # the connection may break though the machine is there
+                    if not self._answers():
+                        raise
+                    shell.run(command, timeout=seconds)
             except (ConnectError, DeadlineExceeded):
                 self.hurry()
                 raise

@@ -482,6 +482,28 @@ def test_a_machine_with_a_network_that_overlaps_the_vpn_s_keeps_it(launch, provi
     assert fitted.host_routes and launch.store.machine('planner').load().vpn == fitted
 
 
+@pytest.mark.parametrize('there', [True, False])
+def test_connection_that_breaks_at_the_end_is_opened_again(launch, provider, there):
+    ran = []
+
+    def run(command, **_):
+        ran.append(command.argv[0])
+        if len(ran) == 1 or not there:
+            raise ConnectError('the connection was lost')
+
+    mine = Job(launch, SPEC)
+    mine.ask, mine.shell = lambda seconds: None, SimpleNamespace(run=run)
+    mine.patience(30.0)
+    mine.ask = None
+    if there:
+        mine.tidy(mine.shell, [Command(('remove',))])
+        assert ran == ['remove', 'true', 'remove']
+    else:
+        with pytest.raises(ConnectError):
+            mine.tidy(mine.shell, [Command(('remove',))])
+        assert ran == ['remove', 'true'] and mine.patience(30.0) < 30.0
+
+
 @pytest.mark.parametrize('where', ['describe', 'found', 'gone'])
 def test_a_watch_that_fails_says_so_and_is_a_fault_in_the_end(
         launch, provider, monkeypatch, where):
