@@ -52,7 +52,7 @@ test-minimum:
 	@PIP_CONSTRAINT=$(CURDIR)/packaging/noble.txt tools/setup.sh lint
 	@tools/run.sh embedded -- pytest test/unit test/contract test/launch ros2_embedded/test $(ARGS)
 
-## lint   ruff, mypy, and a check for phrases that are hard to read
+## lint   ruff, mypy, and a check for phrases and names of tests that are hard to read
 lint:
 	@tools/setup.sh lint
 	@tools/lint.sh

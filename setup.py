@@ -59,7 +59,7 @@ setup(
     python_requires='>=3.10',
     # folders with an __init__.py: a test compares them with plugin_system.OWN_PACKAGES
     packages=find_packages(),
-    package_data={'fogros2': ['locked.txt', 'py.typed'],
+    package_data={'fogros2': ['py.typed'], 'fogros2.host': ['locked.txt'],
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'paramiko', 'PyYAML'],
@@ -87,10 +87,10 @@ setup(
             'ssh = fogros2.provider.ssh:SSHProvider',
         ],
         'fogros2.machine': [
-            'aws = fogros2.actions.machines_cloud:AWSCloudInstance',
-            'container = fogros2.actions.machines:ContainerInstance',
-            'kubernetes = fogros2.actions.machines_cloud:KubeInstance',
-            'ssh = fogros2.actions.machines:SSHInstance',
+            'aws = fogros2.describe.machines_cloud:AWSCloudInstance',
+            'container = fogros2.describe.machines:ContainerInstance',
+            'kubernetes = fogros2.describe.machines_cloud:KubeInstance',
+            'ssh = fogros2.describe.machines:SSHInstance',
         ],
         'fogros2.configured': [
             'aws = fogros2.provider.aws.clients:configured',
@@ -123,7 +123,7 @@ setup(
             'theora = fogros2.image_transport.republish:Theora',
         ],
         'launch.frontend.launch_extension': [
-            'fogros2 = fogros2.actions.frontend',
+            'fogros2 = fogros2.actions.frontend.elements',
         ],
         'ros2doctor.checks': [
             'FogCheck = ros2fog_cli.ros2doctor:FogCheck',

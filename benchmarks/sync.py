@@ -58,7 +58,7 @@ def main() -> None:
             known = Path(top, 'known_hosts')
             known.write_text(f'{endpoint.host} {endpoint.host_key}\n')
             options = ['-o', f'UserKnownHostsFile={known}', '-i',
-                       str(launch.store.machine('bench-sync').key_file)]
+                       str(launch.store.key_file('bench-sync'))]
             target = f'{endpoint.user}@{endpoint.host}'
             for _ in range(RUNS):
                 machine.shell.run(Command(('rm', '-rf', 'new')), timeout=600)

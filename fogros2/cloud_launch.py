@@ -4,8 +4,8 @@ Run inside ``ros2 launch`` on the machine: turn the agent's NodeSpecs into launc
 
 The file imports only launch and the ament index, not fogros2: it works where only it and
 ``agent.py`` have been copied. It exchanges JSON lines with the agent over the socket whose number
-is in ``FOGROS2_AGENT_FD``. It receives ``start``, ``stop`` and ``signal``, and sends ``started``,
-``output``, ``exited`` and ``refused``. The end of the agent's stream shuts launch down in order.
+is in ``FOGROS2_AGENT_FD``. It receives ``start``, ``stop`` and ``signal``, and sends ``NodeEvent``
+of ``fogros2.events``. The end of the agent's stream shuts launch down in order.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import signal
 import socket
 import sys
 import tempfile
-from typing import Any, Optional, Union
+from typing import Any, Optional, TYPE_CHECKING, Union
 
 from ament_index_python.packages import (
     get_package_prefix,
@@ -38,6 +38,9 @@ from launch.events.process import (
     ShutdownProcess,
     SignalProcess,
 )
+
+if TYPE_CHECKING:
+    from fogros2.events import NodeEvent
 
 Json = dict[str, Any]
 #: Text with markers, as received: see ``fogros2.model.Text``.
@@ -145,7 +148,7 @@ class ObeyAgent(Action):
         for line in lines:
             message = json.loads(line)
             if message['command'] == 'start':
-                # variables that were configured after the start of this process
+                # an agent of the first version sends variables that were configured later
                 os.environ.update(message.get('environment', {}))
                 for spec in message['nodes']:
                     self._start(context, spec)
@@ -252,7 +255,8 @@ class ObeyAgent(Action):
         """Report the start of a process."""
         node.running = node.seen = True
         node.expected = False
-        self._report('started', node, pid=event.pid, cmd=list(event.cmd))
+        self._report({'event': 'started', 'node': node.id, 'name': node.name,
+                      'pid': event.pid, 'cmd': list(event.cmd)})
         self._let_go(node)
         waiting, node.waiting = node.waiting, []
         for name in waiting:
@@ -278,7 +282,8 @@ class ObeyAgent(Action):
         if respawns and node.retries_left > 0:
             node.retries_left -= 1
         node.expected = respawns
-        self._report('exited', node, returncode=event.returncode, respawns=respawns)
+        self._report({'event': 'exited', 'node': node.id, 'name': node.name,
+                      'returncode': event.returncode, 'respawns': respawns})
 
     def _executed(self, context: LaunchContext, node: Node) -> None:
         """Make sure that a process which launch fails to start is reported."""
@@ -302,14 +307,15 @@ class ObeyAgent(Action):
 
     def _output(self, node: Node, stream: str, text: str) -> None:
         for begin in range(0, len(text), CHUNK):
-            self._report('output', node, stream=stream, text=text[begin:begin + CHUNK])
+            self._report({'event': 'output', 'node': node.id, 'name': node.name,
+                          'stream': stream, 'text': text[begin:begin + CHUNK]})
 
     def _refuse(self, node: Node, error: str, hint: str = '') -> None:
-        self._report('refused', node, error=error, hint=hint)
+        self._report({'event': 'refused', 'node': node.id, 'name': node.name,
+                      'error': error, 'hint': hint})
 
-    def _report(self, event: str, node: Node, **data: Any) -> None:
-        line = json.dumps(
-            {'event': event, 'node': node.id, 'name': node.name, **data}, separators=(',', ':'))
+    def _report(self, event: NodeEvent) -> None:
+        line = json.dumps(event, separators=(',', ':'))
         try:
             self._connection.sendall(line.encode() + b'\n')
         except OSError:

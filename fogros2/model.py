@@ -8,7 +8,6 @@ import dataclasses
 from decimal import Decimal
 import enum
 import json
-import threading
 from typing import Any, Literal, Optional, Union
 
 OnExit = Literal['delete', 'stop', 'keep']
@@ -120,10 +119,10 @@ class Machine:
     :param robot_host: if ``vpn_host`` is '': address at which the machine reaches the robot's
         VPN port (UDP), from an option or from the provider.
     :param vpn_port: UDP port that leads to the machine's VPN port from outside; 0: the same port.
-    :param inner_network: name of the private network (a cluster, a VPC) to which ``inner_host``
+    :param private_network: name of the private network (a cluster, a VPC) to which ``private_ip``
         belongs; two machines of the same private network dial each other there.
-    :param inner_host: the machine's private IP in that network, '' for none.
-    :param place: region, context and namespace, or engine; for people.
+    :param private_ip: the machine's private IP in that network, '' for none.
+    :param region: region, context and namespace, or engine; for people.
     :param kind: the kind of machine, such as an instance type; for people.
     :param image: the image that it started from, '' if there is none or it is unknown.
     :param key: the provider's name of its login key, '' as for ``image``.
@@ -144,9 +143,9 @@ class Machine:
     vpn_host: str = ''
     vpn_port: int = 0
     robot_host: str = ''
-    inner_network: str = ''
-    inner_host: str = ''
-    place: str = ''
+    private_network: str = ''
+    private_ip: str = ''
+    region: str = ''
     kind: str = ''
     image: str = ''
     key: str = ''
@@ -171,7 +170,7 @@ class Image:
     id: str
     name: str
     provider: str
-    place: str = ''
+    region: str = ''
     created: Optional[float] = None
     size_gb: Optional[int] = None
     state: str = ''
@@ -189,13 +188,11 @@ class CreateRequest:
     :param tags: tags for every resource that the provider creates.
     :param vpn_port: UDP port to open.
     :param agent_config: the agent's first configuration, for providers that can start it at boot
-        (``agent_directory``); the provider adds ``user`` and the ``end_command``.
+        (``Capabilities.agent_directory``); the provider adds ``user`` and the ``end_command``.
     :param dependencies: hash of the dependencies that the machine needs, by which the provider
         finds a baked image; '' if unknown.
     :param application: container image of a web application that serves HTTP on port 8080, for
-        providers that run one beside the machine (``Provider.application_port``); '' for none.
-    :param cancel: set when the launch is ending. A long ``create``, such as one that downloads
-        an image, then raises Cancelled.
+        providers that run one beside the machine (``Capabilities.application_port``); '' for none.
     """
 
     token: str
@@ -205,7 +202,6 @@ class CreateRequest:
     agent_config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     dependencies: str = ''
     application: str = ''
-    cancel: Optional[threading.Event] = dataclasses.field(default=None, compare=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,7 +271,7 @@ class VpnInterface:
     :param network: the launch's subnet in CIDR form.
     :param port: UDP port on which it listens.
     :param key_file: path of the private key on this host (0600); the key never leaves the host.
-    :param guarded: admit only DDS and ping, and forward nothing (on the robot).
+    :param firewall: admit only DDS and ping, and forward nothing (on the robot).
     :param host_routes: route only the peers' addresses into the VPN, because a network of the
         host overlaps the launch's subnet.
     """
@@ -286,7 +282,7 @@ class VpnInterface:
     port: int
     key_file: str
     mtu: int = 1420
-    guarded: bool = False
+    firewall: bool = False
     host_routes: bool = False
 
 
@@ -316,6 +312,11 @@ class Stream:
     source: Optional[str] = None
     target: Optional[str] = None
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def host_port(host: str, port: int) -> str:
+    """Return ``host:port``, with an IPv6 address in brackets."""
+    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
 
 
 #: A piece of text, or {'share': package} or {'prefix': package}, resolved on the machine.

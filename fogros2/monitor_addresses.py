@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fogros2.model import host_port
 from fogros2.store import Store
 
 #: Port on which viewers expect a bridge.
@@ -17,7 +18,7 @@ IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
 CREDENTIALS = 'monitor-'
 
 
-def guarded_port(port: int) -> int:
+def gate_port(port: int) -> int:
     """Return the port at which others than the robot are let in, beside a bridge's own."""
     return port + 1
 
@@ -27,14 +28,9 @@ def application_port(port: int) -> int:
     return port + 2
 
 
-def place(host: str, port: int) -> str:
-    """Return ``host:port``, an IPv6 address in brackets."""
-    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
-
-
 def bridge(host: str, port: int) -> str:
     """Return a bridge's address without its token."""
-    return f'ws://{place(host, port)}'
+    return f'ws://{host_port(host, port)}'
 
 
 def folder_of(agent: str, port: int, launch: str) -> str:

@@ -12,9 +12,8 @@ from pathlib import Path
 import sys
 from typing import Any, Optional
 
-from fogros2 import workspace
-from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError, WorkspaceError
-from fogros2.model import Machine, MachineSpec, Peer, VpnInterface
+from fogros2.errors import ConfigurationError, DdsError, VpnError
+from fogros2.model import host_port, Machine, MachineSpec, Peer, VpnInterface
 
 #: Number of the first machine's address; .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
@@ -104,10 +103,10 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
 
 
 def robot_interface(launch_id: str, network: str, port: int, key_file: str) -> VpnInterface:
-    """Return the robot's VPN interface: guarded, with the first address."""
+    """Return the robot's VPN interface, which has a firewall and the first address."""
     return VpnInterface(
         name=f'fog{launch_id}', address=_host(network, 1), network=network, port=port,
-        key_file=key_file, guarded=True)
+        key_file=key_file, firewall=True)
 
 
 def machine_interface(
@@ -140,28 +139,23 @@ def machine_port(launch_id: str) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class Route:
     """
     A machine's peer data in the VPN, and the endpoints that lead to the machine.
 
     :param peer: as hosts outside see it; without endpoint if they cannot dial it.
-    :param inner_network: name of the private network of ``inner_endpoint``.
-    :param inner_endpoint: ``host:port`` for machines of the same private network.
+    :param private_network: name of the private network of ``private_endpoint``.
+    :param private_endpoint: ``host:port`` for machines of the same private network.
     :param robot_endpoint: ``host:port`` at which it dials the robot, None if the robot dials.
     """
 
     peer: Peer
-    inner_network: str = ''
-    inner_endpoint: Optional[str] = None
+    private_network: str = ''
+    private_endpoint: Optional[str] = None
     robot_endpoint: Optional[str] = None
 
 
-def endpoint(host: str, port: int) -> str:
-    """Return ``host:port``, with an IPv6 address in brackets."""
-    return f'[{host}]:{port}' if ':' in host else f'{host}:{port}'
-
-
-def place(machine: Machine, peer: Peer, port: int, robot_port: int) -> Place:
+def route(machine: Machine, peer: Peer, port: int, robot_port: int) -> Route:
     """
     Determine how a machine is reached, from its provider's report.
 
@@ -169,21 +163,22 @@ def place(machine: Machine, peer: Peer, port: int, robot_port: int) -> Place:
     :param port: UDP port of its VPN interface; ``robot_port`` is the robot's.
     :raises VpnError: neither the robot nor the machine can dial the other.
     """
-    outside = inner = robot = None
+    outside = private = robot = None
     if machine.vpn_host:
-        outside = endpoint(machine.vpn_host, machine.vpn_port or port)
+        outside = host_port(machine.vpn_host, machine.vpn_port or port)
     elif machine.robot_host:
-        robot = endpoint(machine.robot_host, robot_port)
+        robot = host_port(machine.robot_host, robot_port)
     else:
         raise VpnError(
             f"the robot has no way to '{machine.name}' for the VPN, nor it to the robot",
             'one of the two has to be reachable by UDP: see the options of its provider')
-    if machine.inner_network and machine.inner_host:
-        inner = endpoint(machine.inner_host, port)
-    return Place(dataclasses.replace(peer, endpoint=outside), machine.inner_network, inner, robot)
+    if machine.private_network and machine.private_ip:
+        private = host_port(machine.private_ip, port)
+    return Route(
+        dataclasses.replace(peer, endpoint=outside), machine.private_network, private, robot)
 
 
-def machine_peers(robot: Peer, own: Place, others: Iterable[Place]) -> list[Peer]:
+def machine_peers(robot: Peer, own: Route, others: Iterable[Route]) -> list[Peer]:
     """
     Return a machine's peers: the robot, then the other machines.
 
@@ -192,9 +187,9 @@ def machine_peers(robot: Peer, own: Place, others: Iterable[Place]) -> list[Peer
     machines that cannot be dialled from outside need such a network to reach each other.
     """
     return [dataclasses.replace(robot, endpoint=own.robot_endpoint), *(
-        dataclasses.replace(other.peer, endpoint=other.inner_endpoint)
-        if own.inner_network and own.inner_network == other.inner_network
-        and other.inner_endpoint is not None else other.peer
+        dataclasses.replace(other.peer, endpoint=other.private_endpoint)
+        if own.private_network and own.private_network == other.private_network
+        and other.private_endpoint is not None else other.peer
         for other in others)]
 
 
@@ -253,45 +248,6 @@ def underlay(
 
 def _below(path: str, roots: Iterable[str]) -> bool:
     return any(path == root or path.startswith(root.rstrip('/') + '/') for root in roots)
-
-
-def check_program(
-    package: str, executable: str, prefixes: Sequence[str], travelling: Optional[str] = None,
-) -> None:
-    """
-    Check that a node's program is in the ament index of the robot, or in the workspace to send.
-
-    :param prefixes: the robot's ament prefixes.
-    :param travelling: the workspace to send, which need not be sourced.
-    :raises WorkspaceError: no such package or executable; the hint names the nearest.
-    """
-    index = 'share/ament_index/resource_index/packages'
-    prefixes = [*workspace.prefixes(travelling), *prefixes]
-    for prefix in prefixes:
-        if not Path(prefix, index, package).exists():
-            continue
-        folder = Path(prefix, 'lib', package)
-        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-        if executable in names:
-            return
-        raise WorkspaceError(
-            f"package '{package}' has no executable '{executable}'",
-            _nearest(executable, names) or f'{folder} has none')
-    source = workspace.inspect(travelling).sources.get(package) if travelling else None
-    if source is not None:
-        raise WorkspaceError(f"package '{package}' in {source} is not built",
-                             f'run colcon build in {travelling}')
-    known = {
-        path.name for prefix in prefixes if Path(prefix, index).is_dir()
-        for path in Path(prefix, index).iterdir()}
-    raise WorkspaceError(
-        f"no package is called '{package}'",
-        _nearest(package, sorted(known)) or 'source the setup.bash of its workspace, or name that '
-        'workspace with ros_workspace=')
-
-
-def _nearest(name: str, names: Sequence[str]) -> str:
-    return did_you_mean(name, names, None if len(names) <= 8 else '', cutoff=0.75)
 
 
 def ament_prefixes(environment: Mapping[str, str]) -> list[str]:

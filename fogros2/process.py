@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import errno
 import os
 import shutil
@@ -187,21 +188,21 @@ def run(
     for thread in threads:
         thread.start()
     deadline = begin + timeout
-    while True:
-        left = deadline - time.monotonic()
-        try:
-            # without a cancel event, no polling is needed
-            child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
-            break
-        except subprocess.TimeoutExpired:
-            cancelled = cancel is not None and cancel.is_set()
-            if left > 0 and not cancelled:
-                continue
-            end(child, sudo=_through_sudo(command))
-            what = command.what or words[0]
-            if cancelled:
-                raise Cancelled(what) from None
-            raise DeadlineExceeded(f'{what} took longer than {timeout:g} s') from None
+    what = command.what or words[0]
+    try:
+        while True:
+            left = deadline - time.monotonic()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                # without a cancel event, no polling is needed
+                child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
+                break
+            if cancel is not None and cancel.is_set():
+                raise Cancelled(what)
+            if left <= 0:
+                raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
+    except BaseException:  # Ctrl-C too: the command must not outlive this call
+        end(child, sudo=_through_sudo(command))
+        raise
     for thread in threads:
         # a daemon that the command left may keep the pipe open
         thread.join(2.0)

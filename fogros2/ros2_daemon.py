@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A ``ros2`` whose daemon belongs to one launch, or to one shell.
+Write a program ``ros2`` with a separate daemon for one launch, or for one shell.
 
-``ros2 topic``, ``ros2 node`` and others ask a daemon, which the first of them starts. There is one
-for each ROS domain of a computer, and it keeps the DDS configuration of the terminal that started
-it. So a daemon that was there before a launch never sees the launch's machines. One that was
-started with the configuration of a launch fails for every terminal when the launch has ended. The
-program that this module writes runs ROS 2's own ``ros2`` with a daemon at another TCP port.
+``ros2 topic``, ``ros2 node`` and others use a daemon, which the first of them starts. Each ROS
+domain of a computer has one, with the DDS configuration of the terminal that started it. A daemon
+from before a launch never sees the launch's machines. A daemon with the configuration of a launch
+fails in every terminal after the launch has ended. The program of this module runs ROS 2's own
+``ros2`` with a daemon on another TCP port.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from fogros2.errors import DeadlineExceeded, PrerequisiteError
 from fogros2.store import write_private
 from fogros2.waiting import wait_until
 
-#: TCP ports above those that Linux gives to connections.
+#: TCP ports above Linux's range for outgoing connections.
 PORTS = range(61000, 65536)
-#: Seconds that a daemon may take to answer, and to end.
-PATIENCE = 5.0
-#: In a folder: the port of its daemon, and the folder of the program.
+#: Time-out of a daemon's answer and of its end, in seconds.
+TIMEOUT = 5.0
+#: Names in a folder: the file with the daemon's port, and the folder of the program.
 PORT_FILE, PROGRAMS = 'ros2-daemon', 'bin'
 
 _PROGRAM = '''#!{python}
@@ -43,9 +43,9 @@ sys.exit(main())
 
 def install(folder: Path, python: str) -> Path:
     """
-    Write the program ``ros2`` below a folder, unless it is there; return what belongs into PATH.
+    Write the program ``ros2`` below a folder, unless it exists; return the folder for PATH.
 
-    :param python: interpreter that finds ros2cli.
+    :param python: interpreter with ros2cli.
     :raises PrerequisiteError: no TCP port is free.
     """
     program = folder / PROGRAMS / 'ros2'
@@ -59,9 +59,9 @@ def install(folder: Path, python: str) -> Path:
 
 def stop(folder: Path) -> None:
     """
-    Stop the daemon of a folder's program, and wait for its end; do nothing where none runs.
+    Stop the daemon of a folder's program, and wait for its end; do nothing if none runs.
 
-    It is a ROS node. Where it uses a VPN interface it has to end before the interface.
+    The daemon is a ROS node, and must end before the VPN interface that it uses.
     """
     try:
         port = int((folder / PORT_FILE).read_text())
@@ -69,17 +69,17 @@ def stop(folder: Path) -> None:
         return
     if not _listens(port):
         return
-    # takes longer to load than most launches have use for
+    # Imported late, because these imports are slow and most launches do not need them.
     import http.client
     import xmlrpc.client
-    connection = http.client.HTTPConnection('127.0.0.1', port, timeout=PATIENCE)
+    connection = http.client.HTTPConnection('127.0.0.1', port, timeout=TIMEOUT)
     with contextlib.suppress(OSError, http.client.HTTPException, DeadlineExceeded), \
             contextlib.closing(connection):
         connection.request(
             'POST', '/ros2cli/', xmlrpc.client.dumps((), 'system.shutdown'),
             {'Content-Type': 'text/xml'})
         connection.getresponse().read()
-        wait_until(lambda: not _listens(port), timeout=PATIENCE, what='the daemon of ros2')
+        wait_until(lambda: not _listens(port), timeout=TIMEOUT, what='the daemon of ros2')
 
 
 def _free_port() -> int:
@@ -94,7 +94,7 @@ def _free_port() -> int:
 
 def _listens(port: int) -> bool:
     try:
-        socket.create_connection(('127.0.0.1', port), timeout=PATIENCE).close()
+        socket.create_connection(('127.0.0.1', port), timeout=TIMEOUT).close()
     except OSError:
         return False
     return True

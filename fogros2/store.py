@@ -81,6 +81,12 @@ def process_alive(pid: int, start: int, boot: str = '') -> bool:
     return bool(pid) and boot in ('', boot_id()) and process_start(pid) == start
 
 
+def this_process() -> dict[str, Any]:
+    """Return the fields of a record by which this process is recognised later."""
+    pid = os.getpid()
+    return {'pid': pid, 'pid_start': process_start(pid) or 0, 'boot': boot_id()}
+
+
 @dataclasses.dataclass(frozen=True)
 class Record:
     """
@@ -145,68 +151,81 @@ class Record:
         return self.spec.options if self.asked is None else self.asked
 
 
-class MachineDirectory:
-    """One machine's folder: its record, keys and lock."""
+class Store:
+    """
+    The state folder, with a folder for each machine and each launch.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.name = path.name
+    A machine's folder has its record and its keys. The lock on its name is beside the folder.
+    """
 
-    @property
-    def key_file(self) -> Path:
-        """Path of the private login key."""
-        return self.path / 'id_ed25519'
+    def __init__(self, root: Optional[Path] = None) -> None:
+        self.root = root or state_home()
 
-    def exists(self) -> bool:
-        """Return whether the machine has a record."""
-        return (self.path / 'record.json').exists()
+    def launch(self, launch_id: str) -> Path:
+        """Return a launch's folder (0700); create it if needed."""
+        return _make_folder(self.root / 'launches' / launch_id)
 
-    def load(self) -> Record:
+    def machine(self, name: str) -> Path:
+        """Return the path of a machine's folder, whether or not it exists."""
+        return self.root / 'machines' / check_name(name)
+
+    def key_file(self, name: str) -> Path:
+        """Return the path of a machine's private login key."""
+        return self.machine(name) / 'id_ed25519'
+
+    def exists(self, name: str) -> bool:
+        """Return whether a machine has a record."""
+        return (self.machine(name) / 'record.json').exists()
+
+    def load(self, name: str) -> Record:
         """
-        Read the record.
+        Read a machine's record.
 
         :raises StoreError: there is no record, or it is damaged.
         """
-        path = self.path / 'record.json'
+        path = self.machine(name) / 'record.json'
         try:
             return record_from_json(json.loads(path.read_text()))
         except FileNotFoundError:
-            raise StoreError(f"nothing is known of a machine '{self.name}' here",
+            raise StoreError(f"nothing is known of a machine '{name}' here",
                              'ros2 fog list shows the machines that exist') from None
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise StoreError(
                 f'{path} is damaged: {error}',
-                f'ros2 fog delete {self.name} finds the machine by its tags') from error
+                f'ros2 fog delete {name} finds the machine by its tags') from error
 
     def save(self, record: Record) -> Record:
-        """Replace the record on disk, and return it."""
-        write_private(self.path / 'record.json', model.to_json(record).encode())
+        """Replace a machine's record on disk, and return it."""
+        write_private(
+            self.machine(record.name) / 'record.json', model.to_json(record).encode())
         return record
 
+    def delete(self, name: str) -> None:
+        """Remove a machine's folder with its content."""
+        shutil.rmtree(self.machine(name), ignore_errors=True)
+
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, name: str) -> Iterator[None]:
         """
-        Lock the machine's name on this robot while a launch or a verb works on the machine.
+        Lock a machine's name on this robot while a launch or a verb works on the machine.
 
         :raises NameTaken: another process holds the lock.
         :raises StoreError: the disk is full, or the folder is not writable.
         """
         # beside the folder: deleting the folder must not release the lock early
-        path = self.path.with_name(f'.{self.name}.lock')
+        path = self.machine(name).with_name(f'.{name}.lock')
         _make_folder(path.parent)
         with contextlib.ExitStack() as undo:
             while True:
                 try:
                     handle = undo.enter_context(open(path, 'a'))
                 except OSError as error:
-                    raise StoreError(
-                        f"{path} can't be written: {error.strerror}",
-                        'FOGROS2_STATE_HOME names another folder for it') from error
+                    raise _not_written(path, error) from error
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     raise NameTaken(
-                        f"another launch on this robot has the machine '{self.name}'",
+                        f"another launch on this robot has the machine '{name}'",
                         'give the machine another name=, or end that launch') from None
                 # a former holder may have removed the file between open and lock
                 with contextlib.suppress(FileNotFoundError):
@@ -214,25 +233,6 @@ class MachineDirectory:
                         break
             undo.callback(path.unlink, missing_ok=True)
             yield
-
-    def delete(self) -> None:
-        """Remove the folder with its content."""
-        shutil.rmtree(self.path, ignore_errors=True)
-
-
-class Store:
-    """The state folder."""
-
-    def __init__(self, root: Optional[Path] = None) -> None:
-        self.root = root or state_home()
-
-    def machine(self, name: str) -> MachineDirectory:
-        """Return a machine's folder, whether or not it exists."""
-        return MachineDirectory(self.root / 'machines' / check_name(name))
-
-    def launch(self, launch_id: str) -> Path:
-        """Return a launch's folder (0700); create it if needed."""
-        return _make_folder(self.root / 'launches' / launch_id)
 
     def machines(self) -> list[Record]:
         """Return all records, sorted by name; a damaged one has ``damage``."""
@@ -242,8 +242,8 @@ class Store:
             if path.name.startswith('.') or not path.is_dir():
                 continue
             try:
-                records.append(MachineDirectory(path).load())
-            except StoreError as error:
+                records.append(self.load(path.name))
+            except (StoreError, ConfigurationError) as error:
                 spec = MachineSpec(path.name, '')
                 records.append(Record(path.name, '', spec, damage=str(error)))
         return records
@@ -252,7 +252,7 @@ class Store:
         """Remove the locks that killed launches left."""
         for path in (self.root / 'machines').glob('.*.lock'):
             with contextlib.suppress(NameTaken, ConfigurationError):
-                with self.machine(path.name[1:-len('.lock')]).lock():
+                with self.lock(path.name[1:-len('.lock')]):
                     pass
 
 
@@ -280,8 +280,7 @@ def write_private(path: Path, data: bytes) -> None:
             os.unlink(aside)
             raise
     except OSError as error:
-        raise StoreError(f"{path} can't be written: {error.strerror}",
-                         'FOGROS2_STATE_HOME names another folder for it') from error
+        raise _not_written(path, error) from error
 
 
 def _make_folder(path: Path) -> Path:
@@ -291,9 +290,13 @@ def _make_folder(path: Path) -> Path:
             if not folder.exists():
                 folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
-        raise StoreError(f"{path} can't be made: {error.strerror}",
-                         'FOGROS2_STATE_HOME names another folder for it') from error
+        raise _not_written(path, error) from error
     return path
+
+
+def _not_written(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"{path} can't be written: {error.strerror}",
+                      'FOGROS2_STATE_HOME names another folder for it')
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
@@ -307,5 +310,8 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
-            values[key] = kind(**values[key])
+            # older versions stored the firewall as 'guarded'
+            values[key] = kind(**{
+                'firewall' if name == 'guarded' else name: value
+                for name, value in values[key].items()})
     return Record(**values)

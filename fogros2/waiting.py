@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time-outs of a deployment, the only polling loop, and calls that a cancel abandons."""
+"""Time-outs of a deployment, the only polling loops, and calls that a cancel abandons."""
 
 from __future__ import annotations
 
@@ -66,6 +66,34 @@ def wait_until(
             raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
         cancel.wait(min(interval, left))
         interval = min(interval * 1.5, longest)
+
+
+class Periodic:
+    """
+    Call a function periodically in a thread, until ``close``.
+
+    :param interval: seconds between a call's end and the next call.
+    :param work: may return the seconds until its next call; it must not raise.
+    :param first: seconds before the first call; ``interval`` if None.
+    :param stop: event that ``close`` sets; it may be shared.
+    """
+
+    def __init__(
+        self, name: str, interval: float, work: Callable[[], Optional[float]], *,
+        first: Optional[float] = None, stop: Optional[threading.Event] = None,
+    ) -> None:
+        self._stop = stop or threading.Event()
+
+        def run() -> None:
+            pause = interval if first is None else first
+            while not self._stop.wait(pause):
+                pause = work() or interval
+
+        threading.Thread(target=run, name=name, daemon=True).start()
+
+    def close(self) -> None:
+        """Stop the calls; one that is under way goes on."""
+        self._stop.set()
 
 
 def cancellable(

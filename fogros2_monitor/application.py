@@ -11,25 +11,23 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 import contextlib
+import functools
 import signal
 import socket
 import sys
 import threading
 from typing import Optional
 
-from fogros2 import process
-from fogros2.errors import Cancelled, CommandError, FogError, PrerequisiteError
-from fogros2.model import Command
-from fogros2.provider import container_engine
+from fogros2.errors import Cancelled, FogError
+from fogros2.provider.container import engine as container_engine
 from fogros2.waiting import wait_until
 
 #: Port of the application inside the container.
 INSIDE = 8080
-#: Time-outs of an image download and of any other call of the engine, in seconds.
-PULL, CALL = 900.0, 60.0
+#: Time-out of an image download in seconds.
+PULL = 900.0
 #: Time-out of the container's start, until it listens, in seconds.
 READY = 30.0
-ENGINES = ('podman', 'docker')
 
 
 class Application:
@@ -46,7 +44,7 @@ class Application:
         self._ended = ended
         # A fixed name, so that a container that survived a crash is replaced.
         self._name = f'fogros2-application-{port}'
-        self._engine = next((name for name in ENGINES if process.which(name)), '')
+        self._engine: Optional[container_engine.Engine] = None
 
     def start(self) -> None:
         """
@@ -54,34 +52,24 @@ class Application:
 
         :raises FogError: the container cannot start.
         """
-        if not self._engine:
-            raise PrerequisiteError(
-                'neither podman nor docker is there', 'sudo apt-get install podman')
-        try:
-            self._call('image', 'inspect', self._image)
-        except CommandError:
+        engine = self._engine = container_engine.select('auto', self._image)
+        call = functools.partial(engine.call, what='run the web application', cancel=self._ended)
+        if call('image', 'inspect', self._image, check=False).returncode != 0:
             say(f'getting {self._image}')
-            self._call('pull', '-q', self._image, timeout=PULL)
+            call('pull', '-q', self._image, timeout=PULL)
         self.stop()
         # Lichtblick's server has this file capability, and does not start without it.
-        self._call('run', '-d', '--name', self._name, '--stop-timeout', '0',
-                   '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
-                   '--security-opt', 'no-new-privileges', *container_engine.limits(),
-                   '-p', f'127.0.0.1:{self._port}:{INSIDE}', self._image)
+        call('run', '-d', '--name', self._name, '--stop-timeout', '0',
+             '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
+             '--security-opt', 'no-new-privileges', *container_engine.limits(),
+             '-p', f'127.0.0.1:{self._port}:{INSIDE}', self._image)
         wait_until(self._listens, timeout=READY, cancel=self._ended,
                    what=f'{self._image} to listen on its port {INSIDE}')
 
     def stop(self) -> None:
         """Remove the container, if there is one."""
-        if self._engine:
-            process.run(self._command('rm', '-f', self._name), timeout=CALL, check=False)
-
-    def _command(self, *words: str) -> Command:
-        # As root, because the login user may not be in docker's group.
-        return Command((self._engine, *words), sudo=True, what='run the web application')
-
-    def _call(self, *words: str, timeout: float = CALL) -> None:
-        process.run(self._command(*words), timeout=timeout, cancel=self._ended)
+        if self._engine is not None:
+            self._engine.call('rm', '-f', self._name, what='stop the web application', check=False)
 
     def _listens(self) -> Optional[bool]:
         with contextlib.suppress(OSError), socket.create_connection(
@@ -116,10 +104,6 @@ def _start(application: Application, name: str) -> None:
         say(f'the web application is there: ros2 fog monitor {name}')
     except Cancelled:
         pass
-    except CommandError as error:
-        # The last line of the engine's error output has the cause.
-        said = error.result.stderr.strip().splitlines() or [str(error)]
-        say(f'no web application here: {said[-1]}')
     except FogError as error:
         say(f'no web application here: {error}')
 

@@ -126,7 +126,7 @@ class _Topic:
             data=bytes(message.data), format=message.format).encode())
 
 
-class BridgeNode(Node):
+class BridgeNode(Node, ServerListener):
     """
     The node that serves the topics of the graph.
 
@@ -147,63 +147,75 @@ class BridgeNode(Node):
         backlog = int(self.declare_parameter('backlog', BACKLOG).value)
         self._look()
         self._server = foxglove.start_server(
-            name=self.get_name(), host=address, port=port, server_listener=_Listener(self),
+            name=self.get_name(), host=address, port=port, server_listener=self,
             capabilities=[Capability.ClientPublish] if publish else [],
             supported_encodings=['cdr'], context=self.viewers, message_backlog_size=backlog)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
-
-    def do(self, action: Callable[..., None], *words: Any) -> None:
-        """Run ``action`` in the executor's thread; callable from any thread."""
-        self._work.create_task(functools.partial(action, *words))
 
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
         self._server.stop()
         super().destroy_node()
 
-    def look(self, channel: int, viewer: int) -> None:
+    # -- requests of viewers, from the SDK's threads --------------------------------------------
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """Start to send a topic to a viewer."""
-        topic = self._topic(channel)
-        if topic is not None:
-            topic.look(viewer)
+        self._with_topic(channel.id, lambda topic: topic.look(client.id))
 
-    def look_away(self, channel: int, viewer: int) -> None:
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         """Stop sending a topic to a viewer."""
-        topic = self._topic(channel)
-        if topic is not None:
-            topic.look_away(viewer)
+        self._with_topic(channel.id, lambda topic: topic.look_away(client.id))
 
-    def advertise(self, viewer: int, channel: int, topic: str, encoding: str, kind: str) -> None:
+    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
+        """Create a publisher for a viewer."""
+        self._work.create_task(functools.partial(
+            self._advertise, (client.id, channel.id), channel.topic, channel.encoding,
+            channel.schema_name))
+
+    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
+        """Destroy a viewer's publisher."""
+        self._with_publisher(client, client_channel_id, self._unadvertise)
+
+    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
+        """Publish a viewer's message."""
+        self._with_publisher(client, client_channel_id,
+                             lambda key: self._published[key].publish(data))
+
+    # -- in the executor's thread ---------------------------------------------------------------
+
+    def _with_topic(self, channel: int, action: Callable[[_Topic], None]) -> None:
+        def act() -> None:
+            for topic in self._topics.values():
+                if topic.id == channel:
+                    action(topic)
+                    break
+
+        self._work.create_task(act)
+
+    def _with_publisher(
+        self, client: Client, channel: int, action: Callable[[tuple[int, int]], None],
+    ) -> None:
+        key = client.id, channel
+        self._work.create_task(lambda: action(key) if key in self._published else None)
+
+    def _unadvertise(self, key: tuple[int, int]) -> None:
+        self.destroy_publisher(self._published.pop(key))
+
+    def _advertise(self, key: tuple[int, int], topic: str, encoding: str, kind: str) -> None:
         """Create a publisher for a viewer; report to all viewers if that is impossible."""
         if encoding != 'cdr':
             self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
         try:
-            publisher = self.create_publisher(message_class(kind), topic, 10)
+            self._published[key] = self.create_publisher(message_class(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
             self._refuse(f'{topic}: {error}')
-            return
-        self._published[viewer, channel] = publisher
-
-    def unadvertise(self, viewer: int, channel: int) -> None:
-        """Destroy a viewer's publisher."""
-        publisher = self._published.pop((viewer, channel), None)
-        if publisher is not None:
-            self.destroy_publisher(publisher)
-
-    def publish(self, viewer: int, channel: int, data: bytes) -> None:
-        """Publish a viewer's message."""
-        publisher = self._published.get((viewer, channel))
-        if publisher is not None:
-            publisher.publish(data)
 
     def _refuse(self, why: str) -> None:
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
-
-    def _topic(self, channel: int) -> Optional[_Topic]:
-        return next((topic for topic in self._topics.values() if topic.id == channel), None)
 
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
@@ -227,29 +239,6 @@ class BridgeNode(Node):
             except LookupError as error:
                 self._unknown.add(kind)
                 self.get_logger().warning(f'{name} is not shown: {error}')
-
-
-class _Listener(ServerListener):
-    """Pass the viewers' requests from the SDK's threads to the executor's thread."""
-
-    def __init__(self, node: BridgeNode) -> None:
-        self._node = node
-
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        self._node.do(self._node.look, channel.id, client.id)
-
-    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        self._node.do(self._node.look_away, channel.id, client.id)
-
-    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
-        self._node.do(self._node.advertise, client.id, channel.id, channel.topic,
-                      channel.encoding, channel.schema_name)
-
-    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
-        self._node.do(self._node.unadvertise, client.id, client_channel_id)
-
-    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
-        self._node.do(self._node.publish, client.id, client_channel_id, data)
 
 
 def fitting(node: Node, topic: str) -> QoSProfile:

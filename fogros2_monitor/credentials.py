@@ -8,7 +8,6 @@ The machine creates the token, the key and the certificate, so nobody sends them
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from pathlib import Path
 import secrets
@@ -24,26 +23,12 @@ DAYS = 365
 _SECONDS = 60.0
 
 
-@dataclasses.dataclass(frozen=True)
 class Credentials:
-    """Paths of the certificate, its key and the token."""
+    """Paths of the token, and of the certificate and its private key (PEM)."""
 
-    folder: Path
-
-    @property
-    def certificate(self) -> Path:
-        """Path of the certificate (PEM)."""
-        return self.folder / 'certificate.pem'
-
-    @property
-    def key(self) -> Path:
-        """Path of the private key (PEM)."""
-        return self.folder / 'key.pem'
-
-    @property
-    def token(self) -> Path:
-        """Path of the token."""
-        return self.folder / 'token'
+    def __init__(self, folder: Path) -> None:
+        self.token = folder / 'token'
+        self.certificate, self.key = folder / 'certificate.pem', folder / 'key.pem'
 
 
 def make_token(folder: Path) -> Credentials:

@@ -1,2 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transport images as H.264: ``codec`` without ROS, and the nodes ``encoder`` and ``decoder``."""
+"""
+Transport images as H.264, by a codec without ROS and two nodes.
+
+``annexb`` parses H.264 streams, ``picture`` describes images. ``deep`` codes deep images,
+``codec`` all others, ``stills`` JPEG and PNG. ``worker`` runs work in a thread. ``pacing`` limits
+images in flight, ``rate`` estimates a link, ``control`` adapts the encoder to all links,
+``repair`` corrects losses, ``turns`` lets nodes send in turn, ``memory`` keeps freed memory.
+``acknowledgement`` waits for readers. ``message`` converts ROS messages, ``lazy`` is the base of
+both nodes. ``receivers`` and ``senders`` do their work by codec, for the nodes ``decoder`` and
+``encoder``.
+"""

@@ -17,10 +17,14 @@ from typing import Optional
 import zlib
 
 START_CODE = b'\x00\x00\x00\x01'
-SLICE, IDR, SEI, SPS, PPS, DELIMITER = 1, 5, 6, 7, 8, 9
+SLICE, PARTITION, IDR, SEI, SPS, PPS, DELIMITER = 1, 2, 5, 6, 7, 8, 9
 #: UUID of our user data, created once at random.
 UUID = bytes.fromhex('5f0b6e0c8d3a4e6fb1c27a94d0e35812')
 VERSION = 1
+#: Bytes of the longest sequence parameter set that is parsed, up to its sizes.
+LONGEST_SPS = 4096
+#: Profiles whose sequence parameter sets state chroma format and bit depth.
+_HIGH = (44, 83, 86, 100, 110, 118, 122, 128, 138, 144, 244)
 
 #: version, flags, stream, sequence, width, height, step, checksum, lengths of encoding and alpha
 _HEADER = struct.Struct('>BBIIIIIIBI')
@@ -139,9 +143,109 @@ def units(packet: bytes) -> Iterator[tuple[int, int]]:
             yield begin, end
 
 
+def parameter_sets(packet: bytes) -> Iterator[Sps]:
+    """
+    Yield the sizes in the packet's sequence parameter sets.
+
+    FFmpeg reads a set that makes no sense once more with its emulation prevention bytes, so such a
+    set has two meanings.
+
+    :raises ValueError: a set is cut or invalid.
+    """
+    for begin, end in units(packet):
+        if packet[begin] & 31 == SPS:
+            unit = packet[begin:end]
+            for body in {unit, unit.replace(b'\x00\x00\x03', b'\x00\x00')}:
+                yield Sps.parse(body)
+
+
+def pictures(packet: bytes) -> int:
+    """Return the number of fields or frames: slices that begin with the first macroblock."""
+    return sum(packet[begin] & 31 in (SLICE, PARTITION, IDR) and packet[begin + 1:end] >= b'\x80'
+               for begin, end in units(packet))
+
+
 def kinds(packet: bytes) -> list[int]:
     """Return the types of the packet's NAL units."""
     return [packet[begin] & 31 for begin, _ in units(packet)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sps:
+    """
+    Sizes in a sequence parameter set (7.3.2.1.1).
+
+    :param references: frames that the decoder keeps beside the current one.
+    :param sample_bytes: bytes per pixel of all planes.
+    """
+
+    width: int
+    height: int
+    references: int
+    sample_bytes: float
+
+    @classmethod
+    def parse(cls, unit: bytes) -> Sps:
+        """
+        Parse a NAL unit without emulation prevention.
+
+        :raises ValueError: the unit is cut or invalid.
+        """
+        bits = _Bits(unit[1:LONGEST_SPS])
+        profile, _, _ = bits.fixed(8), bits.fixed(16), bits.golomb()
+        chroma, deep = 1, False
+        if profile in _HIGH:
+            chroma = bits.golomb()
+            bits.fixed(chroma == 3)
+            deep = bits.golomb() + bits.golomb() > 0
+            bits.fixed(1)
+            if bits.fixed(1):
+                for index in range(12 if chroma == 3 else 8):
+                    if bits.fixed(1):
+                        bits.skip_scaling_list(16 if index < 6 else 64)
+        bits.golomb()
+        order = bits.golomb()
+        if order == 0:
+            bits.golomb()
+        elif order == 1:
+            bits.fixed(1), bits.golomb(), bits.golomb()
+            for _ in range(bits.golomb()):
+                bits.golomb()
+        references = bits.golomb()
+        bits.fixed(1)
+        width, height = 16 * (bits.golomb() + 1), 16 * (bits.golomb() + 1)
+        return cls(width, height * (2 - bits.fixed(1)), references,
+                   {2: 2.0, 3: 3.0}.get(chroma, 1.5) * (1 + deep))
+
+
+class _Bits:
+    """Read the bits of a parameter set; a ValueError ends a cut one."""
+
+    def __init__(self, data: bytes) -> None:
+        self._bits, self._at = ''.join(f'{byte:08b}' for byte in data), 0
+
+    def fixed(self, count: int) -> int:
+        """Read u(count)."""
+        self._at += count
+        if self._at > len(self._bits):
+            raise ValueError('a parameter set that was cut')
+        return int('0' + self._bits[self._at - count:self._at], 2)
+
+    def golomb(self) -> int:
+        """Read ue(v), or se(v) as the number of its code."""
+        zeros = self._bits.index('1', self._at) - self._at
+        if zeros > 32:
+            raise ValueError('a number that is too large')
+        return self.fixed(2 * zeros + 1) - 1
+
+    def skip_scaling_list(self, size: int) -> None:
+        """Read scaling_list() (7.3.2.1.1.1)."""
+        scale = 8
+        for _ in range(size):
+            code = self.golomb()
+            scale = (scale + (-(code // 2) if code % 2 == 0 else (code + 1) // 2)) % 256
+            if scale == 0:
+                return
 
 
 def _sei(payload: bytes) -> bytes:

@@ -32,10 +32,11 @@ from image_transport_h264.deep import DeepDecoder, DeepEncoder, lines, MAGIC, sp
 from image_transport_h264.picture import (
     BadPicture,
     Buffer,
+    check_size,
     CodecError,
-    LARGEST_SIDE,
     Layout,
     LAYOUTS,
+    MAX_PIXELS,
     Picture,
     Pixels,
 )
@@ -135,7 +136,8 @@ class Encoder:
     """Encode pictures of one topic; size and encoding may change between pictures."""
 
     def __init__(self, settings: Optional[Settings] = None) -> None:
-        self._settings = settings or Settings()
+        #: A change takes effect with the next picture, as a keyframe.
+        self.settings = settings or Settings()
         self._codec: Optional[VideoCodecContext] = None
         self._opened: object = None
         self._coding = Coding('', '', False)
@@ -143,15 +145,6 @@ class Encoder:
         self._stream = secrets.randbits(32)
         self._sequence = 0
         self._pts = -1
-
-    @property
-    def settings(self) -> Settings:
-        """The settings; a change takes effect with the next picture, as a keyframe."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: Settings) -> None:
-        self._settings = settings
 
     def encode(
         self, picture: Picture, *, key: bool = False, seconds: Optional[float] = None,
@@ -184,7 +177,7 @@ class Encoder:
     def _encode(
         self, picture: Picture, layout: Layout, key: bool, seconds: Optional[float],
     ) -> tuple[bytes, bool]:
-        settings = self._settings
+        settings = self.settings
         wanted = (picture.width, picture.height, picture.encoding, settings)
         if self._codec is None or self._opened != wanted:
             self._coding = _coding(layout, settings)
@@ -215,20 +208,20 @@ class Decoder:
     :param show_damage: continue after losses and damage, with smears in the pictures, instead of
         waiting for the next keyframe.
     :param encoding: encoding of pictures whose packets have no tag, from other encoders.
+    :param max_pixels: larger pictures are refused before they take memory.
     """
 
-    def __init__(self, *, show_damage: bool = False, encoding: str = 'bgr8') -> None:
+    def __init__(
+        self, *, show_damage: bool = False, encoding: str = 'bgr8', max_pixels: int = MAX_PIXELS,
+    ) -> None:
         self.show_damage = show_damage
         self.encoding = encoding
+        self.max_pixels = max_pixels
         self._codec: Optional[VideoCodecContext] = None
         self._deep = DeepDecoder()
         self._last: Optional[Tag] = None
-        self._needs_key = True
-
-    @property
-    def needs_key(self) -> bool:
-        """Whether decoding needs a keyframe first."""
-        return self._needs_key
+        #: Whether decoding needs a keyframe first.
+        self.needs_key = True
 
     def decode(self, data: Buffer) -> Optional[Picture]:
         """
@@ -243,7 +236,7 @@ class Decoder:
                 return self._decode_deep(packet)
             return self._decode(packet)
         except Damaged:
-            self._needs_key = True
+            self.needs_key = True
             raise
 
     def _decode_deep(self, packet: bytes) -> Optional[Picture]:
@@ -251,10 +244,10 @@ class Decoder:
             tag, _, _ = split(packet)
             if self._is_old(tag):
                 return None
-            tag, picture = self._deep.decode(packet)
+            tag, picture = self._deep.decode(packet, self.max_pixels)
         except CodecError as error:
             raise Damaged(str(error), error.cause) from error
-        self._last, self._needs_key, self._codec = tag, False, None
+        self._last, self.needs_key, self._codec = tag, False, None
         return picture
 
     def _decode(self, packet: bytes) -> Optional[Picture]:
@@ -270,7 +263,8 @@ class Decoder:
             key = tag.key
         if not key and not self.show_damage:
             self._check_order(tag)
-        if key and (self._needs_key or self._codec is None
+        self._check_sizes(coded)
+        if key and (self.needs_key or self._codec is None
                     or (tag is not None and not _same_picture(tag, self._last))):
             self._codec = None  # a new codec: no reference to an older stream or another size
         if self._codec is None:
@@ -284,8 +278,19 @@ class Decoder:
             self._codec = None
             raise Damaged(f'{len(frames)} whole pictures in a packet', 'damage')
         picture = self._picture(frames[0], tag)
-        self._last, self._needs_key = tag, False
+        self._last, self.needs_key = tag, False
         return picture
+
+    def _check_sizes(self, coded: bytes) -> None:
+        try:
+            for sps in annexb.parameter_sets(coded):
+                # the references, the current frame, and one that waits for its conversion
+                check_size(max(1, sps.width - 15), max(1, sps.height - 31), self.max_pixels,
+                           sps.sample_bytes * (sps.references + 2))
+        except ValueError as error:
+            raise Damaged(f'H.264: {error}', getattr(error, 'cause', 'damage')) from error
+        if annexb.pictures(coded) > 2:  # the two fields of a frame
+            raise Damaged('several pictures in a packet', 'damage')
 
     def _check_order(self, tag: Optional[Tag]) -> None:
         """
@@ -296,17 +301,17 @@ class Decoder:
         last = self._last
         if tag is None or last is None or self._codec is None:
             # Without tags, only errors of the decoder reveal a loss.
-            if self._needs_key or self._codec is None or tag is not last:
-                self._needs_key = True
+            if self.needs_key or self._codec is None or tag is not last:
+                self.needs_key = True
                 raise Missing('waiting for a key', 'waiting')
         elif not _follows(tag, last):
             gap = (tag.sequence - last.sequence) & 0xffffffff
-            waiting, self._needs_key = self._needs_key, True
+            waiting, self.needs_key = self.needs_key, True
             raise Missing(f'{gap - 1} packets missing', 'waiting' if waiting else 'loss')
 
     def _is_old(self, tag: Tag) -> bool:
         last = self._last
-        if last is None or tag.stream != last.stream or self._needs_key and tag.key:
+        if last is None or tag.stream != last.stream or self.needs_key and tag.key:
             return False
         return (tag.sequence - last.sequence - 1) & 0xffffffff >= 0x80000000
 
@@ -324,10 +329,10 @@ class Decoder:
             row = width * layout.pixel_bytes
             # The encoder pads by at most one pixel, to make a side even.
             if not (0 <= frame.width - width <= 1 and 0 <= frame.height - height <= 1
-                    and 0 < width <= LARGEST_SIDE and row <= step <= 2 ** 20):
+                    and 0 < width and row <= step and step * height <= 4 * self.max_pixels):
                 self._codec = None
                 raise Damaged(f'a picture of {frame.width}x{frame.height}, where its tag says '
-                              f'{width}x{height}', 'damage')
+                              f'{width}x{height} in rows of {step} bytes', 'damage')
         data = _pixels(frame, layout, width, height, step)
         if tag is not None and layout.alpha:
             _put_alpha(numpy.frombuffer(data, numpy.uint8).reshape(height, step), tag)
@@ -521,8 +526,7 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
     """Convert a picture to a frame for the encoder."""
     rows = picture.rows()
     if layout.alpha and coding.codec == 'libx264rgb':
-        pixels = rows.reshape(picture.height, picture.width, 4) if rows.flags.c_contiguous else (
-            numpy.ascontiguousarray(rows).reshape(picture.height, picture.width, 4))
+        pixels = numpy.ascontiguousarray(rows).reshape(picture.height, picture.width, 4)
         opaque = pixels[:, :, :3].copy()
         return VideoFrame.from_numpy_buffer(opaque, coding.av_format)
     rows = _padded(rows, layout, coding.even)

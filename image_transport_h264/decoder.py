@@ -9,15 +9,11 @@ The node publishes ``image`` (remap it) from ``<image>/h264``, or from the topic
 from __future__ import annotations
 
 import functools
-import signal
 from typing import Optional
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
-from image_transport_h264 import memory
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.receivers import make_receiver
 
@@ -51,17 +47,4 @@ class DecoderNode(LazyNode):
 
 def main() -> None:
     """Run the node until a signal."""
-    memory.keep()
-    rclpy.init()
-    node = DecoderNode()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy shuts down already, in its own thread; do not do it twice
-    finally:
-        # A second Ctrl-C must not interrupt the clean-up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        failed = node.failed
-        node.destroy_node()
-    if failed:
-        raise SystemExit(1)
+    run(DecoderNode)

@@ -25,11 +25,20 @@ import numpy
 from numpy.typing import NDArray
 
 from image_transport_h264.annexb import Tag
-from image_transport_h264.picture import CodecError, LARGEST_SIDE, LAYOUTS, Picture, Pixels
+from image_transport_h264.picture import (
+    check_size,
+    CodecError,
+    LAYOUTS,
+    MAX_PIXELS,
+    Picture,
+    Pixels,
+)
 
 MAGIC = b'FFV1tag1'
 #: Minimum width, because FFV1 refuses a picture of one column and two rows.
 NARROWEST = 2
+#: Largest number of slices beside and below each other that is decoded; the encoder makes 2.
+SLICES = 4
 _LENGTHS = struct.Struct('>HHI')
 
 
@@ -48,7 +57,7 @@ class DeepEncoder:
             self._codec, self._size = _open(width, height), (width, height)
         # The pixels have 16 bits in any case: no conversion, and one copy into the frame.
         frame = VideoFrame(width, height, 'gray16le')
-        _fill(frame, high_low)
+        lines(frame)[:height, :2 * high_low.shape[1]] = high_low.view(numpy.uint8)
         coded = b''.join(bytes(packet) for packet in self._codec.encode(frame))
         extra = bytes(self._codec.extradata or b'')
         packed = dataclasses.replace(tag, key=True, checksum=zlib.crc32(extra + coded)).pack()
@@ -63,28 +72,27 @@ class DeepDecoder:
         self._codec: Optional[VideoCodecContext] = None
         self._extra = b''
 
-    def decode(self, packet: bytes) -> tuple[Tag, Picture]:
+    def decode(self, packet: bytes, max_pixels: int = MAX_PIXELS) -> tuple[Tag, Picture]:
         """
         Decode a packet to its tag and picture.
 
-        :raises CodecError: the packet is damaged.
+        :raises CodecError: the packet is damaged, or its picture is larger than ``max_pixels``.
         """
         tag, extra, coded = split(packet)
         layout = LAYOUTS.get(tag.encoding)
         if layout is None or layout.kind != 'deep':
             raise CodecError(f"a packet of encoding '{tag.encoding}'", 'damage')
-        if not (0 < tag.width <= LARGEST_SIDE and 0 < tag.height <= LARGEST_SIDE
-                and tag.width * layout.pixel_bytes <= tag.step <= 2 ** 20):
+        check_size(tag.width, tag.height, max_pixels)
+        if not (tag.width * layout.pixel_bytes <= tag.step
+                and tag.step * tag.height <= 4 * max_pixels):
             raise CodecError('a packet with a size that no image has', 'damage')
         halves = layout.pixel_bytes // 2
-        if self._codec is None or self._extra != extra:
-            codec = CodecContext.create('ffv1', 'r')
-            assert isinstance(codec, VideoCodecContext)
-            codec.extradata = extra
-            codec.width, codec.height = max(NARROWEST, tag.width), tag.height * halves
-            codec.thread_type, codec.thread_count = 'SLICE', 2
-            self._codec, self._extra = codec, extra
         try:
+            if self._codec is None or self._extra != extra:
+                # FFmpeg refuses more slices than pixels; each slice may take 4 MB of contexts.
+                _decoder(extra, SLICES, SLICES).open()
+                self._codec = _decoder(extra, max(NARROWEST, tag.width), tag.height * halves)
+                self._extra = extra
             frames = self._codec.decode(av.Packet(coded))
         except (FFmpegError, ValueError) as error:
             self._codec = None
@@ -123,6 +131,15 @@ def lines(frame: VideoFrame, plane: int = 0) -> Pixels:
     return flat.reshape(-1, memory.line_size)
 
 
+def _decoder(extra: bytes, width: int, height: int) -> VideoCodecContext:
+    codec = CodecContext.create('ffv1', 'r')
+    assert isinstance(codec, VideoCodecContext)
+    codec.extradata = extra
+    codec.width, codec.height = width, height
+    codec.thread_type, codec.thread_count = 'SLICE', 2
+    return codec
+
+
 def _open(width: int, height: int) -> VideoCodecContext:
     codec = CodecContext.create('ffv1', 'w')
     assert isinstance(codec, VideoCodecContext)
@@ -143,31 +160,21 @@ def _planes(picture: Picture) -> NDArray[numpy.uint16]:
     size = picture.layout.pixel_bytes
     rows = picture.rows()
     if size == 2:
-        return _contiguous(rows).view(f'{order}u2').astype('<u2', copy=False)
-    bits = _contiguous(rows).view(f'{order}u4')
+        return numpy.ascontiguousarray(rows).view(f'{order}u2').astype('<u2', copy=False)
+    bits = numpy.ascontiguousarray(rows).view(f'{order}u4')
     planes = numpy.empty((2 * picture.height, picture.width), '<u2')
     planes[:picture.height] = bits >> 16
     planes[picture.height:] = bits & 0xffff
     return planes
 
 
-def _contiguous(rows: Pixels) -> Pixels:
-    return rows if rows.flags.c_contiguous else numpy.ascontiguousarray(rows)
-
-
-def _fill(frame: VideoFrame, pixels: NDArray[numpy.uint16]) -> None:
-    lines(frame)[:pixels.shape[0], :2 * pixels.shape[1]] = pixels.view(numpy.uint8)
-
-
 def _picture(frame: VideoFrame, tag: Tag, halves: int) -> Picture:
     pixels = lines(frame)[:frame.height, :2 * tag.width].view('<u2')
-    order = '>' if tag.is_bigendian else '<'
     out = numpy.zeros((tag.height, tag.step), numpy.uint8)
-    row = out[:, :tag.width * 2 * halves]
-    if halves == 1:
-        row[:] = pixels.astype(f'{order}u2').view(numpy.uint8)
-    else:
-        bits = pixels[:tag.height].astype(numpy.uint32) << 16 | pixels[tag.height:]
-        row[:] = bits.astype(f'{order}u4').view(numpy.uint8)
+    row = out[:, :tag.width * 2 * halves].view('>u2' if tag.is_bigendian else '<u2')
+    for half in range(halves):
+        # The high halves are above the low ones; in a number, the byte order says which is first.
+        at = half if tag.is_bigendian else halves - 1 - half
+        row[:, at::halves] = pixels[half * tag.height:(half + 1) * tag.height]
     return Picture(tag.width, tag.height, tag.encoding, tag.step, out.data.cast('B'),
                    tag.is_bigendian)

@@ -10,15 +10,11 @@ the name of ``image`` in log messages.
 from __future__ import annotations
 
 import difflib
-import signal
 from typing import Optional
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import CameraInfo, Image
 
-from image_transport_h264 import memory
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, Tap
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
 from image_transport_h264.worker import Worker
@@ -71,17 +67,4 @@ class EncoderNode(LazyNode):
 
 def main() -> None:
     """Run the node until a signal."""
-    memory.keep()
-    rclpy.init()
-    node = EncoderNode()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy shuts down already, in its own thread; do not do it twice
-    finally:
-        # A second Ctrl-C must not interrupt the clean-up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        failed = node.failed
-        node.destroy_node()
-    if failed:
-        raise SystemExit(1)
+    run(EncoderNode)

@@ -4,39 +4,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import signal
 import threading
 from typing import Any, Optional
 
 import rclpy
-from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+from image_transport_h264 import memory
+from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.turns import Turns
 
-#: Packets of a stream; reliable for recorders and other subscribers that ask for it.
-STREAM_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
-#: Images: the newest ones.
-IMAGE_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=2, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
-#: Messages that are useless if they are late.
-FEEDBACK_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE)
-#: Pieces of packets: useless if they are late.
-PIECES_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE)
-REQUEST_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
 
+def _qos(
+    depth: int, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability,
+                      durability=DurabilityPolicy.VOLATILE)
+
+
+#: Packets of a stream; reliable for recorders and other subscribers that ask for it.
+STREAM_QOS = _qos(8)
+#: Images: the newest ones.
+IMAGE_QOS = _qos(2)
+#: Messages that are useless if they are late: acknowledgements, and pieces of packets.
+FEEDBACK_QOS = _qos(8, ReliabilityPolicy.BEST_EFFORT)
+PIECES_QOS = _qos(128, ReliabilityPolicy.BEST_EFFORT)
+REQUEST_QOS = _qos(1)
 
 #: Time-out of a message's acknowledgement in seconds; a reader that hangs delays the others.
 LONGEST = 2.0
@@ -44,9 +43,25 @@ LONGEST = 2.0
 
 def best_effort(qos: QoSProfile) -> QoSProfile:
     """Return the profile with best-effort reliability."""
-    return QoSProfile(
-        history=qos.history, depth=qos.depth, durability=qos.durability,
-        reliability=ReliabilityPolicy.BEST_EFFORT)
+    return _qos(qos.depth, ReliabilityPolicy.BEST_EFFORT)
+
+
+def run(kind: Callable[[], LazyNode]) -> None:
+    """Run a node until a signal; exit with status 1 if its worker failed."""
+    memory.keep()
+    rclpy.init()
+    node = kind()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # rclpy shuts down already, in its own thread; do not do it twice
+    finally:
+        # A second Ctrl-C must not interrupt the clean-up.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        failed = node.failed
+        node.destroy_node()
+    if failed:
+        raise SystemExit(1)
 
 
 class LazyNode(Node):
@@ -92,8 +107,8 @@ class LazyNode(Node):
     def all_acknowledged(self, publisher: Publisher) -> bool:
         """Wait until reliable readers have all messages; return False after a time-out."""
         try:
-            return bool(publisher.wait_for_all_acked(Duration(seconds=LONGEST)))
-        except RuntimeError:  # RCLError of rclpy
+            return wait_for_all_acked(publisher, LONGEST)
+        except RuntimeError:
             if rclpy.ok(context=self.context):
                 raise
             return False  # the node is shutting down

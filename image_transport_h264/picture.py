@@ -16,6 +16,8 @@ Kind = Literal['rgb', 'grey', 'yuv422', 'deep']
 
 #: Maximum side in pixels, larger than any camera's; a larger value means a damaged header.
 LARGEST_SIDE = 16384
+#: Pixels of the largest picture that a receiver decodes by default.
+MAX_PIXELS = 4096 * 4096
 
 
 class CodecError(ValueError):
@@ -32,6 +34,20 @@ class CodecError(ValueError):
 
 class BadPicture(CodecError):
     """An image's fields contradict each other, or its encoding is unknown."""
+
+
+def check_size(width: int, height: int, max_pixels: int, pixel_bytes: float = 4) -> None:
+    """
+    Check before decoding that a picture fits into the receiver's memory.
+
+    :param pixel_bytes: bytes that the decoder needs per pixel; there are 9 for each of
+        ``max_pixels``: three frames of 8-bit colours.
+    :raises CodecError: it does not.
+    """
+    if not (0 < width * height <= max_pixels and width * height * pixel_bytes <= 9 * max_pixels):
+        raise CodecError(
+            f'a picture of {width}x{height} takes more memory than max_pixels ({max_pixels}) '
+            'allows', 'size')
 
 
 @dataclasses.dataclass(frozen=True)

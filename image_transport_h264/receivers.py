@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable
+import functools
 import secrets
 import threading
 import time
-from typing import Optional
+from typing import Any, Optional
 
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CompressedImage, Image
@@ -28,6 +28,7 @@ from image_transport_h264.lazy import (
     Tap,
 )
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
+from image_transport_h264.picture import MAX_PIXELS
 from image_transport_h264.repair import Assembler
 from image_transport_h264.worker import Worker
 
@@ -42,72 +43,60 @@ BUSY = 3
 REQUEST_INTERVAL = 0.1
 
 
-class Receiver(abc.ABC):
-    """Receive a stream, and pass its images to ``publish``."""
+class Receiver:
+    """
+    Receive a stream, in the executor's thread and in a worker thread.
 
-    @abc.abstractmethod
+    :param taps: the subscriptions, which pass messages to ``worker``.
+    """
+
+    def __init__(self, worker: Worker[Any], *taps: Tap) -> None:
+        self._worker, self._taps = worker, taps
+
     def want(self, wanted: bool) -> None:
         """Subscribe to the stream, or unsubscribe."""
+        for tap in self._taps:
+            tap.want(wanted)
 
-    @abc.abstractmethod
     def stop(self) -> None:
         """Stop the worker thread."""
+        self._worker.stop()
 
 
 def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> Receiver:
     """
-    Create the receiver of a codec.
+    Create the receiver of a codec, which passes images to ``publish``.
 
     :raises ValueError: the codec is unknown.
     """
     if codec == 'h264':
         return VideoReceiver(node, stream, publish)
+    kind: Any = Image
+    work: Callable[[Any], None] = publish
     if codec in ('jpeg', 'png'):
-        return StillReceiver(node, stream, publish)
-    if codec == 'raw':
-        return RawReceiver(node, stream, publish)
-    raise ValueError(f"codec '{codec}' is not one of h264, jpeg, png, raw")
+        kind = CompressedImage
+        work = functools.partial(_decode_still, node, publish, _max_pixels(node))
+    elif codec != 'raw':
+        raise ValueError(f"codec '{codec}' is not one of h264, jpeg, png, raw")
+    worker: Worker[Any] = Worker('decode', work, node.fail)
+    return Receiver(worker, Tap(node, kind, stream, IMAGE_QOS, worker.put))
 
 
-class RawReceiver(Receiver):
-    """Forward raw images."""
-
-    def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
-        self._worker: Worker[Image] = Worker('pass', publish, node.fail)
-        self._tap = Tap(node, Image, stream, IMAGE_QOS, self._worker.put)
-
-    def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or unsubscribe."""
-        self._tap.want(wanted)
-
-    def stop(self) -> None:
-        """Stop the worker thread."""
-        self._worker.stop()
+def _max_pixels(node: LazyNode) -> int:
+    return int(node.declare_parameter('max_pixels', MAX_PIXELS, ParameterDescriptor(
+        description='larger images are not decoded', read_only=True)).value)
 
 
-class StillReceiver(Receiver):
-    """Decode JPEG and PNG images."""
-
-    def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
-        self._node, self._publish = node, publish
-        self._worker: Worker[CompressedImage] = Worker('decode', self._decode, node.fail)
-        self._tap = Tap(node, CompressedImage, stream, IMAGE_QOS, self._worker.put)
-
-    def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or unsubscribe."""
-        self._tap.want(wanted)
-
-    def stop(self) -> None:
-        """Stop the worker thread."""
-        self._worker.stop()
-
-    def _decode(self, coded: CompressedImage) -> None:
-        try:
-            picture = stills.decode(coded.format, memoryview(coded.data))
-        except CodecError as error:
-            self._node.complain(error.cause, f'packet not shown: {error}')
-            return
-        self._publish(message.image(coded.header, picture))
+def _decode_still(
+    node: LazyNode, publish: Publish, max_pixels: int, coded: CompressedImage,
+) -> None:
+    """Decode a JPEG or PNG image."""
+    try:
+        picture = stills.decode(coded.format, memoryview(coded.data), max_pixels)
+    except CodecError as error:
+        node.complain(error.cause, f'packet not shown: {error}')
+        return
+    publish(message.image(coded.header, picture))
 
 
 class VideoReceiver(Receiver):
@@ -119,13 +108,14 @@ class VideoReceiver(Receiver):
             description='show pictures that losses have left smears in', read_only=True)).value
         encoding = node.declare_parameter('encoding', 'bgr8', ParameterDescriptor(
             description="of images from encoders that aren't FogROS2's", read_only=True)).value
-        self._decoder = Decoder(show_damage=bool(show), encoding=str(encoding))
+        self._decoder = Decoder(show_damage=bool(show), encoding=str(encoding),
+                                max_pixels=_max_pixels(node))
         self._identity = secrets.randbits(63)
         self._asked = -1e9
         self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)
         self._feedback = node.create_publisher(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', FEEDBACK_QOS)
-        self._worker: Worker[Coded] = Worker('decode', self._decode, node.fail, WAITING)
+        worker: Worker[Coded] = Worker('decode', self._decode, node.fail, WAITING)
         self._assembler = Assembler()
         self._counted: Optional[Tag] = None
         self._acknowledged: Optional[Tag] = None
@@ -133,17 +123,9 @@ class VideoReceiver(Receiver):
         self._acknowledging = threading.Lock()
         # Reliable, because a deep picture would never arrive completely otherwise.
         self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._whole, adapt=False)
-        self._pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
-                           adapt=False)
-
-    def want(self, wanted: bool) -> None:
-        """Subscribe to the stream, or unsubscribe."""
-        self._tap.want(wanted)
-        self._pieces.want(wanted)
-
-    def stop(self) -> None:
-        """Stop the worker thread."""
-        self._worker.stop()
+        pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
+                     adapt=False)
+        super().__init__(worker, self._tap, pieces)
 
     def _whole(self, coded: CompressedImage) -> None:
         data = bytes(coded.data)

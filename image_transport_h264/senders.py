@@ -62,7 +62,7 @@ def make_sender(
     if codec == 'h264':
         return VideoSender(node, stream, changed)
     if codec == 'raw':
-        return RawSender(node, stream, changed)
+        return PictureSender(node, Image, stream, changed)
     if codec in ('jpeg', 'png'):
         return StillSender(node, codec, stream, changed)
     raise ValueError(f"codec '{codec}' is not one of {', '.join(CODECS)}")
@@ -70,7 +70,7 @@ def make_sender(
 
 class PictureSender(Sender):
     """
-    Publish complete images at the rate of their acknowledgements, so that none waits on the link.
+    Publish raw images at the rate of their acknowledgements, so that none waits on the link.
 
     Meanwhile the node keeps the newest image, and drops the others.
     """
@@ -84,6 +84,10 @@ class PictureSender(Sender):
         self._pace = Pace()
         self._waiters = ThreadPoolExecutor(MOST, 'acknowledgement')
         self._under_way: list[Future[tuple[Sent, float, bool]]] = []
+
+    def send(self, image: Image) -> None:
+        """Publish the image."""
+        self._put(image)
 
     def _put(self, message: Any) -> None:
         """Publish a message, and wait until the next one may be sent."""
@@ -111,17 +115,6 @@ class PictureSender(Sender):
                 self._pace.acknowledged(sent, when)
             else:
                 self._pace.expired(when)
-
-
-class RawSender(PictureSender):
-    """Publish raw images."""
-
-    def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
-        super().__init__(node, Image, stream, changed)
-
-    def send(self, image: Image) -> None:
-        """Publish the image."""
-        self._put(image)
 
 
 class StillSender(PictureSender):

@@ -10,12 +10,22 @@ import numpy
 from numpy.typing import NDArray
 
 from image_transport_h264.codec import Damaged
-from image_transport_h264.picture import BadPicture, Buffer, Layout, LAYOUTS, Picture
+from image_transport_h264.picture import (
+    BadPicture,
+    Buffer,
+    check_size,
+    Layout,
+    LAYOUTS,
+    MAX_PIXELS,
+    Picture,
+)
 
 Format = Literal['jpeg', 'png']
 #: Arrays with 8 or 16 bits per channel.
 Pixels = NDArray[Any]
 PNG_LEVEL = 3
+#: Markers of JPEG that stand before a frame header: APPn, COM, DQT, DHT, DAC and DRI.
+_SEGMENTS = frozenset([*range(0xe0, 0xf0), 0xfe, 0xdb, 0xc4, 0xcc, 0xdd])
 _TO_BGR = {'rgb24': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGRA,
            'uyvy422': cv2.COLOR_YUV2BGR_UYVY, 'yuyv422': cv2.COLOR_YUV2BGR_YUY2}
 
@@ -47,13 +57,14 @@ def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, byte
     return f'{picture.encoding}; {kind} compressed {target}', data.tobytes()
 
 
-def decode(form: str, data: Buffer) -> Picture:
+def decode(form: str, data: Buffer, max_pixels: int = MAX_PIXELS) -> Picture:
     """
     Decode a JPEG or PNG image.
 
     :param form: ``format`` of the message; it may name the original encoding.
-    :raises Damaged: the data are no image.
+    :raises CodecError: the data are no image, or one of more than ``max_pixels``.
     """
+    check_size(*size(bytes(data)), max_pixels)
     try:
         pixels = cv2.imdecode(numpy.frombuffer(data, numpy.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -70,8 +81,33 @@ def decode(form: str, data: Buffer) -> Picture:
         encoding, layout = 'bgr8', LAYOUTS['bgr8']
     rows = numpy.ascontiguousarray(_as(pixels, layout))
     height, width = rows.shape[:2]
+    if rows.nbytes != width * height * layout.pixel_bytes:
+        raise Damaged(f'{rows.dtype} pixels in a picture of {encoding}', 'damage')
     flat = rows.view(numpy.uint8).reshape(-1)
     return Picture(width, height, encoding, width * layout.pixel_bytes, flat.data)
+
+
+def size(data: bytes) -> tuple[int, int]:
+    """
+    Return width and height of a JPEG or PNG image, from its header.
+
+    :raises Damaged: it has no such header.
+    """
+    if data[:8] == b'\x89PNG\r\n\x1a\n' and data[12:16] == b'IHDR' and len(data) > 25:
+        if data[24] == 16 and data[25] != 0:
+            raise Damaged('16-bit colours, which no encoding has', 'damage')
+        return int.from_bytes(data[16:20], 'big'), int.from_bytes(data[20:24], 'big')
+    at = 2 if data[:3] == b'\xff\xd8\xff' else len(data)
+    # Segments of JPEG (ITU-T T.81, B.1.1.4): FF, marker, length; a frame header has the size.
+    while at + 9 <= len(data) and data[at] == 0xff:
+        marker = data[at + 1]
+        if 0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc):
+            return (int.from_bytes(data[at + 7:at + 9], 'big'),
+                    int.from_bytes(data[at + 5:at + 7], 'big'))
+        if marker not in _SEGMENTS:
+            break
+        at += 2 + int.from_bytes(data[at + 2:at + 4], 'big')
+    raise Damaged('neither JPEG nor PNG', 'damage')
 
 
 def _pixels(picture: Picture, layout: Layout) -> Pixels:

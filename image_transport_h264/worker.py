@@ -28,21 +28,16 @@ class Worker(Generic[Item]):
         self._waiting = waiting
         self._news = threading.Condition()
         self._stopping = False
-        #: Number of items that were replaced before the work on them began.
-        self.dropped = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def put(self, item: Item) -> bool:
-        """Queue an item, and return at once; return False if it replaced an older item."""
+    def put(self, item: Item) -> None:
+        """Queue an item, and return at once."""
         with self._news:
-            whole = len(self._items) < self._waiting
-            if not whole:
+            if len(self._items) == self._waiting:
                 self._items.popleft()
-                self.dropped += 1
             self._items.append(item)
             self._news.notify()
-            return whole
 
     @property
     def waiting(self) -> int:
@@ -57,21 +52,16 @@ class Worker(Generic[Item]):
         self._thread.join(5.0)
 
     def _run(self) -> None:
-        stopped = False
         try:
-            self._loop()
-            stopped = True
-        finally:
-            if not stopped:
-                self._failed()
-
-    def _loop(self) -> None:
-        while True:
-            with self._news:
-                self._news.wait_for(lambda: self._items or self._stopping)
-                if self._stopping:
-                    return
-                item = self._items.popleft()
-            self._work(item)
-            # Free the picture while the thread waits for the next one.
-            del item
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: self._items or self._stopping)
+                    if self._stopping:
+                        return
+                    item = self._items.popleft()
+                self._work(item)
+                # Free the picture while the thread waits for the next one.
+                del item
+        except BaseException:
+            self._failed()
+            raise

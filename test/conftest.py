@@ -13,6 +13,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 from typing import Any
 import urllib.request
 
@@ -143,8 +144,16 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
     from moto.ec2.models.amis import AmiBackend
     from moto.ssm.models import Parameter, ssm_backends
 
+    from fogros2 import waiting
     from fogros2.provider.aws import images
 
+    def hasty(probe: Any, **options: Any) -> Any:
+        return waiting.wait_until(probe, **{**options, 'first': 0.0, 'interval': 0.02})
+
+    # the pauses are for EC2: Moto ends an instance at once
+    for module in [found for name, found in sys.modules.items()
+                   if name.startswith('fogros2.provider.') and hasattr(found, 'wait_until')]:
+        monkeypatch.setattr(module, 'wait_until', hasty)
     # a thousand of other people's images, loaded anew for each test and region
     monkeypatch.setenv('MOTO_EC2_LOAD_DEFAULT_AMIS', 'false')
     urllib.request.urlopen(urllib.request.Request(
@@ -174,7 +183,7 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
 
     monkeypatch.setattr(AmiBackend, 'create_image', create_with_snapshots)
     # Moto has no price list
-    monkeypatch.setattr('fogros2.provider.aws.choices.price_of',
+    monkeypatch.setattr('fogros2.provider.vm.market.Market.price_of',
                         lambda *args, **kwargs: Decimal('0.0416'))
     for region in MOTO_REGIONS:
         for arch in images.UBUNTU:

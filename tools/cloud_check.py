@@ -25,10 +25,11 @@ from typing import Optional
 from launch import LaunchContext
 
 from fogros2 import deploy, plan
-from fogros2.actions import cost, override
+from fogros2.describe import overrides
 from fogros2.errors import FogError
 from fogros2.model import Machine, MachineSpec, MachineState
 from fogros2.provider import Provider, TAG_NAME
+from fogros2.runtime import cost
 
 #: Keywords of the smallest machine that has room for ROS 2, and what else the provider creates.
 SMALLEST = {
@@ -56,7 +57,7 @@ def main() -> int:
         f'{name}={args.provider}', small, f'lifetime={LIFETIME}', args.options]))
     try:
         provider = deploy.provider(args.provider)
-        price = announce(provider, override.parse(words).machine(name).spec(LaunchContext()),
+        price = announce(provider, overrides.parse(words).machine(name).spec(LaunchContext()),
                          things)
         if not agreed():
             print('Nothing was created.')

@@ -160,7 +160,8 @@ install_packages() {
     fi
     status=0
     { as_root apt-get update -q && as_root env DEBIAN_FRONTEND=noninteractive RUNLEVEL=1 \
-        apt-get install -q -y --no-install-recommends $packages; } || status=$?
+        apt-get install -q -y -o DPkg::Lock::Timeout=600 \
+        --no-install-recommends $packages; } || status=$?
     if [ -n "$services" ]; then
         as_root systemctl unmask --runtime --quiet $services || status=$?
         as_root systemctl disable --quiet $services || status=$?

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write fogros2/locked.txt: what a machine may take from its package index, pinned with hashes.
+Write fogros2/host/locked.txt: what a machine may take from its package index, pinned with hashes.
 
     tools/run.sh embedded -- python tools/lock.py
 
@@ -16,8 +16,8 @@ import subprocess
 import sys
 import tempfile
 
-from fogros2 import locked
-from fogros2.modules import MODULES
+from fogros2.host import locked
+from fogros2.host.modules import MODULES
 
 #: What the embedded default needs and a robot can't send to another kind of machine: see
 #: ros2_embedded/setup.py. The pure Python distributions travel.

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 import dataclasses
+import functools
 from pathlib import Path
 import re
 import sys
@@ -59,6 +60,7 @@ def remedies(page: str) -> dict[str, tuple[str, str]]:
         r'^\| `(\w+)` \| (.*?) \| (.*?) \|$', table, re.MULTILINE)}
 
 
+@functools.cache
 def messages() -> list[Message]:
     """Return all messages, sorted."""
     known = set(kinds())
@@ -70,8 +72,14 @@ def messages() -> list[Message]:
     return sorted(found)
 
 
+@functools.cache
+def tree(path: Path) -> ast.Module:
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
 def _in_file(path: Path, known: set[str]) -> Iterator[Message]:
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree(path)):
         if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
             continue
         if node.func.id not in known or not node.args or node.func.id == 'CommandError':

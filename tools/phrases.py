@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Refuse phrases that are hard to read in code, messages and pages.
+Refuse phrases that are hard to read in code, messages and pages, and long names of tests.
 
     python tools/phrases.py [FOLDER]
 
-Prints file, line and phrase of each, and returns 1 if there is one. FOLDER is the project's.
+Prints file, line and phrase or name of each, and returns 1 if there is one. FOLDER is the
+project's.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ PHRASES = (
     'take it that', 'is told', 'are told', 'be told', 'told of', 'told beside', 'whoever',
     'no more at all', 'by the word of', 'as it is there', 'what is asked of', 'is called so',
 )
+#: Characters that the name of a test may have; it states one behaviour.
+LONGEST_NAME = 60
+TEST = re.compile(rf'^ *(?:async )?def (test_\w{{{LONGEST_NAME - 4},}})', re.MULTILINE)
 #: Folders that builds or measurements write.
 WRITTEN = ('build', 'install', 'log', 'benchmarks/results')
 #: Between two words: space, also with the beginning of the next comment, or the end of a string
@@ -44,11 +48,14 @@ def texts(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def found(folder: Path) -> Iterator[str]:
-    """Yield a line for each phrase in the project's files."""
+    """Yield a line for each phrase, and for each long name of a test, in the project's files."""
     for name, text in texts(folder):
         for match in PATTERN.finditer(text):
             line = text.count('\n', 0, match.start()) + 1
             yield f'{name}:{line}: {" ".join(match[0].split())!r} is hard to read: rewrite it'
+        for match in TEST.finditer(text) if name.endswith('.py') else ():
+            line = text.count('\n', 0, match.start()) + 1
+            yield f'{name}:{line}: {match[1]} has more than {LONGEST_NAME} characters'
 
 
 def main(folder: Path) -> int:

@@ -137,7 +137,7 @@ install_packages() {
     status=0
     { as_root apt-get update -q \
         && as_root env DEBIAN_FRONTEND=noninteractive RUNLEVEL=1 \
-            apt-get install -q -y --no-install-recommends $packages; } \
+            apt-get install -q -y -o DPkg::Lock::Timeout=600 --no-install-recommends $packages; } \
         >"$log" 2>&1 </dev/null || status=$?
     if [ -n "$quiet_sshd" ]; then
         as_root systemctl unmask --runtime --quiet ssh.service ssh.socket || status=$?

@@ -1,2 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extend launch with machines; launch files import the public names from :mod:`fogros2`."""
+"""
+The actions of launch files; these import the public names from :mod:`fogros2`.
+
+In reading order: ``fog_machine`` describes a machine, ``foxglove`` shows topics in a browser,
+``nodes`` and ``cloud_group`` run nodes on machines, ``launch_description`` knows all machines of a
+launch, ``override`` runs machines elsewhere, and ``frontend`` reads XML and YAML.
+"""

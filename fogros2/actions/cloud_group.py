@@ -9,15 +9,15 @@ from typing import Any, Optional, TYPE_CHECKING
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.actions import components, keywords, streaming
-from fogros2.actions.carriers import RobotCarrier
-from fogros2.actions.coordinator import Coordinator
-from fogros2.actions.machines import checked
-from fogros2.actions.remote import RemoteProcess, send
-from fogros2.actions.wrapping import wrap
+from fogros2.describe import keywords
+from fogros2.describe.machines import checked
+from fogros2.launch_internals.wrapping import wrap
+from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.remote_process import RemoteProcess, send, send_components
+from fogros2.runtime.republishers import RobotRepublisher
 
 if TYPE_CHECKING:
-    from fogros2.actions.coordinator import SomeMachine
+    from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 
@@ -53,9 +53,8 @@ class CloudGroup(GroupAction):
         coordinator = Coordinator.of(context)
         coordinator.know(self.machine)
         self._resolved = coordinator.resolve(self.machine)
-        self._streams = streaming.resolve(
-            context, self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
-        streaming.check(self._streams)
+        self._streams = coordinator.resolve_streams(
+            self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
         return wrap(super().execute(context), self._send)
 
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
@@ -63,7 +62,7 @@ class CloudGroup(GroupAction):
                 not entity.condition.evaluate(context)):
             return  # launch skips it
         if isinstance(entity, ExecuteLocal) and not isinstance(
-                entity, (RemoteProcess, RobotCarrier)):
+                entity, (RemoteProcess, RobotRepublisher)):
             send(entity, self._resolved, self._streams)
         else:
-            components.send(entity, self._resolved, self._streams, context)
+            send_components(entity, self._resolved, self._streams, context)

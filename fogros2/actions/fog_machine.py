@@ -8,13 +8,13 @@ from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext
 
-from fogros2.actions import keywords, words
-from fogros2.actions.coordinator import Coordinator
+from fogros2.describe import keywords, values
+from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-    from fogros2.actions.machines import CloudInstance
+    from fogros2.describe.machines import CloudInstance
 
 
 class FogMachine(Action):
@@ -45,18 +45,18 @@ class FogMachine(Action):
     def execute(self, context: LaunchContext) -> None:
         """Create the machine's description, and register its name with the launch."""
         if self.machine is None:
-            provider = words.resolve(context, self._provider)
+            provider = values.resolve(context, self._provider)
             known = keywords.keywords(keywords.machine_class(provider))
             self.machine = keywords.make(provider, {
                 name: value for name, value in self._given.items()
                 if name in known or not self._is_empty(context, value)})
         for container in self._containers:
             self.machine.add_docker_container(**{
-                name: words.resolve(context, value) for name, value in container.items()})
+                name: values.resolve(context, value) for name, value in container.items()})
         # resolves the name, so that nodes can refer to it
         self.machine.spec(context)
         Coordinator.of(context).know(self.machine)
 
     @staticmethod
     def _is_empty(context: LaunchContext, value: Any) -> bool:
-        return bool(words.is_text(value)) and words.resolve(context, value) == ''
+        return bool(values.is_text(value)) and values.resolve(context, value) == ''

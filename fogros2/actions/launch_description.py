@@ -23,17 +23,19 @@ from launch.actions import (
     UnsetLaunchConfiguration,
 )
 
-from fogros2.actions import keywords, private, streaming
 from fogros2.actions.cloud_group import CloudGroup
-from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.fog_machine import FogMachine
-from fogros2.actions.remote import RemoteProcess
-from fogros2.actions.wrapping import wrap
+from fogros2.describe import keywords
 from fogros2.errors import ConfigurationError
+from fogros2.launch_internals import private
+from fogros2.launch_internals.wrapping import wrap
 from fogros2.model import RobotNodes
+from fogros2.runtime import streaming
+from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.remote_process import RemoteProcess
 
 if TYPE_CHECKING:
-    from fogros2.actions.coordinator import SomeMachine
+    from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 #: Entities that only set something for the entities after them.
@@ -138,25 +140,5 @@ def _hold(
     coordinator: Coordinator, entity: LaunchDescriptionEntity, context: LaunchContext,
 ) -> None:
     """Make a robot process or a timer wait until the cloud is up."""
-    if isinstance(entity, RemoteProcess):
-        return
-    if isinstance(entity, ExecuteLocal):
-        start = private.execute_process(entity)
-
-        async def start_later(context: LaunchContext) -> None:
-            if await coordinator.hold() and not context.is_shutdown:
-                await start(context)
-                return
-            future = private.completed(entity)
-            if future is not None and not future.done():
-                future.set_result(None)
-
-        private.replace(entity, private.EXECUTE_PROCESS, start_later)
-    elif isinstance(entity, TimerAction):
-        wait = private.wait_to_fire(entity)
-
-        async def wait_later(context: LaunchContext) -> None:
-            await coordinator.hold()
-            await wait(context)
-
-        private.replace(entity, private.WAIT_TO_FIRE, wait_later)
+    if isinstance(entity, (ExecuteLocal, TimerAction)) and not isinstance(entity, RemoteProcess):
+        private.delay_start(entity, coordinator.hold)

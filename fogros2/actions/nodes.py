@@ -9,17 +9,17 @@ from typing import Any, Optional, TYPE_CHECKING, Union
 from launch import LaunchContext, LaunchDescriptionEntity
 import launch_ros.actions
 
-from fogros2 import containers
-from fogros2.actions import components, keywords, streaming, words
-from fogros2.actions.coordinator import Coordinator
-from fogros2.actions.machines import checked, CloudInstance
-from fogros2.actions.remote import RemoteProcess, send
+from fogros2.describe import keywords, values
+from fogros2.describe.machines import checked, CloudInstance
 from fogros2.errors import ConfigurationError
+from fogros2.host import containers
+from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.remote_process import RemoteProcess, send, send_components
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType, Substitution
 
-    from fogros2.actions.coordinator import SomeMachine
+    from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 
@@ -65,7 +65,7 @@ class Node(launch_ros.actions.Node):
             return
         self.stream_topics = list(stream_topics)
         self._image = image
-        self._image_options = words.items(image_options)
+        self._image_options = values.items(image_options)
         self._fogros2_own_machine = True
         if image is not None and isinstance(machine, CloudInstance):
             machine.takes_containers()
@@ -80,8 +80,8 @@ class Node(launch_ros.actions.Node):
             namespace = self.expanded_node_namespace
             if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
                 namespace = '/'
-            self._fogros2_streams = streaming.resolve(context, self.stream_topics, namespace)
-            streaming.check(self._fogros2_streams)
+            self._fogros2_streams = Coordinator.of(context).resolve_streams(
+                self.stream_topics, namespace)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; components that it loads use the topic names of its machine."""
@@ -91,13 +91,13 @@ class Node(launch_ros.actions.Node):
         assert isinstance(self, RemoteProcess)
         entities: list[LaunchDescriptionEntity] = super().execute(context) or []
         for entity in entities:
-            components.send(entity, self.machine, self._fogros2_streams, context)
+            send_components(entity, self.machine, self._fogros2_streams, context)
         return entities
 
     def _use_image(self, context: LaunchContext) -> None:
         assert isinstance(self, RemoteProcess)
-        image = words.resolve(context, self._image)
-        options = words.resolve(context, self._image_options)
+        image = values.resolve(context, self._image)
+        options = values.resolve(context, self._image_options)
         containers.node_container(image, options)
         if self.shell:
             raise ConfigurationError(

@@ -114,6 +114,24 @@ class DdsVendor(abc.ABC):
         return None
 
 
+def local_only(user: Mapping[str, str]) -> bool:
+    """Return whether the user limits ROS 2 to this computer."""
+    return (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
+            or user.get('ROS_LOCALHOST_ONLY') == '1')
+
+
+def check_discovery(user: Mapping[str, str]) -> None:
+    """
+    Check that nodes find each other.
+
+    :raises DdsError: the user's environment disables discovery.
+    """
+    if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
+        raise DdsError(
+            'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
+            'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+
+
 def static_peers(user: Mapping[str, str]) -> list[str]:
     """Return the hosts in ROS_STATIC_PEERS, which are separated by ``;``."""
     return [host.strip() for host in user.get('ROS_STATIC_PEERS', '').split(';') if host.strip()]

@@ -28,7 +28,7 @@ from types import MappingProxyType
 from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
-from fogros2.dds import DdsVendor, is_address
+from fogros2.dds import check_discovery, DdsVendor, is_address, local_only
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 
@@ -117,18 +117,13 @@ class CycloneDds(DdsVendor):
             raise DdsError(
                 "CYCLONEDDS_URI's NetworkInterfaceAddress leaves no place for the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
-        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST':
-            # the user limits ROS 2 to this computer; here: to this computer and its machines
-            lan = None
         has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
         listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
         _check_multicast(listed)
         interfaces = []
         if not any(re.search(r'"lo"|"127\.', attributes) for attributes in listed):
             interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
-        local = (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
-                 or user.get('ROS_LOCALHOST_ONLY') == '1')
-        if lan is not None and not listed and not local:
+        if lan is not None and not listed and not local_only(user):
             interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
         # below 0, the default priority of the user's own interfaces
         return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]
@@ -215,10 +210,7 @@ class CycloneDds(DdsVendor):
         :param path: absolute path of our file.
         :raises DdsError: the user's environment disables discovery, or the path contains a comma.
         """
-        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
-            raise DdsError(
-                'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
-                'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+        check_discovery(user)
         if ',' in path:
             raise DdsError(f'Cyclone DDS reads {path} as two files', 'use a path without a comma')
         # Cyclone opens the path after file:// without decoding it

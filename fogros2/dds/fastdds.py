@@ -21,7 +21,7 @@ from typing import ClassVar, Optional
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from fogros2.dds import DdsVendor, is_address, static_peers
+from fogros2.dds import check_discovery, DdsVendor, is_address, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
@@ -84,7 +84,7 @@ class FastDds(DdsVendor):
             raise DdsError(
                 f'FASTDDS_BUILTIN_TRANSPORTS={transports} has nodes that reach no machine',
                 'unset it: machines speak UDP over IPv4')
-        if _here_only(user):
+        if local_only(user):
             return [DdsInterface(LOOPBACK, 10), DdsInterface(vpn, multicast=True)]
         return []
 
@@ -161,20 +161,12 @@ class FastDds(DdsVendor):
 
         :raises DdsError: the user's environment disables discovery.
         """
-        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
-            raise DdsError(
-                'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
-                'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+        check_discovery(user)
         variables = {'RMW_IMPLEMENTATION': self.rmw, VARIABLE: path,
                      'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT'}
         if user.get('ROS_LOCALHOST_ONLY') == '1':
             variables['ROS_LOCALHOST_ONLY'] = '0'
         return variables
-
-
-def _here_only(user: Mapping[str, str]) -> bool:
-    return (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
-            or user.get('ROS_LOCALHOST_ONLY') == '1')
 
 
 def _profiles(path: str) -> tuple[Element, Element]:

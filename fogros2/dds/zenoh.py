@@ -16,7 +16,7 @@ import json
 from types import MappingProxyType
 from typing import Any, ClassVar, Optional
 
-from fogros2.dds import DdsVendor, Router, static_peers
+from fogros2.dds import check_discovery, DdsVendor, local_only, Router, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 
@@ -102,7 +102,7 @@ class Zenoh(DdsVendor):
             ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST the router connects only to machines.
         """
         dialled = [_endpoint(other) for other in others]
-        if user is not None and not _here_only(user):
+        if user is not None and not local_only(user):
             dialled += [USERS_ROUTER, *(f'tcp/{host}:7447' for host in static_peers(user))]
         return Router('rmw_zenoh_cpp', 'rmw_zenohd', 'ZENOH_ROUTER_CONFIG_URI', _text({
             'mode': 'router',
@@ -121,10 +121,7 @@ class Zenoh(DdsVendor):
 
         :raises DdsError: the user's environment disables discovery.
         """
-        if user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'OFF':
-            raise DdsError(
-                'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no node would find another',
-                'unset ROS_AUTOMATIC_DISCOVERY_RANGE')
+        check_discovery(user)
         return {'RMW_IMPLEMENTATION': self.rmw, 'ZENOH_SESSION_CONFIG_URI': path}
 
 
@@ -137,11 +134,6 @@ _TRANSPORT: Mapping[str, Any] = {
     'link': {'tx': {'lease': LEASE, 'keep_alive': 4}},
     # hosts share no memory, and a machine's limits are small
     'shared_memory': {'enabled': False}}
-
-
-def _here_only(user: Mapping[str, str]) -> bool:
-    return (user.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST'
-            or user.get('ROS_LOCALHOST_ONLY') == '1')
 
 
 def _endpoint(address: str) -> str:

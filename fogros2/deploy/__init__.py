@@ -4,17 +4,19 @@ Create machines from specs, run nodes on them, and delete the machines again.
 
 A :class:`Launch` is the robot's side of one launch. :meth:`Launch.up` takes one machine through
 the steps of the paper. Several machines come up in parallel, each in a thread of the caller.
-Each step pushes its undo before it runs. The modules, in the order of the steps:
-``launch``      what all machines share, checks before anything is created, the end of a launch
-``choosing``    choices of the providers before anything is created, and prices
-``robot``       programs and rights that this computer needs; ``robot_vpn``: its VPN interface
-``deployment``  the steps of one machine; ``job``: what the steps share
-``creating``    steps 1 to 3: create or reuse a machine, wait until it can be reached
-``entering``    log in, replace the host key, move SSH into the VPN and close the SSH port
-``guarding``    the agent, started before any slow step; nodes and heartbeat
-``joining``     step 5: the machine's end of the VPN
-``running``     a machine that is up; ``watching``: check that the machine still exists
-``comparing``   compare the machine's clock with the robot's
+Each step pushes its undo before it runs. The modules, each imports only those before it:
+
+``undo``          undo steps; one that fails does not stop the others
+``robot``         programs and rights that this computer needs
+``robot_vpn``     the robot's VPN interface; ``robot_router``: the router beside its nodes
+``choosing``      choices of the providers before anything is created, and prices
+``checks``        checks before anything is created
+``context``       what the steps of one machine use
+``machine_job``   what the steps of one machine learn and change, and how they are undone
+``steps``         a module for each step
+``running``       a machine that is up
+``deployment``    the order of the steps
+``launch``        what all machines share; the end of a launch
 """
 
 from fogros2.deploy.launch import Launch

@@ -41,7 +41,7 @@ class Choices:
         if known is not None:
             return known
         provider = self._provider(spec.provider)
-        if type(provider).resolve is Provider.resolve:
+        if not provider.capabilities.choices:
             return spec
         with step(self._report, spec.name, 'choices') as detail:
             chosen = provider.resolve(spec)

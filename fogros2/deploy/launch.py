@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
 from decimal import Decimal
@@ -12,42 +12,25 @@ from pathlib import Path
 import secrets
 import shutil
 import threading
-import time
 from typing import Optional
 
-from fogros2 import (
-    bootstrap,
-    containers,
-    model,
-    plan,
-    plugin_system,
-    process,
-    ros2_daemon,
-    undeclared,
-    wheels,
-    workspace,
-)
-from fogros2 import shell as shells
+from fogros2 import model, plan, plugin_system, ros2_daemon
 from fogros2.dds import DdsVendor
-from fogros2.deploy import routing
+from fogros2.deploy import robot_router
+from fogros2.deploy.checks import check, check_architecture, check_names
 from fogros2.deploy.choosing import Choices
-from fogros2.deploy.deployment import Deployment
-from fogros2.deploy.robot import check_robot, provider
-from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.deploy.context import Context
+from fogros2.deploy.deployment import bring_up
+from fogros2.deploy.robot import check_robot, provider, run
+from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
-from fogros2.errors import (
-    Cancelled,
-    ConfigurationError,
-    DdsError,
-    FogError,
-    PrerequisiteError,
-    StoreError,
-)
+from fogros2.deploy.undo import UndoStack
+from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
 from fogros2.journal import Journal
-from fogros2.model import Command, MachineSpec
+from fogros2.model import MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, StepFailed
-from fogros2.store import boot_id, check_name, process_start, Store, write_private
+from fogros2.store import Store, this_process, write_private
 from fogros2.waiting import Timeouts
 
 
@@ -71,20 +54,20 @@ class Launch:
         self.report: Reporter = Journal(report, self.store.root / 'launches' / self.id)
         self.timeouts = timeouts or Timeouts()
         self.cancel = cancel or threading.Event()
+        self._ending = threading.Event()
         self.user_environment = dict(os.environ if environment is None else environment)
         self._lock = threading.RLock()
-        self.undo = contextlib.ExitStack()
         self._failures: list[FogError] = []
+        self.undo = UndoStack(self.report, '', self._failures)
         self._indices: dict[str, int] = {}
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
         self._programs: dict[str, Sequence[tuple[str, str]]] = {}
         self._images: dict[str, Sequence[str]] = {}
-        self.choices = Choices(self.provider, self.report)
-        self._robot: Optional[RobotVpn] = None
+        self._choices = Choices(self.provider, self.report)
+        self._vpn: Optional[RobotVpn] = None
         self._rmw = ''
         self._robot_environment: Optional[dict[str, str]] = None
-        self._closed = False
 
     # -- before anything is created -------------------------------------------------------------
 
@@ -100,41 +83,16 @@ class Launch:
         :param images: machine name to the container images that nodes there will run in.
         :raises FogError: the first problem that was found, with its remedy.
         """
-        self.dds()
+        rmw = self.dds().rmw
         check_robot()
         self._programs.update(programs)
         self._images.update(images)
-        names = [spec.name for spec in specs]
-        for name in names:
-            check_name(name)
-            if names.count(name) > 1:
-                raise ConfigurationError(f"two machines of this launch are called '{name}'",
-                                         'give each a name= of its own')
-        prefixes = plan.ament_prefixes(self.user_environment)
-        plan.check_rmw(self._rmw, prefixes, specs)
+        check_names(specs)
+        plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
         for spec in specs:
-            machines = self.provider(spec.provider)
-            shells.warm(machines.shell_kind)
-            machines.check(spec)
-            if spec.on_exit == 'stop' and not machines.owned:
-                raise ConfigurationError(
-                    f"'{spec.name}' is a computer that exists already: no launch switches it off",
-                    "use on_exit='delete' to leave nothing there, or 'keep'")
-            for line in spec.containers:
-                containers.check(containers.parse(line), self._rmw)
-            if spec.containers or images.get(spec.name):
-                machines.check_containers(spec)
-            chain = [workspace.inspect(path) for path in spec.workspaces]
-            for package, executable in programs.get(spec.name, ()):
-                if not spec.options.get('image'):
-                    plan.check_program(package, executable, prefixes, spec.workspace)
-            # a step that cannot do without reports what is wrong
-            with contextlib.suppress(FogError, OSError):
-                warned = undeclared.warning(
-                    spec, chain, {package for package, _ in programs.get(spec.name, ())},
-                    prefixes, machines.shown(spec))
-                if warned:
-                    self.report(warned)
+            check(spec, self.provider(spec.provider), rmw=rmw, environment=self.user_environment,
+                  programs=programs.get(spec.name, ()), images=images.get(spec.name, ()),
+                  report=self.report)
         choosing = [spec for spec in specs if not self._may_be_kept(spec)]
         with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
             for choice in [pool.submit(self._choose, spec) for spec in choosing]:
@@ -142,32 +100,16 @@ class Launch:
 
     def _choose(self, spec: MachineSpec) -> None:
         """Make the open choices of a spec; check that wheels and workspace fit its processor."""
-        spec = self.choices.resolved(spec)
-        if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
-            return  # only the machine's system decides
-        architecture = self.provider(spec.provider).architecture(spec)
-        if architecture:
-            bootstrap.check_architecture(
-                spec, architecture,
-                workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)
+        check_architecture(self._choices.resolved(spec), self.provider(spec.provider))
 
     def _may_be_kept(self, spec: MachineSpec) -> bool:
         """Return whether this spec may reuse a machine of an earlier launch, with its choices."""
-        folder = self.store.machine(spec.name)
         try:
-            before = folder.load() if folder.exists() else None
+            before = self.store.load(spec.name) if self.store.exists(spec.name) else None
         except StoreError:
             return False
         return before is not None and before.machine_id is not None \
             and before.provider == spec.provider
-
-    def programs(self, name: str) -> Sequence[tuple[str, str]]:
-        """Return the (package, executable) pairs that are known to run on a machine."""
-        return self._programs.get(name, ())
-
-    def images(self, name: str) -> Sequence[str]:
-        """Return the container images that nodes on a machine are known to run in."""
-        return self._images.get(name, ())
 
     def provider(self, name: str) -> Provider:
         """
@@ -187,7 +129,7 @@ class Launch:
 
         Each item is (name, US dollars per hour, seconds that this launch has used the machine).
         """
-        return self.choices.cost()
+        return self._choices.cost()
 
     def use_dds(self, name: str) -> None:
         """
@@ -234,18 +176,7 @@ class Launch:
             raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
                                      'use 0 to 101') from None
 
-    def underlay(self, workspaces: Sequence[str]) -> plan.Underlay:
-        """
-        Return the paths of the robot's ROS 2 and of workspaces; the first need not be sourced.
-
-        :raises PrerequisiteError: the robot has no ROS 2.
-        """
-        ros2 = shutil.which('ros2', path=self.user_environment.get('PATH'))
-        if ros2 is None:
-            raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
-        return plan.underlay(
-            workspace.sourced(next(iter(workspaces), None), self.user_environment), workspaces,
-            ros2)
+    # -- the robot ------------------------------------------------------------------------------
 
     def robot_environment(self) -> dict[str, str]:
         """
@@ -259,38 +190,59 @@ class Launch:
         with self._lock:
             if self._robot_environment is None:
                 check_robot()
-                vendor = self.dds()
-                lan = vendor.parse_lan(self.robot([vendor.ask_lan()]))
-                robot = self.robot_vpn()
+                vendor, user = self.dds(), self.user_environment
+                lan = vendor.parse_lan(run(
+                    [vendor.ask_lan()], timeout=self.timeouts.vpn, cancel=self.cancel))
+                vpn = self.robot_vpn()
                 interfaces = vendor.robot_interfaces(
-                    robot.interface.address if vendor.by_address else robot.interface.name,
-                    lan, self.user_environment)
+                    vpn.interface.address if vendor.by_address else vpn.interface.name, lan, user)
                 path = self.store.launch(self.id) / vendor.file_name
                 # no peers: the machines announce themselves
-                write_private(
-                    path, vendor.render(interfaces, (), self.user_environment).encode())
+                write_private(path, vendor.render(interfaces, (), user).encode())
                 # for terminals that join the launch: they read the domain and the middleware
                 write_private(path.with_name('domain'), str(self.domain).encode())
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
-                robot.ensure()
+                vpn.ensure()
                 # the ROS 2 daemon is a node that uses the interface: it has to end first
                 self.undo.callback(ros2_daemon.stop, path.parent)
-                self._route(vendor, path.parent)
-                self._robot_environment = dict(
-                    vendor.environment(str(path), self.user_environment))
+                router = vendor.router(
+                    vpn.interface.address,
+                    [self._address(index) for index in range(robot_router.MACHINES)], user)
+                if router is not None:
+                    # ends after the robot's nodes have ended, and before the VPN goes down
+                    self.undo.callback(robot_router.RobotRouter(router, path.parent, user).close)
+                self._robot_environment = dict(vendor.environment(str(path), user))
             return dict(self._robot_environment)
 
-    def _route(self, vendor: DdsVendor, folder: Path) -> None:
-        """Start the router of the robot's nodes, for a middleware that has one."""
-        robot = self.robot_vpn().interface
-        machines = [
-            plan.machine_interface('', robot.network, index, 0, '').address
-            for index in range(routing.MACHINES)]
-        router = vendor.router(robot.address, machines, self.user_environment)
-        if router is not None:
-            running = routing.RobotRouter(router, folder, self.user_environment)
-            # runs after the robot's nodes have ended, and before the VPN goes down
-            self.undo.callback(running.close)
+    def robot_vpn(self) -> RobotVpn:
+        """Return the robot's VPN; its interface need not be up yet."""
+        with self._lock:
+            if self._vpn is None:
+                folder = self.store.launch(self.id)
+                self.undo.callback(self._remove_folder, folder)
+                # `ros2 fog gc` reads this to recognise the folder of a killed launch
+                write_private(
+                    folder / 'process.json', model.to_json(this_process()).encode())
+                vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
+                    domain=self.domain, ports=self.dds().ports)
+                self._vpn = RobotVpn(
+                    choose_interface(
+                        self.id, folder, self.user_environment, self.timeouts.vpn), vpn,
+                    report=self.report, undo=self.undo, timeout=self.timeouts.vpn,
+                    cancel=self.cancel, ending=self._ending)
+            return self._vpn
+
+    def _remove_folder(self, folder: Path) -> None:
+        """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
+        if self._vpn is None or self._vpn.down:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _address(self, index: int) -> str:
+        """Return the VPN address of the ``index``-th machine."""
+        network = self.robot_vpn().interface.network
+        return plan.machine_interface('', network, index, 0, '').address
+
+    # -- up -------------------------------------------------------------------------------------
 
     def expect(self, names: Iterable[str]) -> None:
         """Reserve the VPN addresses of machines, so that nodes that start earlier know them."""
@@ -298,18 +250,25 @@ class Launch:
             for name in names:
                 self._indices.setdefault(name, len(self._indices))
 
-    def index(self, name: str) -> int:
-        """Return a machine's number in the VPN."""
-        return self._indices[name]
+    def context(self, spec: MachineSpec) -> Context:
+        """
+        Return what the steps of a machine use.
 
-    def addresses_but(self, name: str) -> list[str]:
-        """Return the VPN addresses of all known machines except one."""
-        network = self.robot_vpn().interface.network
-        with self._lock:
-            indices = [index for other, index in self._indices.items() if other != name]
-        return [plan.machine_interface('', network, index, 0, '').address for index in indices]
+        :raises FogError: there is no such provider or middleware, or no subnet for the VPN.
+        """
+        def others() -> list[str]:
+            with self._lock:
+                return [self._address(index) for name, index in self._indices.items()
+                        if name != spec.name]
 
-    # -- up -------------------------------------------------------------------------------------
+        self.expect([spec.name])
+        return Context(
+            launch=self.id, environment=self.user_environment, store=self.store,
+            report=self.report, failures=self._failures, timeouts=self.timeouts,
+            cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
+            choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
+            index=self._indices[spec.name], others=others,
+            programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()))
 
     def up(self, spec: MachineSpec) -> RunningMachine:
         """
@@ -321,17 +280,16 @@ class Launch:
         :raises Cancelled: the launch is ending.
         """
         with self._lock:
-            if self._closed or self.cancel.is_set():
+            if self.ending or self.cancel.is_set():
                 raise Cancelled(f"machine '{spec.name}'")
             known = self._ups.get(spec.name)
             if known is None:
-                self.expect([spec.name])
                 mine: Future[RunningMachine] = Future()
                 self._ups[spec.name] = mine
         if known is not None:
             return known.result()
         try:
-            machine = Deployment(self, spec).run()
+            machine = bring_up(self.context(spec), spec)
         except BaseException as error:
             mine.set_exception(error)
             raise
@@ -353,29 +311,10 @@ class Launch:
             with contextlib.suppress(FogError):  # the first start of a node reports the same error
                 machine.warm()
 
-    def robot_vpn(self) -> RobotVpn:
-        """Return the robot's VPN; its interface need not be up yet."""
-        with self._lock:
-            if self._robot is None:
-                folder = self.store.launch(self.id)
-                self.undo.callback(self._remove_folder, folder)
-                # `ros2 fog gc` reads this to recognise the folder of a killed launch
-                pid = os.getpid()
-                write_private(folder / 'process.json', model.to_json(
-                    {'pid': pid, 'pid_start': process_start(pid),
-                     'boot': boot_id()}).encode())
-                self._robot = RobotVpn(self, folder)
-            return self._robot
-
-    def _remove_folder(self, folder: Path) -> None:
-        """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
-        if self._robot is None or self._robot.down:
-            shutil.rmtree(folder, ignore_errors=True)
-
     @property
     def ending(self) -> bool:
         """Whether the launch is on its way down."""
-        return self._closed
+        return self._ending.is_set()
 
     def machines(self) -> list[RunningMachine]:
         """Return the machines that are up now."""
@@ -392,7 +331,7 @@ class Launch:
         Returns the errors of undo steps that failed; the other undo steps ran.
         """
         with self._lock:
-            self._closed = True
+            self._ending.set()
         self.cancel.set()
         ups = dict(self._ups)
         with ThreadPoolExecutor(max(1, len(ups)), 'fog-down') as pool:
@@ -409,37 +348,14 @@ class Launch:
             self._ups.clear()
             # whatever failed before, the VPN interface has to go
             self.undo.close()
-            failures, self._failures = self._failures + list(known.values()), []
+            failures = [*self._failures, *known.values()]
+            self._failures.clear()
         if unexpected is not None:
-            for name, error in known.items():
+            for name, failure in known.items():
                 # the exception below replaces the return value: report these errors here
-                self.report(StepFailed(name, 'end', 0.0, str(error), fatal=False))
+                self.report(StepFailed(name, 'end', 0.0, str(failure), fatal=False))
             raise unexpected
         return failures
-
-    def attempt(self, machine: str, name: str, undo: Callable[[], None]) -> None:
-        """Run an undo step; if it fails, report and remember the error."""
-        begin = time.monotonic()
-        try:
-            undo()
-        except FogError as error:
-            self.undo_failed(machine, name, error, time.monotonic() - begin)
-
-    def undo_failed(
-        self, machine: str, name: str, error: FogError, seconds: float = 0.0,
-    ) -> None:
-        """Report and remember the error of an undo step."""
-        self.report(StepFailed(machine, name, seconds, str(error)))
-        with self._lock:
-            self._failures.append(error)
-
-    def robot(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
-        """Run commands on the robot, one after the other; return the last one's output."""
-        output = ''
-        for command in commands:
-            output = process.run(command, timeout=self.timeouts.vpn,
-                                 cancel=self.cancel if cancel else None).stdout
-        return output
 
 
 def _end(up: Future[RunningMachine]) -> None:

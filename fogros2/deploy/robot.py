@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import os
 from pathlib import Path
 import shutil
 import threading
+from typing import Optional
 
 from fogros2 import plugin_system, process, ros2_daemon
 from fogros2.errors import PrerequisiteError
+from fogros2.model import Command
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step
 from fogros2.store import Record, Store
@@ -34,6 +37,16 @@ def provider(name: str) -> Provider:
     """
     instance: Provider = plugin_system.load('fogros2.provider', name)()
     return instance
+
+
+def run(
+    commands: Iterable[Command], *, timeout: float, cancel: Optional[threading.Event] = None,
+) -> str:
+    """Run commands on the robot, one after the other; return the last one's output."""
+    output = ''
+    for command in commands:
+        output = process.run(command, timeout=timeout, cancel=cancel).stdout
+    return output
 
 
 def check_robot() -> None:
@@ -83,7 +96,6 @@ def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
         with step(report, record.name, 'VPN interface'):
             ros2_daemon.stop(store.launch(record.launch))
             vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
-            for command in vpn.down(record.robot_vpn):
-                process.run(command, timeout=Timeouts().vpn)
+            run(vpn.down(record.robot_vpn), timeout=Timeouts().vpn)
             shutil.rmtree(store.launch(record.launch), ignore_errors=True)
-    store.machine(record.name).delete()
+    store.delete(record.name)

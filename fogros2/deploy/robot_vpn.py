@@ -3,58 +3,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 from pathlib import Path
 import threading
 import time
-from typing import Optional, TYPE_CHECKING
+from typing import Optional
 
-from fogros2 import plan, plugin_system, process
+from fogros2 import plan, process
+from fogros2.deploy.robot import run
+from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.report import step, StepFailed
+from fogros2.report import Reporter, step, StepFailed
 from fogros2.vpn import addresses, helped, Vpn
-
-if TYPE_CHECKING:
-    from fogros2.deploy.launch import Launch
+from fogros2.waiting import Periodic
 
 #: Seconds between two refreshes of sudo's ticket, which is valid for some minutes.
 TICKET_REFRESH = 30.0
 #: Seconds that a new machine waits for the others to add it as a peer.
-TELLING = 5.0
-#: Longest interval in seconds between two attempts to repair the interface.
-SELDOM = 15.0
+UPDATE_TIMEOUT = 5.0
+#: Interval in seconds of the health check, and the longest one between attempts to repair.
+POLL_INTERVAL, LONGEST_POLL_INTERVAL = 1.0, 15.0
+
+
+def choose_interface(
+    launch_id: str, folder: Path, environment: Mapping[str, str], timeout: float,
+) -> VpnInterface:
+    """
+    Return an interface with a subnet and a port that this computer does not use.
+
+    :param folder: the launch's folder.
+    :raises FogError: there is none, or this computer's networks cannot be read.
+    """
+    used = addresses.parse_used(run([addresses.used_networks()], timeout=timeout))
+    network = addresses.choose_subnet(
+        used, launch_id=launch_id, pool=addresses.pool_from(environment))
+    interface = plan.robot_interface(
+        launch_id, network, addresses.choose_port(environment), str(folder / 'vpn.key'))
+    if helped.permitted():
+        return dataclasses.replace(interface, key_file=helped.key_file(interface.name))
+    return interface
 
 
 class RobotVpn:
-    """The robot's VPN interface, one for each launch, and the machines that it connects."""
+    """
+    The robot's VPN interface, one for each launch, and the machines that it connects.
 
-    #: True while no part of the interface exists on this computer.
-    down = True
-    _ticket = True
-    _told_of_sudo = False
+    :param undo: the launch's undo steps.
+    :param timeout: of the commands for the interface, in seconds.
+    :param cancel: set when the launch is cancelled.
+    :param ending: set when the launch is on its way down.
+    """
 
-    def __init__(self, launch: Launch, folder: Path) -> None:
-        self._launch = launch
+    def __init__(
+        self, interface: VpnInterface, vpn: Vpn, *, report: Reporter, undo: UndoStack,
+        timeout: float, cancel: threading.Event, ending: threading.Event,
+    ) -> None:
+        self.interface = interface
+        self.vpn = vpn
+        #: True while no part of the interface exists on this computer.
+        self.down = True
+        self._report = report
+        self._undo = undo
+        self._timeout = timeout
+        self._cancel = cancel
+        self._ending = ending
         self._lock = threading.Lock()
-        self._up = False
         self._members: dict[str, VpnMember] = {}
-        self._public_key = ''
+        #: The robot as the machines' peer while the interface is up.
+        self._peer: Optional[Peer] = None
         self._stop = threading.Event()
-        self.vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-            domain=launch.domain, ports=launch.dds().ports)
-        used = addresses.parse_used(launch.robot([addresses.used_networks()]))
-        network = addresses.choose_subnet(
-            used, launch_id=launch.id, pool=addresses.pool_from(launch.user_environment))
-        self.interface = plan.robot_interface(
-            launch.id, network, addresses.choose_port(launch.user_environment),
-            str(folder / 'vpn.key'))
-        if helped.permitted():
-            self.interface = dataclasses.replace(
-                self.interface, key_file=helped.key_file(self.interface.name))
-            # sudo's ticket then serves only container machines: without a ticket, refresh none
-            self._ticket = process.refresh_ticket()
+        self._poll_interval = POLL_INTERVAL
+        # the helper needs no ticket; container machines then refresh one that is there
+        self._ticket = not helped.made(interface) or process.refresh_ticket()
+        self._ticket_valid = True
+        self._ticket_refreshed = time.monotonic()
 
     def ensure(self) -> Peer:
         """
@@ -63,25 +87,27 @@ class RobotVpn:
         :raises Cancelled: the launch has taken the interface down.
         """
         with self._lock:
-            if not self._up:
-                launch = self._launch
+            if self._peer is None:
                 if self._stop.is_set():
                     # a thread that still updates a machine's peers may come late; nothing would
                     # take the interface down a second time
                     raise Cancelled('the VPN interface')
-                with step(launch.report, '', 'VPN interface') as detail:
-                    launch.undo.callback(launch.attempt, '', 'VPN interface', self._take_down)
+                with step(self._report, '', 'VPN interface') as detail:
+                    self._undo.add('VPN interface', self._take_down)
                     self.down = False
-                    self._public_key = launch.robot([self.vpn.keys(self.interface)]).strip()
+                    public_key = self._run([self.vpn.keys(self.interface)]).strip()
                     self._bring_up()
                     detail.append(f'{self.interface.name} {self.interface.address}')
-                self._up = True
-                threading.Thread(target=self._keep, name='fog-vpn', daemon=True).start()
-            return Peer('robot', self._public_key, self.interface.address)
+                self._peer = Peer('robot', public_key, self.interface.address)
+                Periodic('fog-vpn', POLL_INTERVAL, self.check_health, stop=self._stop)
+            return self._peer
+
+    def _run(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
+        return run(commands, timeout=self._timeout, cancel=self._cancel if cancel else None)
 
     def _bring_up(self) -> None:
         try:
-            self._launch.robot(self.vpn.up(self.interface, []))
+            self._run(self.vpn.up(self.interface, []))
         except CommandError as error:
             if 'Address already in use' in error.result.stderr:
                 raise VpnError(
@@ -94,15 +120,15 @@ class RobotVpn:
         """Return the current peers of a machine."""
         robot = self.ensure()
         with self._lock:
-            others = [other.place for name, other in sorted(self._members.items())
+            others = [other.route for name, other in sorted(self._members.items())
                       if name != member.name]
-        return plan.machine_peers(robot, member.place, others)
+        return plan.machine_peers(robot, member.route, others)
 
     def admit(self, member: VpnMember) -> None:
         """Add a machine to the robot's peers."""
         with self._lock:
             self._members[member.name] = member
-            self._launch.robot(self.vpn.peers(self.interface, self._sorted()))
+            self._run(self.vpn.peers(self.interface, self._peers()))
 
     def spread(self, new: VpnMember) -> None:
         """
@@ -113,24 +139,24 @@ class RobotVpn:
         new.update(self)
         with self._lock:
             others = [member for member in self._members.values() if member is not new]
-        threads = [threading.Thread(target=self._tell, args=(other,), name='fog-peers',
+        threads = [threading.Thread(target=self._update, args=(other,), name='fog-peers',
                                     daemon=True) for other in others]
         for thread in threads:
             thread.start()
-        until = time.monotonic() + TELLING
+        until = time.monotonic() + UPDATE_TIMEOUT
         for thread in threads:
             thread.join(max(0.0, until - time.monotonic()))
 
-    def _tell(self, member: VpnMember) -> None:
+    def _update(self, member: VpnMember) -> None:
         """Update a machine's peers; retry until that succeeds."""
         pause = 1.0
-        while not self._launch.ending and self._members.get(member.name) is member:
+        while not self._ending.is_set() and self._members.get(member.name) is member:
             try:
                 member.update(self)
                 return
             except FogError as error:
-                if pause == 1.0 and not self._launch.ending:
-                    self._launch.report(StepFailed(
+                if pause == 1.0 and not self._ending.is_set():
+                    self._report(StepFailed(
                         member.name, 'VPN peers', 0.0,
                         f'does not know a new machine yet, trying again: {error}', fatal=False))
             self._stop.wait(pause)
@@ -140,48 +166,40 @@ class RobotVpn:
         """Remove a machine from the robot's peers, unless the whole launch is ending."""
         with self._lock:
             gone = self._members.pop(name, None)
-            if gone is not None and self._up and not self._launch.ending:
-                self._launch.robot(
-                    self.vpn.peers(self.interface, self._sorted()), cancel=False)
+            if gone is not None and self._peer is not None and not self._ending.is_set():
+                self._run(self.vpn.peers(self.interface, self._peers()), cancel=False)
 
-    def _sorted(self) -> list[Peer]:
-        return [self._members[name].place.peer for name in sorted(self._members)]
+    def _peers(self) -> list[Peer]:
+        return [self._members[name].route.peer for name in sorted(self._members)]
 
-    def _keep(self) -> None:
-        """Restart the interface's program when it ends; nodes do not notice."""
-        asked = time.monotonic()
-        pause = 1.0
-        while not self._stop.wait(pause):
-            if self._ticket and time.monotonic() - asked > TICKET_REFRESH:
-                asked = time.monotonic()
-                self._refresh_ticket()
-            with self._lock:
-                if self._stop.is_set():
-                    return
-                if self._launch.ending:
-                    continue  # the networks that lead to the machines end with them
-                # report a lasting failure now and then, not every second
-                pause = min(2 * pause, SELDOM)
-                try:
-                    alive = process.run(self.vpn.alive(self.interface), check=False,
-                                        timeout=self._launch.timeouts.vpn)
-                    if alive.returncode == 0:
-                        pause = 1.0
-                        continue
-                    with step(self._launch.report, '', 'VPN repair', fatal=False):
-                        self._launch.robot(
-                            self.vpn.repair(self.interface, self._sorted()), cancel=False)
-                    pause = 1.0
-                except FogError:
-                    pass  # the step has reported a failed repair; the next round tries again
+    def check_health(self) -> float:
+        """
+        Restart the interface's program if it has ended; nodes do not notice.
+
+        Return the seconds until the next check: a lasting failure is reported now and then.
+        """
+        if self._ticket and time.monotonic() - self._ticket_refreshed > TICKET_REFRESH:
+            self._ticket_refreshed = time.monotonic()
+            self._refresh_ticket()
+        with self._lock:
+            if self._stop.is_set() or self._ending.is_set():
+                return self._poll_interval  # the networks that lead to the machines end with them
+            self._poll_interval = min(2 * self._poll_interval, LONGEST_POLL_INTERVAL)
+            try:
+                if process.run(self.vpn.health_check(self.interface), check=False,
+                               timeout=self._timeout).returncode != 0:
+                    with step(self._report, '', 'VPN repair', fatal=False):
+                        self._run(self.vpn.repair(self.interface, self._peers()), cancel=False)
+                self._poll_interval = POLL_INTERVAL
+            except FogError:
+                pass  # the step has reported a failed repair; the next check tries again
+            return self._poll_interval
 
     def _refresh_ticket(self) -> None:
-        """Refresh sudo's ticket, so that the way down needs no password; warn once if it fails."""
-        if process.refresh_ticket():
-            self._told_of_sudo = False
-        elif not self._told_of_sudo:
-            self._told_of_sudo = True
-            self._launch.report(StepFailed(
+        """Refresh sudo's ticket, so that the way down needs no password; warn if it has ended."""
+        before, self._ticket_valid = self._ticket_valid, process.refresh_ticket()
+        if before and not self._ticket_valid:
+            self._report(StepFailed(
                 '', 'sudo ticket', 0.0,
                 'sudo wants a password again, so taking this launch down will leave its '
                 'containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; else '
@@ -190,8 +208,8 @@ class RobotVpn:
     def _take_down(self) -> None:
         self._stop.set()
         with self._lock:
-            self._up = False
-            self._launch.robot(self.vpn.down(self.interface), cancel=False)
+            self._peer = None
+            self._run(self.vpn.down(self.interface), cancel=False)
             self.down = True
 
 
@@ -199,49 +217,51 @@ class VpnMember:
     """
     A machine in the VPN, whose peers are updated when other machines join.
 
-    :param on: runs commands on the machine.
-    :param keep: makes the machine's agent repair the interface with these peers.
+    :param run: runs commands on the machine.
+    :param health_check: makes the machine's agent check and repair the interface with these
+        peers.
     """
 
     def __init__(
-        self, place: plan.Place, interface: VpnInterface,
-        on: Callable[[Iterable[Command]], str], keep: Callable[[Sequence[Peer]], None],
+        self, route: plan.Route, interface: VpnInterface,
+        run: Callable[[Iterable[Command]], object],
+        health_check: Callable[[Sequence[Peer]], object],
     ) -> None:
-        self.place = place
-        self.name = place.peer.name
+        self.route = route
+        self.name = route.peer.name
         self.interface = interface
-        self._on = on
-        self._keep = keep
+        self._run = run
+        self._health_check = health_check
         self._lock = threading.Lock()
-        #: None until the interface is up.
-        self._told: Optional[list[Peer]] = None
-        self._kept: Optional[list[Peer]] = None
+        #: Peers of the interface and of its health check; None until the interface is up.
+        self._peers: Optional[list[Peer]] = None
+        self._checked: Optional[list[Peer]] = None
 
     def up(self, robot: RobotVpn) -> None:
         """Bring the machine's interface up with its current peers."""
         with self._lock:
-            self._told = robot.peers_of(self)
-            self._on(robot.vpn.up(self.interface, self._told))
+            self._peers = robot.peers_of(self)
+            self._run(robot.vpn.up(self.interface, self._peers))
 
     def update(self, robot: RobotVpn) -> None:
         """Send the machine and its agent the current peers, if these have changed."""
         with self._lock:
-            if self._told is None:
+            if self._peers is None:
                 return  # ``up`` will use the peers of that moment
             peers = robot.peers_of(self)
-            if peers != self._told:
-                self._on(robot.vpn.peers(self.interface, peers))
-                self._told = peers
-            if peers != self._kept:
-                self._keep(peers)
-                self._kept = peers
+            if peers != self._peers:
+                self._run(robot.vpn.peers(self.interface, peers))
+                self._peers = peers
+            if peers != self._checked:
+                self._health_check(peers)
+                self._checked = peers
 
     def redial(self, robot: RobotVpn, endpoint: str) -> None:
         """Make the machine dial the robot at another ``host:port`` from now on."""
-        before = self.place
-        self.place = dataclasses.replace(before, robot_endpoint=endpoint)
+        before = self.route
+        self.route = dataclasses.replace(before, robot_endpoint=endpoint)
         try:
             self.update(robot)
         except FogError:
-            self.place = before  # so that the next check tries again
+            self.route = before  # so that the next check tries again
             raise

@@ -4,67 +4,51 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import contextlib
-import dataclasses
+import json
 import threading
-from typing import Any, Optional, TYPE_CHECKING
+from typing import Any, Optional
 
-from fogros2 import monitor_addresses
-from fogros2.agent_client import AgentClient, Heartbeat
-from fogros2.deploy.beside import Containers
-from fogros2.deploy.equipping import Equipment
-from fogros2.deploy.job import Job, SILENT
-from fogros2.deploy.watching import Watch
+from fogros2.agent_client import EventCallback
+from fogros2.deploy.context import Context
+from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
+from fogros2.deploy.steps.containers import Containers
+from fogros2.deploy.steps.installing import Modules
+from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import AgentError
-from fogros2.model import Machine, NodeSpec, VpnInterface
-from fogros2.shell import Shell
-
-if TYPE_CHECKING:
-    from fogros2.deploy.launch import Launch
+from fogros2.events import Event
+from fogros2.model import host_port, Machine, NodeSpec, to_json
 
 
-#: Events that the robot's side alone emits; events of the agent have a ``seq``.
-_OURS = ('lost', 'connection', 'gap')
-
-
-class RunningMachine:
+class RunningMachine(Step):
     """
     A machine of the launch that is up, and the nodes on it.
 
-    :param first_event: number of the first agent event that belongs to this launch.
-    :param found: called with the provider's report when the machine exists but is silent.
-    :param equipment: installs what some nodes import.
+    :param modules: installs what some nodes import.
     :param containers: downloads the images that some nodes run in.
+    :param found: called with the provider's report when the machine exists but is silent.
     """
 
     def __init__(
-        self, launch: Launch, job: Job, machine: Machine, shell: Shell, agent: AgentClient,
-        heartbeat: Heartbeat, interface: VpnInterface, first_event: int,
-        found: Callable[[Machine], None], equipment: Equipment, containers: Containers,
+        self, context: Context, job: MachineJob, modules: Modules, containers: Containers,
+        found: Callable[[Machine], None] = lambda machine: None,
     ) -> None:
+        super().__init__(context, job)
         self.spec = job.spec
-        self.machine = machine
-        self.shell = shell
-        self.agent = agent
-        self.heartbeat = heartbeat
-        self.vpn_address = interface.address
-        self.interface = interface
-        #: The undo stack that ends the machine.
-        self.undo = contextlib.ExitStack()
-        self._launch = launch
-        self._job = job
-        self._equipment = equipment
+        self.machine = job.machine
+        self.shell = job.shell
+        self.agent = job.agent
+        self.heartbeat = job.heartbeat
+        self.interface = job.interface
+        self.vpn_address = job.interface.address
+        self._modules = modules
         self._containers = containers
-        self._first_event = first_event
         self._warm = False
         self._lock = threading.Lock()
-        self._callbacks: list[Callable[[dict[str, Any]], None]] = []
+        self._callbacks: list[EventCallback] = []
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
-        self._watch: Optional[Watch] = None
-        if job.provider.owned:
-            self._watch = Watch(job, agent, heartbeat, gone=self._gone, found=found)
-            job.undo.callback(self._watch.close)
+        if context.capabilities.owned:
+            job.undo.callback(Watch(context, job, gone=self._gone, found=found).close)
 
     def warm(self) -> None:
         """Start the machine's launch process ahead of its nodes; once."""
@@ -78,8 +62,8 @@ class RunningMachine:
 
         :raises PrerequisiteError: the machine cannot get their imports or their image.
         """
-        nodes = self._equipment.fitted(self._containers.inside(nodes))
-        self.agent.request('start', nodes=[_json(node) for node in nodes])
+        nodes = self._modules.fitted(self._containers.inside(nodes))
+        self.agent.request('start', nodes=json.loads(to_json(nodes)))
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes by SIGINT, SIGTERM, SIGKILL in turn; all nodes if ``ids`` is None."""
@@ -91,9 +75,9 @@ class RunningMachine:
 
     def _request(self, command: str, **arguments: Any) -> None:
         """Send the agent a request, with a shorter time-out while the launch ends."""
-        if self._launch.cancel.is_set():
-            self.agent.request(
-                command, timeout=self._job.patience(30.0), silent=SILENT, **arguments)
+        if self._context.cancel.is_set():
+            self.agent.request(command, timeout=self._job.timeout(30.0),
+                               silent=SILENCE_TIMEOUT, **arguments)
         else:
             self.agent.request(command, timeout=30.0, **arguments)
 
@@ -101,45 +85,37 @@ class RunningMachine:
         """Record the TCP port of the Foxglove bridge on the machine."""
         self._job.save(monitor=port)
 
-    def publish(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
+    def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """
         Open a TCP port of the machine until the machine ends; return (host, port) to connect to.
 
         :param sources: networks (CIDR) that may connect.
         :raises FogError: the provider cannot open the port.
         """
-        job = self._job
+        job, provider = self._job, self._context.provider
 
         def close() -> None:
             # the firewall rule of a deleted machine goes with the machine
             if job.survives or job.spec.on_exit == 'stop':
-                job.provider.publish(self.machine, port, ())
+                provider.open_port(self.machine, port, ())
 
         if port not in self._published:  # a program that listens there may have restarted
-            self.undo.callback(job.undone, 'port of the monitor', close)
-            self._published[port] = job.provider.publish(self.machine, port, sources)
-            job.save(monitor_open=monitor_addresses.place(*self._published[port]))
+            job.undoing('port of the monitor', close)
+            self._published[port] = provider.open_port(self.machine, port, sources)
+            job.save(monitor_open=host_port(*self._published[port]))
         return self._published[port]
 
-    def subscribe(self, callback: Callable[[dict[str, Any]], None]) -> None:
+    def subscribe(self, callback: EventCallback) -> None:
         """
         Pass every event of the machine since the start of this launch to ``callback``.
 
         A thread of the connection or of the watch calls it; ``callback`` must not send requests to
-        the agent. In addition to the agent's events (see ``agent.py``) there are:
-
-        ``{'event': 'notice', 'reason': ...}``  a preemption notice, once: the provider will
-            reclaim the machine. The agent still answers requests until then.
-        ``{'event': 'lost', 'reason': ...}``  the machine ended, stopped or was evicted; once, and
-            the last event. Requests fail from now on.
-        ``{'event': 'connection', 'state': 'lost' | 'back' | 'absent'}``  the connection changed.
-        ``{'event': 'gap', 'count': n}``  n events were dropped from the agent's log.
+        the agent. After ``MachineLost`` requests fail.
         """
-        def tell(event: dict[str, Any]) -> None:
-            if self._lost or event['event'] in _OURS and 'seq' in event:
-                return  # a hijacked agent must not forge these events
+        def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
-            if event['event'] != 'connection' or not self._launch.ending:
+            expected = event['event'] == 'connection' and self._context.ending.is_set()
+            if not self._lost and not expected:
                 callback(event)
 
         with self._lock:
@@ -149,7 +125,7 @@ class RunningMachine:
             callback({'event': 'lost', 'reason': lost})
             return
         try:
-            self.agent.subscribe(tell, since=self._first_event)
+            self.agent.subscribe(tell, since=self._job.first_event)
         except AgentError:
             # another thread may have reported the loss and closed the connection meanwhile
             if not self._lost:
@@ -166,8 +142,4 @@ class RunningMachine:
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
-        self.undo.close()
-
-
-def _json(node: NodeSpec) -> dict[str, Any]:
-    return {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
+        self._job.undo.close()

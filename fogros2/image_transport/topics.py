@@ -17,8 +17,8 @@ import re
 import shlex
 from typing import Any, Optional
 
-from fogros2 import modules
 from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.host import modules
 from fogros2.model import NodeSpec, Stream
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')

@@ -2,8 +2,8 @@
 """
 The client of a Kubernetes API server, for the shell and the provider of pods.
 
-``configuration`` reads the kubeconfig, ``answers`` parses responses and errors, ``watch`` watches
-objects, ``api`` sends requests.
+``configuration`` reads the kubeconfig, ``answers`` parses responses and errors, ``api`` sends
+requests and watches objects.
 """
 
 from fogros2.kubernetes_client.answers import ApiError, items, path, selector, Unreachable

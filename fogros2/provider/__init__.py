@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The seam to those who have computers: AWS, Kubernetes, a container engine, a host by SSH."""
+"""
+The plugin interface to computers: a cloud, a cluster, a container engine, an existing host.
+
+In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
+file's options), this module, then a module or package for each provider:
+``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by clouds of virtual machines), ``aws``.
+"""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
 from decimal import Decimal
 import threading
 from typing import ClassVar, Optional
 
 from fogros2.errors import ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
+from fogros2.provider.offers import Offers, Region, Wants
 from fogros2.waiting import wait_until
 
-#: Tags that the core puts on everything; the provider's copy of them is the truth.
+#: Tags that the core puts on every resource; the provider's copy of them is the truth.
 TAG_NAME = 'fogros2-name'
 TAG_ROBOT = 'fogros2-robot'
 TAG_LAUNCH = 'fogros2-launch'
@@ -22,79 +30,112 @@ TAG_ON_EXIT = 'fogros2-on-exit'
 TAG_DEPENDENCIES = 'fogros2-dependencies'
 
 
+@dataclasses.dataclass(frozen=True)
+class Capabilities:
+    """
+    What a provider can do besides the four methods that every provider has.
+
+    A method of :class:`Provider` that needs a capability names it; without the capability, the
+    core does not call the method.
+
+    :param shell_kind: name of the shell plugin that reaches its machines.
+    :param owned: it creates machines for a launch; False for computers that exist already.
+    :param containers: a container engine can run on its machines, without an option for it.
+    :param firewall: ``allow`` and ``robot_address`` decide who reaches a machine. The launch then
+        closes the SSH port as soon as the VPN works.
+    :param one_time_host_key: other programs may have read the host key that ``describe`` reports.
+        The launch then has the machine generate another one, and calls ``pin``.
+    :param stop: ``stop`` and ``start`` keep a machine's disk.
+    :param images: ``bake``, ``images`` and ``delete_image`` work.
+    :param choices: ``resolve`` may change a spec.
+    :param adopt: ``adopt`` changes how an existing machine ends.
+    :param regions: it has regions: ``region_names``, ``regions``, ``search_in``.
+    :param prices: ``offers`` lists types of machines with prices.
+    :param agent_directory: folder on the machine of the agent that ``create`` starts at boot; ''
+        if the launch starts the agent over the first connection.
+    :param agent_program: path on the machine of that agent's program.
+    :param application_port: TCP port on the machine's loopback where ``create`` serves the
+        request's application, 0 if it serves none.
+    :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0
+        means that the provider is about to reclaim the machine; the output has reason and time.
+    """
+
+    shell_kind: str = 'ssh'
+    owned: bool = True
+    containers: bool = True
+    firewall: bool = False
+    one_time_host_key: bool = False
+    stop: bool = False
+    images: bool = False
+    choices: bool = False
+    adopt: bool = False
+    regions: bool = False
+    prices: bool = False
+    agent_directory: str = ''
+    agent_program: str = ''
+    application_port: int = 0
+    preemption_notice: tuple[str, ...] = ()
+
+    @property
+    def boots_agent(self) -> bool:
+        """Whether ``create`` starts the agent at boot."""
+        return bool(self.agent_directory)
+
+
 class Provider(abc.ABC):
     """
-    Somebody who has machines.
+    A source of machines.
 
-    Subclasses write four methods, synchronously; they are called from several threads at once.
-    Their SDK's errors become FogErrors with ``raise ... from``. A machine's id is theirs alone.
+    A subclass implements ``create``, ``describe``, ``find`` and ``destroy``; each other method
+    has a default. Several threads call the methods at the same time. An SDK's error is raised as
+    a FogError with ``raise ... from``. Only the provider reads a machine's id.
     """
 
     name: ClassVar[str]
-    #: Kind of shell that its machines are reached by, so that it can be loaded beforehand.
-    shell_kind: ClassVar[str] = 'ssh'
-    #: Folder of the agent that ``create`` starts at boot, and its program on the machine; ''
-    #: where it starts none, and the deployment does as soon as it has a shell.
-    agent_directory: ClassVar[str] = ''
-    agent_program: ClassVar[str] = ''
-    #: Whether its computers are made for a launch, not somebody's that exist already.
-    owned: ClassVar[bool] = True
-    #: Whether a container engine can run on its machines, unasked.
-    runs_containers: ClassVar[bool] = True
-    #: Port of the machine's loopback at which ``create`` serves the request's application, 0 where
-    #: it serves none.
-    application_port: ClassVar[int] = 0
-    #: Seconds between two looks at a machine that comes up slowly, at the most.
-    look_interval: ClassVar[float] = 3.0
-    #: Whether ``allow`` decides who reaches a machine; the launch then closes the SSH port as soon
-    #: as the VPN carries the connection.
-    firewall: ClassVar[bool] = False
-    #: Whether the host key that ``describe`` tells was handed over at boot, where others may read
-    #: it: the launch then has the machine make another at once, and calls ``pin``.
-    one_time_host_key: ClassVar[bool] = False
-    #: Command line that an agent runs as root every few seconds; once it exits with 0 the machine
-    #: is about to be taken away, and what it printed says why and when. Empty: no such notice.
-    notice: ClassVar[tuple[str, ...]] = ()
-    #: Set when the launch that this provider works for is to end: long calls on the way up give
-    #: up with Cancelled. Calls that begin later belong to the way down.
+    capabilities: ClassVar[Capabilities] = Capabilities()
+    #: Maximum pause in seconds between two requests of ``reachable``.
+    poll_interval: ClassVar[float] = 3.0
+    #: Set when the launch or the verb that uses this provider ends. Long calls, such as
+    #: ``create`` and ``reachable``, then raise Cancelled; ``destroy`` and ``stop`` continue.
     cancel: Optional[threading.Event] = None
+
+    # -- before a machine exists ----------------------------------------------------------------
 
     @classmethod
     def configured(cls) -> bool:
         """
-        Return whether somebody has set this provider up here (credentials, a configuration file).
+        Return whether this provider is set up here (credentials, a configuration file).
 
-        Asked by the command line before anything is loaded: one that isn't set up is left out of
-        what goes to all providers, unless a record or an option names it. Files and variables
-        alone; no SDK. A provider that takes long to import has it as an entry point of the group
-        ``fogros2.configured`` as well, which is asked in its place.
+        The command line skips a provider that is not, unless a record or an option names it. The
+        method reads only files and variables and loads no SDK. A provider that is slow to import
+        is also an entry point of the group ``fogros2.configured``, which is called instead.
         """
         return True
 
     def answers(self) -> str:
         """
-        Ask for as little as possible, and return a few words for people (account, version).
+        Make the smallest request, and return a few words for people (account, version).
 
-        :raises FogError: it can't be reached, or doesn't take our credentials.
+        :raises FogError: the provider does not answer, or refuses the credentials.
         """
         count = sum(1 for _ in self.find({}))
         return f'answers, {count} machine{"" if count == 1 else "s"}'
 
     def check(self, spec: MachineSpec) -> None:
         """
-        Look for everything ``create`` will need, quickly and at no cost.
+        Check everything that ``create`` needs, quickly and at no cost.
 
-        :raises ConfigurationError: an option is unknown or its value is wrong.
+        :raises ConfigurationError: an option is unknown or has a wrong value.
         :raises PrerequisiteError: this computer lacks something.
         """
 
     def check_containers(self, spec: MachineSpec) -> None:
         """
-        Look whether a container engine can run on a machine of this spec.
+        Check that a container engine can run on a machine with this spec.
 
-        :raises Unsupported: it can't.
+        :raises Unsupported: it cannot.
         """
-        if not self.runs_containers:
+        if not self.capabilities.containers:
             raise Unsupported(
                 f"'{spec.name}' can't run containers: a machine of the provider '{self.name}' "
                 "hasn't the rights that an engine takes",
@@ -103,81 +144,75 @@ class Provider(abc.ABC):
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """
-        Return the spec with every open choice made ('nearest' region, 'cheapest' type).
+        Resolve open choices of a spec, such as 'nearest' and 'cheapest' (``choices``).
 
-        May ask the provider, at no cost; called once, after ``check`` and before ``create``.
+        Called once, after ``check`` and before ``create``; it may make requests at no cost.
 
-        :raises FogError: nothing there is fits, or nobody answers.
+        :raises FogError: nothing fits, or the provider does not answer.
         """
         return spec
 
     def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
-        """Return in words, for people, what ``resolve`` has made of a spec."""
+        """Describe for people what ``resolve`` has changed."""
         return [f'{key} {" or ".join(map(str, value)) if _is_list(value) else value}'
                 for key, value in sorted(chosen.options.items())
                 if asked.options.get(key) != value]
 
     def architecture(self, spec: MachineSpec) -> str:
         """
-        Return the processor architecture that a machine of a resolved spec will have.
+        Return the processor architecture of a machine with a resolved spec.
 
-        :returns: as ``uname -m`` has it (``x86_64``, ``aarch64``), '' where it isn't known yet.
-        :raises FogError: nobody answers.
+        :returns: as ``uname -m`` prints it (``x86_64``, ``aarch64``), '' if it is not known yet.
+        :raises FogError: the provider does not answer.
         """
         return ''
 
-    def shown(self, spec: MachineSpec) -> Sequence[str]:
-        """Return the folders of this computer that a machine of a spec has too."""
+    def shared_folders(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the folders of this computer that the machine also has."""
         return ()
 
+    def has_own_packages(self, spec: MachineSpec) -> bool:
+        """Return whether the machine may have ROS packages that this computer does not have."""
+        return False
+
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
-        """Return what a machine of a resolved spec will cost (US dollars), None if unknown."""
+        """Return the price of a machine with a resolved spec in US dollars, None if unknown."""
         return None
+
+    # -- a machine's life -----------------------------------------------------------------------
 
     @abc.abstractmethod
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """
-        Ask for a machine and return its id at once, without waiting for it to run.
+        Request a machine and return its id at once, without waiting until it runs.
 
-        Called again with the same ``request.token`` it returns the same machine.
+        A second call with the same ``request.token`` returns the same machine.
 
-        :raises ProviderError: refused; nothing is left behind then.
+        :raises NameTaken: a machine of this name exists, created with another token.
+        :raises ProviderError: refused; nothing is left behind. ``refused`` of the error is False
+            if a machine may exist in spite of it.
         """
-
-    def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
-        """
-        Let a machine that an earlier launch kept or stopped be this launch's.
-
-        Called before it is started or connected to. A provider whose machines say by themselves
-        until when they live, and how they end, writes that anew.
-
-        :param spec: this launch's; ``on_exit`` says how the machine ends from now on.
-        :param tags: those of the core's that are others by now.
-        """
-
-    def notice_for(self, machine: Machine) -> tuple[str, ...]:
-        """Return ``notice`` for a machine that can be taken away, () for one that isn't."""
-        return self.notice
 
     @abc.abstractmethod
     def describe(self, machine_id: str) -> Machine:
         """
-        Return what is known of a machine now.
+        Return the current state of a machine.
 
-        ``shell`` is set, with the host key to pin, as soon as a connection can be tried. By then
-        ``vpn_host`` says where the robot dials the machine's VPN port; where nobody outside can,
-        ``robot_host`` says where the machine dials the robot, and where the robot is by now each
-        time that this is asked.
+        ``shell`` is set, with the host key to pin, as soon as a connection can be tried. From then
+        on ``vpn_host`` is the address of the machine's VPN port. If nobody outside can reach that
+        port, ``robot_host`` is the robot's current address, to which the machine connects.
+        ``end_command`` is required for a machine that was created for a launch: the agent runs it
+        as root when the robot is gone, and it must end the billing.
 
-        :raises MachineNotFound: it doesn't exist (any more).
+        :raises MachineNotFound: the machine does not exist (any more).
         """
 
     @abc.abstractmethod
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
         """
-        Yield the machines that carry all of ``tags``, in any state but deleted.
+        Yield the machines that have all of ``tags``, in any state but deleted.
 
-        An empty mapping finds every machine of FogROS2's.
+        An empty mapping finds every machine of FogROS2.
 
         :raises Unsupported: the provider keeps no tags.
         """
@@ -185,45 +220,32 @@ class Provider(abc.ABC):
     @abc.abstractmethod
     def destroy(self, machine_id: str) -> None:
         """
-        End a machine and everything made for it, and return when it is gone.
+        Delete a machine and everything created for it; return when all of it is gone.
 
-        Idempotent: an id that is unknown, or gone already, is no error.
+        Idempotent: an id that is unknown or already deleted is no error.
         """
 
-    def tidy(self) -> list[str]:
+    def capabilities_of(self, machine: Machine) -> Capabilities:
+        """Return the capabilities of one machine, if they depend on it (a spot instance)."""
+        return self.capabilities
+
+    def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
         """
-        Delete what machines that ended by themselves left behind, and say what, for people.
+        Give a kept or stopped machine to this launch, before it is started or connected to.
 
-        What belongs to a machine that exists, or is being made, stays.
+        A provider that stores on the machine how it ends replaces that (``adopt``).
+
+        :param spec: this launch's; ``on_exit`` is how the machine ends from now on.
+        :param tags: the core's tags that change.
         """
-        return []
 
-    def stop(self, machine_id: str) -> None:
+    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
         """
-        Stop a machine so that it can be started again with its disk as it is.
+        Wait until a machine runs and a connection can be tried; return it.
 
-        :raises Unsupported: the provider can't.
-        """
-        raise Unsupported(f"provider '{self.name}' can't stop a machine",
-                          "use on_exit='keep' or 'delete'")
+        A provider whose API can be watched overrides this method instead of polling.
 
-    def start(self, machine_id: str) -> None:
-        """
-        Start a stopped machine again.
-
-        :raises Unsupported: the provider can't.
-        """
-        raise Unsupported(f"provider '{self.name}' can't start a machine")
-
-    def reachable(
-        self, machine_id: str, *, name: str, timeout: float, cancel: threading.Event,
-    ) -> Machine:
-        """
-        Wait until a machine runs and a connection can be tried, and return it.
-
-        A provider whose API can be watched writes this anew, so that nobody asks again and again.
-
-        :raises ProviderError: it ended meanwhile, or can't come up, with the provider's reason.
+        :raises ProviderError: the machine ended, or cannot start, with the provider's reason.
         :raises DeadlineExceeded: after ``timeout`` seconds.
         :raises Cancelled: ``cancel`` was set.
         """
@@ -234,12 +256,39 @@ class Provider(abc.ABC):
                                     "the provider's own log says why")
             return machine if machine.state is MachineState.RUNNING and machine.shell else None
 
-        return wait_until(look, timeout=timeout, cancel=cancel, longest=self.look_interval,
+        return wait_until(look, timeout=timeout, cancel=self.cancel, longest=self.poll_interval,
                           what=f"the machine '{name}' to run")
+
+    def stop(self, machine_id: str) -> None:
+        """
+        Stop a machine so that it can be started again with its disk (``stop``).
+
+        :raises Unsupported: this machine cannot be stopped.
+        """
+        raise Unsupported(f"provider '{self.name}' can't stop a machine",
+                          "use on_exit='keep' or 'delete'")
+
+    def start(self, machine_id: str) -> None:
+        """
+        Start a stopped machine again (``stop``).
+
+        :raises Unsupported: the provider cannot.
+        """
+        raise Unsupported(f"provider '{self.name}' can't start a machine")
+
+    def tidy(self) -> list[str]:
+        """
+        Delete the remains of machines that ended by themselves; describe them for people.
+
+        Resources of a machine that exists, or that is being created, stay.
+        """
+        return []
+
+    # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
         """
-        Return the address (CIDR) that this computer's connections to machines come from.
+        Return the address (CIDR) from which machines see this computer (``firewall``).
 
         :raises Unsupported: the provider has no firewall.
         """
@@ -247,38 +296,41 @@ class Provider(abc.ABC):
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
         """
-        Let ``sources`` (CIDR) reach a TCP port of a machine, they alone; none of them closes it.
+        Let only ``sources`` (CIDR) reach a TCP port of a machine (``firewall``).
 
+        :param sources: none closes the port, even if ``cancel`` is set.
         :raises Unsupported: the provider has no firewall.
         """
         raise Unsupported(f"provider '{self.name}' has no firewall")
 
-    def publish(
+    def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],
     ) -> tuple[str, int]:
         """
-        Let ``sources`` (CIDR) reach a TCP port of a machine, they alone, and return where they do.
+        Let only ``sources`` (CIDR) reach a TCP port of a machine; return its host and port there.
 
-        None of them closes it, and ends what was made for it. Whatever listens there has to look
-        itself who comes: a provider without a firewall of its own, as here, opens nothing.
+        Without sources, close the port. A provider without a firewall opens nothing: the server
+        on that port checks its clients.
         """
-        if self.firewall:
+        if self.capabilities.firewall:
             self.allow(machine.id, port, sources)
         return machine.vpn_host, port
 
     def pin(self, machine_id: str, host_key: str) -> None:
         """
-        Remember the host key (OpenSSH form) that the machine has made for itself.
+        Store the host key (OpenSSH form) that the machine has generated (``one_time_host_key``).
 
-        ``describe`` tells it from now on, on any computer.
+        From now on ``describe`` reports it, on any computer.
 
-        :raises Unsupported: the provider hands no key over at boot.
+        :raises Unsupported: the provider's host key needs no replacement.
         """
         raise Unsupported(f"provider '{self.name}' hands no host key over at boot")
 
+    # -- images ---------------------------------------------------------------------------------
+
     def bake(self, machine_id: str, name: str, dependencies: str) -> str:
         """
-        Make an image of a machine and return its id at once; ``images`` tells when it is ready.
+        Start to make an image of a machine, and return its id; ``images`` reports its state.
 
         :param dependencies: see :class:`~fogros2.model.Image`.
         :raises Unsupported: the provider keeps no images.
@@ -295,11 +347,59 @@ class Provider(abc.ABC):
 
     def delete_image(self, image_id: str) -> None:
         """
-        Delete an image and the disks' copies behind it; idempotent.
+        Delete an image and its disk snapshots; idempotent.
 
         :raises Unsupported: the provider keeps none.
         """
         raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+
+    # -- regions and prices ---------------------------------------------------------------------
+
+    @classmethod
+    def region_names(cls) -> Sequence[str]:
+        """Return the names of the regions without any request, for completion (``regions``)."""
+        return ()
+
+    def regions(self, names: Sequence[str] = (), *, every: bool = False) -> list[Region]:
+        """
+        Return regions with the round trip from here, the nearest first (``regions``).
+
+        :param names: only these.
+        :param every: include regions that an account has to enable first.
+        :raises ConfigurationError: a name is unknown.
+        :raises Unsupported: the provider has no regions.
+        """
+        raise Unsupported(f"provider '{self.name}' has no regions")
+
+    def nearest(self, names: Sequence[str] = ()) -> str:
+        """
+        Return the region with the fastest response (``regions``).
+
+        :param names: the candidates; none for all.
+        :raises ProviderError: no region answers.
+        """
+        return self.regions(names)[0].region
+
+    def search_in(self, regions: Sequence[str]) -> None:
+        """
+        Let ``find``, ``images`` and ``tidy`` search these regions (``regions``).
+
+        :param regions: names; 'all' stands for every region of the account.
+        """
+
+    def offers(
+        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
+    ) -> Offers:
+        """
+        Return the types of machines that meet requirements, the cheapest first (``prices``).
+
+        :param regions: names, 'all' or 'nearest'; none for the configured one.
+        :param refresh: do not use cached prices.
+        :raises ConfigurationError: nothing fits.
+        :raises FogError: no region answers.
+        :raises Unsupported: the provider has no price list.
+        """
+        raise Unsupported(f"provider '{self.name}' has no price list")
 
 
 def _is_list(value: object) -> bool:

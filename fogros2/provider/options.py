@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading the options of a machine: what is unknown or of the wrong kind is named."""
+"""Read the options of a machine; name an option that is unknown or has a wrong value."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str, Any]:
     """
-    Return the options that aren't None.
+    Return the options that are not None.
 
     :param names: the names that exist.
-    :param what: whose options they are, such as 'a container machine'.
-    :raises ConfigurationError: one has another name; the hint has the nearest.
+    :param what: owner of the options for messages, such as 'a container machine'.
+    :raises ConfigurationError: an option is unknown; the hint has the nearest name.
     """
     names = list(names)
     for name in given:
@@ -36,13 +36,13 @@ def parsed(
     value: Callable[[str, Any, Any], Any] | None = None,
 ) -> Options:
     """
-    Return the options of a spec: what isn't given has its default.
+    Convert the options of a spec to a dataclass; other fields have their defaults.
 
     :param kind: a dataclass, each field with a default.
-    :param what: whose options they are, such as 'a container machine'.
-    :param value: returns an option's value by its name, what was given, and its default;
-        ``convert`` unless there are some that it can't do.
-    :raises ConfigurationError: one is unknown (with the nearest name) or of another kind.
+    :param what: owner of the options for messages, such as 'a container machine'.
+    :param value: converts a value, given the option's name, the value and the default; None for
+        ``convert``.
+    :raises ConfigurationError: an option is unknown (with the nearest name) or of another type.
     """
     defaults = {field.name: {} if field.default is dataclasses.MISSING else field.default
                 for field in dataclasses.fields(kind)}
@@ -53,9 +53,9 @@ def parsed(
 
 def convert(name: str, value: Any, default: Any) -> Any:
     """
-    Return an option's value in the kind of its default.
+    Convert an option's value to the type of its default.
 
-    :raises ConfigurationError: it is of another kind.
+    :raises ConfigurationError: the value does not fit.
     """
     if isinstance(default, tuple):
         if not isinstance(value, str) and isinstance(value, Sequence) \
@@ -65,7 +65,7 @@ def convert(name: str, value: Any, default: Any) -> Any:
     elif isinstance(default, bool):
         if isinstance(value, bool):
             return value
-        # what a launch argument comes as
+        # launch arguments are strings
         if isinstance(value, str) and value.lower() in ('true', 'false'):
             return value.lower() == 'true'
         expected = 'True or False'

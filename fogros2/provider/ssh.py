@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any computer that exists already and runs an SSH server: used, tidied up, never ended."""
+"""Existing computers with an SSH server; a launch cleans them up and never ends them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from urllib.parse import parse_qsl, urlencode
 
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError, Unsupported
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Provider
+from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
 
 _SCHEME = 'ssh:'
-#: Seconds after which a computer that doesn't answer counts as off.
-_PATIENCE = 5.0
+#: Seconds after which a computer without an answer counts as off.
+_TIMEOUT = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """
-    What a launch file says of a computer.
+    Options of an existing computer.
 
     :param host: name or address.
-    :param user: login user; '' for the name of the user here.
-    :param port: of its SSH server.
+    :param user: login user; '' for the name of the user on the robot.
+    :param port: TCP port of its SSH server.
     :param key: private key file; '' for the user's own keys and agent.
-    :param host_key: ``ssh-ed25519 AAAA...``; '' leaves it to ``known_hosts``.
+    :param host_key: ``ssh-ed25519 AAAA...``; '' to use ``known_hosts``.
     """
 
     host: str = ''
@@ -45,7 +45,7 @@ class Options:
         """
         Return the options of a spec.
 
-        :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
+        :raises ConfigurationError: an option is unknown (with the nearest name) or wrong.
         """
         options = parsed(cls, given, 'an SSH machine')
         if any(c.isspace() or c in '/@' for c in options.host) \
@@ -65,25 +65,25 @@ class Options:
 
 def _is_name(host: str) -> bool:
     try:
-        # what a look-up does with it first: an empty label, or one too long, is no name
+        # a look-up encodes the name first, and refuses an empty or too long label
         return bool(host.encode('idna'))
     except UnicodeError:
         return False
 
 
 class SSHProvider(Provider):
-    """Computers that others set up and look after."""
+    """Computers that exist before and after the launch."""
 
     name: ClassVar[str] = 'ssh'
-    owned: ClassVar[bool] = False
-    look_interval: ClassVar[float] = 0.1
+    capabilities: ClassVar[Capabilities] = Capabilities(owned=False)
+    poll_interval: ClassVar[float] = 0.1
 
     def check(self, spec: MachineSpec) -> None:
-        """Look at the options; nothing is asked over the network."""
+        """Check the options without a connection."""
         Options.parse(spec.options)
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Return the id of the computer, which has to answer."""
+        """Return the id of the computer if it answers."""
         options = Options.parse(spec.options)
         try:
             reach(options.host, int(options.port))
@@ -104,7 +104,7 @@ class SSHProvider(Provider):
             'key': str(Path(options.key).expanduser().absolute()) if options.key else ''})
 
     def describe(self, machine_id: str) -> Machine:
-        """Return the computer, as stopped if its SSH port doesn't answer."""
+        """Return the computer; its state is stopped if its SSH port does not answer."""
         if not machine_id.startswith(_SCHEME):
             raise MachineNotFound(f"'{machine_id}' is no SSH machine")
         words = dict(parse_qsl(machine_id[len(_SCHEME):], keep_blank_values=True))
@@ -124,18 +124,18 @@ class SSHProvider(Provider):
             owned=False)
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        """Raise Unsupported: a computer of somebody's keeps no tags of ours."""
+        """Raise Unsupported: an existing computer stores no tags."""
         raise Unsupported('an SSH machine keeps no tags')
 
     def destroy(self, machine_id: str) -> None:
-        """Do nothing: the computer isn't ours to end."""
+        """Do nothing: the launch did not create the computer."""
 
 
-def reach(host: str, port: int, timeout: float = _PATIENCE) -> str:
+def reach(host: str, port: int, timeout: float = _TIMEOUT) -> str:
     """
-    Return the address under which a TCP port answers.
+    Return the address at which a TCP port answers.
 
-    :raises OSError: it doesn't.
+    :raises OSError: no answer.
     """
     with socket.create_connection((host, port), timeout=timeout) as connection:
         return str(connection.getpeername()[0])

@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plugin interface to a machine's command line: run, put, sync, open."""
+"""
+The plugin interface to a machine's command line: run, put, sync, open.
+
+``command_line`` builds command lines for a login shell, ``lines`` reads output. ``relay`` connects
+local streams to a program on a machine (``rsh`` is rsync's end of it), ``terminal`` the user's
+terminal. ``ssh_connection`` opens SSH connections, ``sync`` calls rsync. ``local`` is the shell of
+this computer. ``remote`` is the base of the shells with a connection. ``ssh`` is one of them.
+To a pod, ``kubernetes_mux`` is the program in the pod, ``kubernetes_link`` the connection to it,
+and ``kubernetes`` the shell. ``movable`` replaces a shell in use, ``host_key`` a machine's host
+key.
+"""
 
 from __future__ import annotations
 

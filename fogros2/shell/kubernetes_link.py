@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Connect the robot to a pod's multiplexer: one ``exec``, many channels."""
+"""The robot's end of a pod's multiplexer: a connection by one ``exec``, and its channels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_mux as mux
-from fogros2.shell.kubernetes_channel import Channel
 
 if TYPE_CHECKING:
     import websocket
@@ -38,6 +37,137 @@ _LOADER = ('import os,sys;n={size};s=b""\n'
            ' if not d:sys.exit(1)\n'
            ' s+=d\n'
            'exec(compile(s,"fogros2","exec"))')
+
+
+class Channel:
+    """
+    One command in the pod, with the interface of paramiko's Channel.
+
+    :param number: the command's number in frames.
+    """
+
+    #: For a command that a signal ended, the multiplexer reports 128 + signal.
+    eof_received = 0
+
+    def __init__(self, link: Link, number: int) -> None:
+        self._link = link
+        self._number = number
+        self._changed = threading.Condition()
+        self._waiting = {mux.OUT: bytearray(), mux.ERR: bytearray()}
+        self._open = {mux.OUT, mux.ERR}
+        self._status = -1
+        self._timeout: Optional[float] = None
+        self._credit = mux.CREDIT
+        self._owed = 0
+        #: Set when the exit status is known, or will never be known.
+        self.status_event = threading.Event()
+
+    # -- from the link --------------------------------------------------------------------------
+
+    def take(self, kind: int, payload: bytes) -> None:
+        """Process a frame from the pod."""
+        with self._changed:
+            if kind == mux.EXIT:
+                self._status, = struct.unpack('>i', payload)
+                self.status_event.set()
+            elif kind == mux.WINDOW:
+                self._credit += struct.unpack('>I', payload)[0]
+            elif payload:
+                self._waiting[kind] += payload
+            else:
+                self._open.discard(kind)
+            self._changed.notify_all()
+
+    def lose(self) -> None:
+        """Record that no more frames will arrive."""
+        with self._changed:
+            self._open.clear()
+            self.status_event.set()
+            self._changed.notify_all()
+
+    # -- for its user ---------------------------------------------------------------------------
+
+    def get_transport(self) -> Link:
+        """Return the channel's connection."""
+        return self._link
+
+    def settimeout(self, timeout: Optional[float]) -> None:
+        """Set the time-out of reads in seconds, None: no time-out."""
+        self._timeout = timeout
+
+    def recv(self, size: int) -> bytes:
+        """
+        Return up to ``size`` bytes of standard output, b'' at its end.
+
+        :raises TimeoutError: there was no output.
+        """
+        return self._receive(mux.OUT, size)
+
+    def recv_stderr(self, size: int) -> bytes:
+        """Return up to ``size`` bytes of standard error, b'' at its end."""
+        return self._receive(mux.ERR, size)
+
+    def recv_stderr_ready(self) -> bool:
+        """Return whether standard error has arrived."""
+        return bool(self._waiting[mux.ERR])
+
+    def _receive(self, kind: int, size: int) -> bytes:
+        with self._changed:
+            if not self._changed.wait_for(
+                    lambda: self._waiting[kind] or kind not in self._open, self._timeout):
+                raise TimeoutError
+            data = bytes(self._waiting[kind][:size])
+            del self._waiting[kind][:size]
+            self._owed += len(data)
+            owed = self._owed if self._owed >= mux.CREDIT // 4 else 0
+            self._owed -= owed
+        if owed:
+            with contextlib.suppress(ConnectError):  # what has arrived can be read
+                self._link.send(mux.WINDOW, self._number, struct.pack('>I', owed))
+        return data
+
+    def exit_status_ready(self) -> bool:
+        """Return whether the exit status is known, or will never be known."""
+        return self.status_event.is_set()
+
+    def recv_exit_status(self) -> int:
+        """Wait for the exit, and return the exit status; -1 if it will never be known."""
+        self.status_event.wait()
+        return self._status
+
+    def send(self, data: bytes) -> int:
+        """
+        Send to standard input as much as the command has room for; return the number of bytes.
+
+        :raises OSError: the command has ended, or the channel is lost or closed.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._credit > 0 or self.status_event.is_set())
+            if self.status_event.is_set():
+                raise BrokenPipeError('the command has ended')
+            piece = data[:min(mux.CHUNK, self._credit)]
+            self._credit -= len(piece)
+        self._link.send(mux.IN, self._number, piece)
+        return len(piece)
+
+    def sendall(self, data: bytes) -> None:
+        """Send to standard input, as fast as the command reads; see ``send``."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self.send(bytes(rest[:mux.CHUNK])):]
+
+    def shutdown_write(self) -> None:
+        """Close the command's standard input."""
+        self._link.send(mux.IN, self._number)
+
+    def resize_pty(self, columns: int, rows: int) -> None:
+        """Send the terminal's new size."""
+        self._link.send(mux.RESIZE, self._number, struct.pack('>HH', rows, columns))
+
+    def close(self) -> None:
+        """Close the channel, which ends a running command."""
+        self.lose()
+        self._link.forget(self._number)
 
 
 class Link:
@@ -62,9 +192,8 @@ class Link:
         self._socket = self._connect(timeout)
         threading.Thread(target=self._run, name='fog-pod', daemon=True).start()
 
-    @property
-    def alive(self) -> bool:
-        """Whether new commands can start."""
+    def is_alive(self) -> bool:
+        """Return whether new commands can start."""
         return self._error is None
 
     def open(self, command: Command, *, terminal: Optional[tuple[int, int, str]] = None,
@@ -178,7 +307,7 @@ class Link:
                 raise self._no_program(errors + data)
             elif kind == _STDOUT:
                 self._incoming += data
-                if self._pop_frame() is not None:
+                if list(mux.frames(self._incoming)):
                     return
             if time.monotonic() > deadline:
                 raise DeadlineExceeded(f"'{self._name}' doesn't answer")
@@ -229,7 +358,7 @@ class Link:
             channels = list(self._channels.values())
             self._channels.clear()
         for channel in channels:
-            channel.lose(self._error)
+            channel.lose()
 
     def _serve(self) -> None:
         """
@@ -243,7 +372,10 @@ class Link:
         poll.register(sock, select.POLLIN)
         heard = time.monotonic()
         while True:
-            self._frames()
+            for kind, number, payload in mux.frames(self._incoming):
+                channel = self._channels.get(number)
+                if channel is not None:
+                    channel.take(kind, payload)
             pending = isinstance(sock, ssl.SSLSocket) and sock.pending()
             if not pending and not poll.poll(ASK * 1000):
                 if time.monotonic() - heard > 3 * ASK:
@@ -260,26 +392,6 @@ class Link:
                 self._incoming += data[1:]
             elif data[0] == _ERROR:
                 raise ConnectError(f"the exec on '{self._name}' has ended")
-
-    def _pop_frame(self) -> Optional[tuple[int, int, bytes]]:
-        if len(self._incoming) < mux.HEADER.size:
-            return None
-        kind, number, size = mux.HEADER.unpack_from(self._incoming)
-        end = mux.HEADER.size + size
-        if size > 1 << 20:
-            raise ConnectError(f"'{self._name}' sends what is no frame")
-        if len(self._incoming) < end:
-            return None
-        payload = bytes(self._incoming[mux.HEADER.size:end])
-        del self._incoming[:end]
-        return kind, number, payload
-
-    def _frames(self) -> None:
-        while (found := self._pop_frame()) is not None:
-            kind, number, payload = found
-            channel = self._channels.get(number)
-            if channel is not None:
-                channel.take(kind, payload)
 
 
 def parse_host(host: str) -> tuple[str, str, str]:

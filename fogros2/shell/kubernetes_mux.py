@@ -11,24 +11,24 @@ Frames in both directions: type, channel, length, payload.
 
 from __future__ import annotations
 
-import collections
-from collections.abc import Callable
 import contextlib
 import fcntl
-import functools
 import json
 import os
 import pwd
-import selectors
+import queue
+import select
 import signal
 import struct
 import subprocess
 import termios
+import threading
 import time
 
 TYPE_CHECKING = False  # importing it from typing would delay each pod
 if TYPE_CHECKING:
-    from typing import Any
+    from collections.abc import Iterator
+    from typing import Any, IO
 
 HEADER = struct.Struct('>BII')
 OUT, ERR, EXIT, OPEN, IN, CLOSE, WINDOW, RESIZE = range(1, 9)
@@ -37,99 +37,75 @@ HELLO, PING, PONG, GONE = range(64, 68)
 #: Maximum unacknowledged bytes of a channel in each direction.
 CREDIT = 4 << 20
 CHUNK = 1 << 15
+#: Maximum size of a frame's payload, so that the other side cannot fill the memory.
+LARGEST = 16 << 20
 #: Seconds of silence after which the connection counts as lost.
 SILENCE = 60.0
 _STDIN, _STDOUT = 0, 1
 
 
 class Process:
-    """A command, and our ends of its streams."""
+    """
+    A command; each of its streams has a thread.
+
+    :param streams: our ends of its output streams, with their frame types.
+    """
 
     def __init__(
-        self, number: int, child: subprocess.Popen[bytes], stdin: int, streams: dict[int, int],
-        terminal: bool,
+        self, number: int, child: subprocess.Popen[bytes], stdin: IO[Any],
+        streams: dict[IO[Any], int], terminal: bool,
     ) -> None:
         self.number = number
         self.child = child
         self.stdin = stdin
-        self.terminal = terminal
-        #: Frame type by file descriptor.
         self.streams = streams
-        self.waiting: collections.deque[bytes] = collections.deque()
+        self.terminal = terminal
+        #: Input to write; None closes the command's standard input.
+        self.input: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self.credit = CREDIT
-        self.paused = False
-        self.exited = False
-        self.killed_at = 0.0
+        self.closed = False
+        self.changed = threading.Condition()
 
     def signal(self, name: signal.Signals) -> None:
-        """Send a signal to the command's process group."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.child.pid, name)
+        """Send a signal to the command's process group, if the command runs."""
+        if self.child.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.child.pid, name)
 
 
 class Multiplexer:
     """The commands of one connection."""
 
     def __init__(self) -> None:
-        self.selector = selectors.DefaultSelector()
         self.processes: dict[int, Process] = {}
-        self.ending: list[Process] = []
+        self.sending = threading.Lock()
         self.connected = True
-        self.incoming = bytearray()
-        self.outgoing: collections.deque[bytes] = collections.deque()
-        self.heard = time.monotonic()
-        self.woken, wake = os.pipe()
-        for stream in (wake, self.woken, _STDIN, _STDOUT):
-            os.set_blocking(stream, False)
-        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
-        self.listen_to(self.woken, self.reap)
-        self.listen_to(_STDIN, self.read)
-        self.send(HELLO, 0)
-
-    def listen_to(self, stream: int, call: Callable[[], None]) -> None:
-        """Register a function to call when a stream is readable."""
-        self.selector.register(stream, selectors.EVENT_READ, call)
 
     def run(self) -> None:
         """Serve until the connection ends, then end all commands."""
-        while self.connected and time.monotonic() - self.heard < SILENCE:
-            for key, _ in self.selector.select(1.0):
-                if key.fileobj in self.selector.get_map():
-                    key.data()
-            for process in self.ending:
-                if not process.exited and time.monotonic() - process.killed_at > 2.0:
-                    process.signal(signal.SIGKILL)
-            self.ending = [p for p in self.ending if not p.exited]
-        left = (*self.processes.values(), *self.ending)
-        for name in (signal.SIGTERM, signal.SIGKILL) if left else ():
+        self.send(HELLO, 0)
+        incoming = bytearray()
+        while self.connected and select.select([_STDIN], [], [], SILENCE)[0]:
+            data = os.read(_STDIN, 1 << 18)
+            if not data:
+                break
+            incoming += data
+            for received in frames(incoming):
+                self.take(*received)
+        left = list(self.processes.values())
+        for name in (signal.SIGTERM, signal.SIGKILL):
             for process in left:
                 process.signal(name)
-            time.sleep(0.5)
+            until = time.monotonic() + 0.5
+            while any(p.child.returncode is None for p in left) and time.monotonic() < until:
+                time.sleep(0.01)
 
-    # -- the connection -------------------------------------------------------------------------
-
-    def read(self) -> None:
-        """Read frames from the robot, and process them."""
-        try:
-            data = os.read(_STDIN, 1 << 18)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b''
-        if not data:
-            self.connected = False
-            return
-        self.heard = time.monotonic()
-        self.incoming += data
-        while len(self.incoming) >= HEADER.size:
-            kind, number, size = HEADER.unpack_from(self.incoming)
-            end = HEADER.size + size
-            if len(self.incoming) < end:
-                break
-            payload = bytes(self.incoming[HEADER.size:end])
-            del self.incoming[:end]
-            self.take(kind, number, payload)
+    def send(self, kind: int, number: int, payload: bytes = b'') -> None:
+        """Send a frame; without effect on a lost connection, which ``run`` notices."""
+        data = frame(kind, number, payload)
+        with self.sending, contextlib.suppress(OSError):
+            while data:
+                data = data[os.write(_STDOUT, data):]
 
     def take(self, kind: int, number: int, payload: bytes) -> None:
         """Process a frame from the robot."""
@@ -143,46 +119,18 @@ class Multiplexer:
         elif process is None:
             pass  # the command was closed meanwhile
         elif kind == IN:
-            process.waiting.append(payload)
-            self.feed(process)
+            if payload or not process.terminal:  # a terminal's end of input is a character
+                process.input.put(payload or None)
         elif kind == WINDOW:
-            process.credit += struct.unpack('>I', payload)[0]
-            if process.paused and process.credit > 0:
-                self.listen(process)
+            with process.changed:
+                process.credit += struct.unpack('>I', payload)[0]
+                process.changed.notify_all()
         elif kind == RESIZE:
             rows, columns = struct.unpack('>HH', payload)
-            with contextlib.suppress(OSError):
-                fcntl.ioctl(process.stdin, termios.TIOCSWINSZ,
-                            struct.pack('HHHH', rows, columns, 0, 0))
+            with contextlib.suppress(OSError, ValueError):  # the command has ended
+                resize(process.stdin.fileno(), rows, columns)
         elif kind == CLOSE:
             self.close(process)
-
-    def send(self, kind: int, number: int, payload: bytes = b'') -> None:
-        """Send a frame."""
-        self.outgoing.append(frame(kind, number, payload))
-        self.want_write()
-
-    def want_write(self) -> None:
-        """Write as much as possible, and the rest when the connection is writable again."""
-        try:
-            while self.outgoing:
-                data = self.outgoing[0]
-                count = os.write(_STDOUT, data)
-                if count < len(data):
-                    self.outgoing[0] = data[count:]
-                    continue
-                self.outgoing.popleft()
-        except BlockingIOError:
-            with contextlib.suppress(KeyError):
-                self.selector.register(_STDOUT, selectors.EVENT_WRITE, self.want_write)
-            return
-        except OSError:
-            self.connected = False
-            return
-        with contextlib.suppress(KeyError, ValueError):
-            self.selector.unregister(_STDOUT)
-
-    # -- commands -------------------------------------------------------------------------------
 
     def open(self, number: int, what: dict[str, Any]) -> None:
         """Start a command."""
@@ -199,109 +147,92 @@ class Multiplexer:
         self.processes[number] = process
         if process.terminal:
             self.send(ERR, number)  # a terminal has only one output stream
-        self.listen(process)
+        for stream, kind in process.streams.items():
+            threading.Thread(target=self.output, args=(process, stream, kind), daemon=True).start()
+        for call in (self.feed, self.wait):
+            threading.Thread(target=call, args=(process,), daemon=True).start()
 
-    def listen(self, process: Process) -> None:
-        """Start to read a command's output."""
-        process.paused = False
-        for stream in process.streams:
-            self.listen_to(stream, functools.partial(self.output, process, stream))
-
-    def output(self, process: Process, stream: int) -> None:
-        """Forward a command's output."""
-        kind = process.streams[stream]
-        try:
-            data = os.read(stream, CHUNK)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b''  # the terminal has no more users
-        self.send(kind, process.number, data)
-        if not data:
-            self.selector.unregister(stream)
-            del process.streams[stream]
-            os.close(stream)
-            self.finish(process)
-            return
-        process.credit -= len(data)
-        if process.credit <= 0:
-            process.paused = True
-            for each in process.streams:
-                self.selector.unregister(each)
+    def output(self, process: Process, stream: IO[Any], kind: int) -> None:
+        """Forward an output stream of a command, as fast as the robot reads it."""
+        data = b' '
+        while data:
+            with process.changed:
+                process.changed.wait_for(lambda: process.credit > 0 or process.closed)
+            try:
+                data = stream.read(CHUNK)
+            except OSError:
+                data = b''  # the terminal has no more users
+            with process.changed:
+                process.credit -= len(data)
+            if not process.closed:
+                self.send(kind, process.number, data)
+        stream.close()
 
     def feed(self, process: Process) -> None:
-        """Write waiting input to a command as far as the command reads it."""
-        stdin = process.stdin
-        if stdin < 0:
-            process.waiting.clear()
-            return
-        taken = 0
-        try:
-            while process.waiting and process.waiting[0]:
-                data = process.waiting[0]
-                count = os.write(stdin, data)
-                taken += count
-                if count < len(data):
-                    process.waiting[0] = data[count:]
-                else:
-                    process.waiting.popleft()
-            done = bool(process.waiting)
-        except BlockingIOError:
-            with contextlib.suppress(KeyError):
-                self.selector.register(
-                    stdin, selectors.EVENT_WRITE, functools.partial(self.feed, process))
-            if taken:
-                self.send(WINDOW, process.number, struct.pack('>I', taken))
-            return
-        except OSError:
-            done = True  # the command closed its input; its exit status has the reason
-        if taken:
-            self.send(WINDOW, process.number, struct.pack('>I', taken))
-        with contextlib.suppress(KeyError):
-            self.selector.unregister(stdin)
-        if done and not process.terminal:  # a terminal's end of input is a character
-            process.stdin = -1
-            process.waiting.clear()
-            os.close(stdin)
+        """Write input to a command, as fast as the command reads it."""
+        # The command may close its input; its exit status has the reason.
+        with contextlib.suppress(OSError):
+            while (data := process.input.get()) is not None:
+                rest = data
+                while rest:
+                    rest = rest[process.stdin.write(rest):]
+                self.send(WINDOW, process.number, struct.pack('>I', len(data)))
+        with contextlib.suppress(OSError):
+            process.stdin.close()
 
-    def reap(self) -> None:
-        """Record the commands that have exited."""
-        with contextlib.suppress(BlockingIOError):
-            os.read(self.woken, 4096)
-        for process in (*self.processes.values(), *self.ending):
-            if not process.exited and process.child.poll() is not None:
-                process.exited = True
-                if process.number in self.processes:
-                    code = process.child.returncode
-                    # A signal becomes an exit status as in a shell.
-                    self.send(EXIT, process.number,
-                              struct.pack('>i', code if code >= 0 else 128 - code))
-                    self.finish(process)
-
-    def finish(self, process: Process) -> None:
-        """Close a command that has exited and whose streams have ended."""
-        if process.exited and not process.streams:
-            self.close(process)
+    def wait(self, process: Process) -> None:
+        """Report the exit of a command."""
+        code = process.child.wait()
+        # A signal becomes an exit status as in a shell.
+        self.send(EXIT, process.number, struct.pack('>i', code if code >= 0 else 128 - code))
+        process.input.put(None)
+        self.forget(process)
 
     def close(self, process: Process) -> None:
-        """Close a command's streams, and end the command if it still runs."""
-        del self.processes[process.number]
-        for stream in (*process.streams, *([process.stdin] if process.stdin >= 0 else [])):
-            with contextlib.suppress(KeyError):
-                self.selector.unregister(stream)
-            os.close(stream)
-        process.streams = {}
-        process.stdin = -1
-        # Intentional background processes have their own process groups, and stay.
-        if not process.exited:
+        """Stop to forward a command's output, and end the command if it still runs."""
+        with process.changed:
+            process.closed = True
+            process.changed.notify_all()
+        if process.child.returncode is None:
+            # Intentional background processes have their own process groups, and stay.
             process.signal(signal.SIGTERM)
-            process.killed_at = time.monotonic()
-            self.ending.append(process)
+            killer = threading.Timer(2.0, process.signal, (signal.SIGKILL,))
+            killer.daemon = True
+            killer.start()
+        self.forget(process)
+
+    def forget(self, process: Process) -> None:
+        """Forget a command that is closed and has exited."""
+        if process.closed and process.child.returncode is not None:
+            self.processes.pop(process.number, None)
 
 
 def frame(kind: int, number: int, payload: bytes) -> bytes:
     """Serialise a frame."""
     return HEADER.pack(kind, number, len(payload)) + payload
+
+
+def frames(incoming: bytearray) -> Iterator[tuple[int, int, bytes]]:
+    """
+    Remove the complete frames at the start of a buffer, and yield them.
+
+    :raises ValueError: the buffer does not start with a frame.
+    """
+    while len(incoming) >= HEADER.size:
+        kind, number, size = HEADER.unpack_from(incoming)
+        end = HEADER.size + size
+        if size > LARGEST:
+            raise ValueError(f'a frame of {size} bytes')
+        if len(incoming) < end:
+            return
+        payload = bytes(incoming[HEADER.size:end])
+        del incoming[:end]
+        yield kind, number, payload
+
+
+def resize(terminal: int, rows: int, columns: int) -> None:
+    """Set the size of a terminal, in characters."""
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', rows, columns, 0, 0))
 
 
 def begin(number: int, what: dict[str, Any]) -> Process:
@@ -315,45 +246,34 @@ def begin(number: int, what: dict[str, Any]) -> Process:
         environment['FOGROS2_ROOT'] = 'yes'
     options: dict[str, Any] = {
         'env': environment, 'cwd': user.pw_dir if os.path.isdir(user.pw_dir) else '/',
-        'start_new_session': True, 'restore_signals': True}
+        'start_new_session': True, 'bufsize': 0}
     if user.pw_uid != os.geteuid():
         options.update(user=user.pw_uid, group=user.pw_gid,
                        extra_groups=os.getgrouplist(user.pw_name, user.pw_gid))
     argv = what['argv'] or [environment['SHELL'], '-l']
-    stdin: int
     if not what['pty']:
         child = subprocess.Popen(
             argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
         assert child.stdin and child.stdout and child.stderr
-        stdin, out, err = (os.dup(s.fileno()) for s in (child.stdin, child.stdout, child.stderr))
-        child.stdin.close()
-        child.stdout.close()
-        child.stderr.close()
-        streams = {out: OUT, err: ERR}
-    else:
-        stdin, inner = os.openpty()
+        return Process(
+            number, child, child.stdin, {child.stdout: OUT, child.stderr: ERR}, terminal=False)
+    outer, inner = os.openpty()
+    with open(inner, 'rb', buffering=0), contextlib.ExitStack() as undo:
+        undo.callback(os.close, outer)
         rows, columns, environment['TERM'] = what['pty']
-        fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack('HHHH', rows, columns, 0, 0))
+        resize(inner, rows, columns)
         os.fchown(inner, user.pw_uid, user.pw_gid)
-
-        def take_terminal() -> None:
-            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
-        try:
-            child = subprocess.Popen(argv, stdin=inner, stdout=inner, stderr=inner,
-                                     preexec_fn=take_terminal, **options)
-        except BaseException:
-            os.close(stdin)
-            raise
-        finally:
-            os.close(inner)
-        streams = {os.dup(stdin): OUT}
-    for stream in (stdin, *streams):
-        os.set_blocking(stream, False)
-    return Process(number, child, stdin, streams, bool(what['pty']))
+        child = subprocess.Popen(
+            argv, stdin=inner, stdout=inner, stderr=inner,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0), **options)
+        undo.pop_all()
+    screen = open(os.dup(outer), 'rb', buffering=0)
+    return Process(number, child, open(outer, 'wb', buffering=0), {screen: OUT}, terminal=True)
 
 
 if __name__ == '__main__':
     os.chdir('/')
     os.umask(0o022)
+    for descriptor in (_STDIN, _STDOUT):
+        os.set_blocking(descriptor, True)
     Multiplexer().run()

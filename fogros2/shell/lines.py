@@ -1,27 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a remote program's output line by line, over any kind of channel."""
+"""Describe channels to programs on a machine, and read a program's output line by line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import threading
 from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
+from fogros2.events import clean
 
-#: Maximum bytes of a line, so that a machine cannot fill the robot's memory.
-MAX_LINE = 32 << 20
+#: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
+#: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
+#: characters.
+MAX_LINE = 1 << 20
+#: Maximum bytes that a command's standard output and standard error keep each; the oldest go.
+KEPT = 4 << 20
 _CHUNK = 1 << 16
 
 
+class Connection(Protocol):
+    """A connection to a machine, with many channels."""
+
+    def is_alive(self) -> bool:
+        """Return whether commands can start."""
+
+    def close(self) -> None:
+        """Close the connection, and its channels."""
+
+
 class Channel(Protocol):
-    """A shell's channel to a program; its errors are OSErrors or FogErrors."""
+    """
+    A program on a machine: paramiko's Channel, or an object with the same interface.
+
+    Errors are OSErrors or FogErrors; a read that timed out raises TimeoutError.
+    """
+
+    #: Set when the exit status is known, or will never be known.
+    status_event: threading.Event
+    #: Whether an exit status of -1 means that a signal ended the program.
+    eof_received: int
+
+    def get_transport(self) -> Connection:
+        """Return the channel's connection."""
+
+    def settimeout(self, timeout: Optional[float], /) -> None:
+        """Set the time-out of reads in seconds, None: no time-out."""
 
     def recv(self, size: int, /) -> bytes:
         """Wait for standard output, and return up to ``size`` bytes; b'' at the end."""
 
+    def recv_stderr(self, size: int, /) -> bytes:
+        """Wait for standard error, and return up to ``size`` bytes; b'' at the end."""
+
+    def recv_stderr_ready(self) -> bool:
+        """Return whether standard error has arrived."""
+
+    def send(self, data: bytes, /) -> int:
+        """Send to standard input as much as there is room for; return the number of bytes."""
+
     def sendall(self, data: bytes, /) -> None:
         """Send to standard input, as fast as the program reads."""
+
+    def shutdown_write(self) -> None:
+        """Close standard input."""
+
+    def resize_pty(self, width: int, height: int, /) -> None:
+        """Set the size of the program's terminal, in characters."""
+
+    def exit_status_ready(self) -> bool:
+        """Return whether the exit status is known, or will never be known."""
+
+    def recv_exit_status(self) -> int:
+        """Wait for the exit, and return the exit status; -1 if it will never be known."""
 
     def close(self) -> None:
         """Close the channel, which ends a running program."""
@@ -82,27 +134,57 @@ class Output:
     Collect a command's output, and pass complete lines on.
 
     :param on_output: callback for each line of standard output.
+    :param announced: the first line is not output, but the command's process id.
     """
 
-    def __init__(self, on_output: Optional[Callable[[str], None]]) -> None:
+    def __init__(
+        self, on_output: Optional[Callable[[str], None]], *, announced: bool = False,
+    ) -> None:
+        #: Process id that the command announced, 0 if it is unknown.
+        self.pid = 0
+        self._head: Optional[bytes] = b'' if announced else None
         self._on_output = on_output
-        self._out: list[bytes] = []
-        self._err: list[bytes] = []
+        self._out, self._err = _Tail(), _Tail()
         self._rest = b''
 
     def add(self, out: bytes = b'', err: bytes = b'') -> None:
         """Add new standard output and standard error."""
-        self._out.append(out)
-        self._err.append(err)
+        if self._head is not None:
+            first, newline, out = (self._head + out).partition(b'\n')
+            self._head = None if newline else first
+            if newline and first.isdigit():
+                self.pid = int(first)
+        self._out.add(out)
+        self._err.add(err)
         if self._on_output is not None and out:
             *lines, self._rest = (self._rest + out).split(b'\n')
+            if len(self._rest) > MAX_LINE:
+                lines.append(self._rest)
+                self._rest = b''
             for line in lines:
-                self._on_output(line.decode(errors='replace'))
+                self._on_output(clean(line.decode(errors='replace')))
 
     def text(self) -> tuple[str, str]:
-        """Return standard output and standard error; pass an incomplete last line on."""
+        """Return standard output, and standard error cleaned; pass an incomplete last line on."""
         if self._on_output is not None and self._rest:
-            self._on_output(self._rest.decode(errors='replace'))
+            self._on_output(clean(self._rest.decode(errors='replace')))
             self._rest = b''
-        return (b''.join(self._out).decode(errors='replace'),
-                b''.join(self._err).decode(errors='replace'))
+        return self._out.text(), clean(self._err.text())
+
+
+class _Tail:
+    """The last bytes of a stream."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._dropped = 0
+
+    def add(self, data: bytes) -> None:
+        self._data += data
+        if len(self._data) > KEPT + MAX_LINE:
+            self._dropped += len(self._data) - KEPT
+            del self._data[:-KEPT]
+
+    def text(self) -> str:
+        text = self._data.decode(errors='replace')
+        return f'[{self._dropped} earlier bytes were dropped]\n{text}' if self._dropped else text

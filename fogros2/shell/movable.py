@@ -14,7 +14,7 @@ from fogros2.model import Command, Result, SyncReport
 from fogros2.shell import Shell, Stream
 
 #: Seconds to wait for the commands on a shell that is replaced.
-PATIENCE = 3.0
+DRAIN = 3.0
 
 
 class MovableShell:
@@ -33,12 +33,12 @@ class MovableShell:
         """
         Use another shell to the same machine from now on, and close the previous one.
 
-        Open streams end. The method waits up to ``PATIENCE`` seconds for running commands: on a
+        Open streams end. The method waits up to ``DRAIN`` seconds for running commands: on a
         closed shell, they would connect again, although the firewall no longer admits them.
         """
         with self._news:
             before, self._shell = self._shell, shell
-            self._news.wait_for(lambda: not self._calls[id(before)], PATIENCE)
+            self._news.wait_for(lambda: not self._calls[id(before)], DRAIN)
         before.close()
 
     @contextlib.contextmanager

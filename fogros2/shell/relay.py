@@ -13,36 +13,11 @@ import socket
 import struct
 import sys
 import threading
-from typing import Protocol
 
 from fogros2.errors import FogError
+from fogros2.shell.lines import Channel
 
 _HELPER = Path(__file__).with_name('rsh.py')
-
-
-class Channel(Protocol):
-    """A program on a machine, with the interface of paramiko's channels."""
-
-    def sendall(self, data: bytes, /) -> None:
-        """Send to standard input."""
-
-    def shutdown_write(self) -> None:
-        """Close standard input."""
-
-    def recv(self, size: int, /) -> bytes:
-        """Return up to ``size`` bytes of standard output, b'' at its end."""
-
-    def recv_stderr(self, size: int, /) -> bytes:
-        """Return up to ``size`` bytes of standard error, b'' at its end."""
-
-    def recv_exit_status(self) -> int:
-        """Wait for the exit, and return the exit status; -1 if it will never be known."""
-
-    def settimeout(self, timeout: float | None, /) -> None:
-        """Set the time-out of reads in seconds, None: no time-out."""
-
-    def close(self) -> None:
-        """Close the channel."""
 
 
 @contextlib.contextmanager
@@ -72,25 +47,33 @@ def remote_shell(start: Callable[[str], Channel]) -> Iterator[tuple[str, list[Fo
 def _serve(
     listener: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
 ) -> None:
-    try:
-        link, _ = listener.accept()
-    except OSError:
-        return  # rsync ended before it connected
-    with link:
-        peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
-        if struct.unpack('3i', peer)[1] != os.geteuid():
-            return
-        line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
+    while True:
         try:
-            if len(streams) == 3:
-                link.sendall(bytes([relay(start(line.decode()), *streams)]))
-        except FogError as error:
-            failures.append(error)
+            link, _ = listener.accept()
         except OSError:
-            pass  # rsync has ended; its own exit status has the reason
-        finally:
-            for stream in streams:
-                os.close(stream)
+            return  # rsync ended before it connected
+        with link:
+            # Every account can list and connect to an abstract socket.
+            peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
+            if struct.unpack('3i', peer)[1] == os.geteuid():
+                _serve_rsync(link, start, failures)
+                return
+
+
+def _serve_rsync(
+    link: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
+) -> None:
+    line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
+    try:
+        if len(streams) == 3:
+            link.sendall(bytes([relay(start(line.decode()), *streams)]))
+    except FogError as error:
+        failures.append(error)
+    except OSError:
+        pass  # rsync has ended; its own exit status has the reason
+    finally:
+        for stream in streams:
+            os.close(stream)
 
 
 def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:

@@ -256,7 +256,8 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
     """
     import paramiko
     if not os.access(path, os.R_OK):
-        raise AuthenticationError(f"the key {path} for '{name}' can not be read", 'check key=')
+        raise AuthenticationError(f"the key {path} for '{name}' can not be read",
+                                  'check the owner and the mode of the file')
     for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
         try:
             key: paramiko.PKey = kind.from_private_key_file(str(path))
@@ -266,7 +267,8 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
                                       f'ssh-add {path}') from error
         except (paramiko.SSHException, ValueError, IndexError):
             continue  # another type of key
-    raise AuthenticationError(f'{path} is no private key that SSH knows', 'check key=')
+    raise AuthenticationError(f'{path} is no private key that SSH knows',
+                              'check the content of the file; a full disk leaves it empty')
 
 
 def _explained(

@@ -30,7 +30,7 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, relay, ssh_connection
+from fogros2.shell import command_line, lines, relay, ssh_connection
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -52,7 +52,7 @@ class Connection(Protocol):
             cancel: Optional[threading.Event] = None) -> Result:
         """Run a command on the machine."""
 
-    def start(self, line: str) -> relay.Channel:
+    def start(self, line: str) -> lines.Channel:
         """Start a command line on the machine."""
 
 
@@ -131,17 +131,13 @@ def check_source(source: Path) -> None:
 def is_large(source: Path, limit: int) -> bool:
     """Return whether a folder's files exceed ``limit`` bytes; stop counting at the limit."""
     size = 0
-    folders = [str(source)]
-    while folders:
-        with contextlib.suppress(OSError), os.scandir(folders.pop()) as entries:
-            for entry in entries:
-                if entry.is_dir(follow_symlinks=False):
-                    if entry.name != '.git':
-                        folders.append(entry.path)
-                elif entry.is_file(follow_symlinks=False):
-                    size += entry.stat(follow_symlinks=False).st_size
-                    if size > limit:
-                        return True
+    for folder, folders, files in os.walk(source):
+        folders[:] = set(folders) - {'.git'}
+        for name in files:
+            with contextlib.suppress(OSError):  # deleted meanwhile
+                size += os.lstat(os.path.join(folder, name)).st_size
+        if size > limit:
+            return True
     return False
 
 
@@ -245,9 +241,8 @@ def explained(result: Result, source: Path, where: str) -> FogError:
     if result.returncode in _LOST:
         return ConnectError(f'the connection to {where} was lost while {source} was sent',
                             "check the robot's network")
-    lines = [line for line in text.splitlines() if line.startswith('rsync:')] or \
-        text.splitlines()
-    told = Result(result.returncode, '', '\n'.join(lines[:3]))
+    said = [line for line in text.splitlines() if line.startswith('rsync:')] or text.splitlines()
+    told = Result(result.returncode, '', '\n'.join(said[:3]))
     hint = 'give the login user the right to write there' if 'Permission denied' in text else ''
     return CommandError(Command(('rsync',), what=f'sending {source}'), told, where, hint)
 

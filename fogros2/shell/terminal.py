@@ -11,16 +11,10 @@ import termios
 import threading
 import tty
 from types import FrameType
-from typing import Optional, Protocol
+from typing import Optional
 
 from fogros2.shell import relay
-
-
-class Terminal(relay.Channel, Protocol):
-    """A program on a machine, with or without a terminal."""
-
-    def resize_pty(self, width: int, height: int, /) -> None:
-        """Set a new size, in characters."""
+from fogros2.shell.lines import Channel
 
 
 def size() -> Optional[tuple[int, int, str]]:
@@ -32,7 +26,7 @@ def size() -> Optional[tuple[int, int, str]]:
     return rows or 24, columns or 80, os.environ.get('TERM', 'dumb')
 
 
-def attach(channel: Terminal, *, keys: bool) -> int:
+def attach(channel: Channel, *, keys: bool) -> int:
     """
     Connect standard input and output to a program on a machine until the program ends.
 
@@ -58,7 +52,7 @@ def _raw() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _following_size(channel: Terminal) -> Iterator[None]:
+def _following_size(channel: Channel) -> Iterator[None]:
     """Send each new size of this terminal to the remote terminal during the block."""
     def resized(number: int, frame: Optional[FrameType]) -> None:
         columns, rows = os.get_terminal_size(0)

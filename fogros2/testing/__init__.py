@@ -7,11 +7,11 @@ then runs the contract against the provider. :class:`ShellContract` works the sa
 pass the same contracts, so tests with fakes are valid for real plugins.
 """
 
-from fogros2.testing.fakes import FakeClock, FakeProvider, FakeShell, FakeStream
+from fogros2.testing.fakes import FakeClock, FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.provider_contract import ProviderContract, request_for
 from fogros2.testing.shell_contract import ShellContract
 
 __all__ = [
-    'FakeClock', 'FakeProvider', 'FakeShell', 'FakeStream', 'ProviderContract', 'ShellContract',
-    'request_for',
+    'FakeClock', 'FakeProvider', 'FakeShell', 'FakeStream', 'FakeVpn', 'ProviderContract',
+    'ShellContract', 'request_for',
 ]

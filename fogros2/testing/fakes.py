@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fake a clock, a provider, a stream and a shell, which record calls and have no effect."""
+"""Fake a clock, a provider, a VPN, a stream and a shell, without any effect."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import fnmatch
@@ -13,7 +13,7 @@ import secrets
 import stat
 import threading
 import time
-from typing import ClassVar, Optional
+from typing import Any, ClassVar, Optional
 
 from fogros2.errors import (
     Cancelled,
@@ -33,11 +33,14 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     MachineState,
+    Peer,
     Result,
     SyncReport,
+    VpnInterface,
 )
-from fogros2.provider import Provider
+from fogros2.provider import Capabilities, Provider
 from fogros2.shell import Stream
+from fogros2.vpn import Vpn
 
 #: Endpoint of every fake machine, in TEST-NET-2, which is never assigned.
 FAKE_ENDPOINT = Endpoint('fake', '198.51.100.1', user='fog')
@@ -73,8 +76,9 @@ class FakeProvider(Provider):
     """
 
     name: ClassVar[str] = 'fake'
-    shell_kind: ClassVar[str] = 'fake'
-    look_interval: ClassVar[float] = 0.05
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        shell_kind='fake', choices=True, stop=True)
+    poll_interval: ClassVar[float] = 0.05
 
     def __init__(
         self, *, polls: int = 0, shell: Endpoint = FAKE_ENDPOINT,
@@ -93,6 +97,11 @@ class FakeProvider(Provider):
         self._machines: dict[str, Machine] = {}
         self._tokens: dict[str, str] = {}
         self._waits: dict[str, int] = {}
+
+    @classmethod
+    def can(cls, **changes: Any) -> Capabilities:
+        """Return the capabilities with changes, for a test that replaces them."""
+        return dataclasses.replace(cls.capabilities, **changes)
 
     def check(self, spec: MachineSpec) -> None:
         """Refuse every option except 'size'."""
@@ -179,21 +188,21 @@ class FakeProvider(Provider):
 
     def robot_address(self) -> str:
         """Return ``address``."""
-        if not self.firewall:
+        if not self.capabilities.firewall:
             return super().robot_address()
         self._called('robot_address')
         return self.address
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
         """Record the allowed sources."""
-        if not self.firewall:
+        if not self.capabilities.firewall:
             super().allow(machine_id, port, sources)
         self._called('allow')
         self.allowed[machine_id, port] = list(sources)
 
     def pin(self, machine_id: str, host_key: str) -> None:
         """Record the host key."""
-        if not self.one_time_host_key:
+        if not self.capabilities.one_time_host_key:
             super().pin(machine_id, host_key)
         self._called('pin')
         self.host_keys[machine_id] = host_key
@@ -207,6 +216,48 @@ class FakeProvider(Provider):
         self.calls.append(method)
         if method in self.failures:
             raise self.failures.pop(method)
+
+
+class FakeVpn(Vpn):
+    """A VPN whose commands do nothing; their arguments are the names of the peers."""
+
+    def __init__(self, domain: int = 0, ports: Sequence[tuple[int, int]] = ()) -> None:
+        """Ignore the parameters, which every VPN has."""
+
+    def keys(self, interface: VpnInterface) -> Command:
+        """Return a command that prints a public key."""
+        return Command(('echo', f'key of {interface.name}'), what='keys')
+
+    def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """Yield one command."""
+        return self._named('up', peers)
+
+    def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """Yield one command."""
+        return self._named('peers', peers)
+
+    def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
+        """Yield one command."""
+        return self._named('repair', peers)
+
+    def _named(self, what: str, peers: Sequence[Peer]) -> Iterator[Command]:
+        yield Command(('true', *sorted(peer.name for peer in peers)), what=what)
+
+    def health_check(self, interface: VpnInterface) -> Command:
+        """Return a command that succeeds."""
+        return Command(('true',), what='health check')
+
+    def status(self, interface: VpnInterface) -> Command:
+        """Return a command without output."""
+        return Command(('true',), what='status')
+
+    def parse_status(self, output: str) -> dict[str, dict[str, float]]:
+        """Return nothing."""
+        return {}
+
+    def down(self, interface: VpnInterface) -> Iterator[Command]:
+        """Yield one command."""
+        return self._named('down', ())
 
 
 class FakeStream:

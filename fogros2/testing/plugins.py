@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import os
 from pathlib import Path
 from typing import Any, Union
@@ -39,12 +39,14 @@ def install(folder: Path, group: str, name: str, program: str, attribute: str) -
 
 
 def instead(
-    patch: pytest.MonkeyPatch, group: str, known: Mapping[str, Union[type[Any], FogError]],
+    patch: pytest.MonkeyPatch, group: str,
+    known: Mapping[str, Union[Callable[..., Any], FogError]],
 ) -> None:
     """
     Replace all plugins of a group in this process.
 
-    :param known: by name, the class, or the error that loading it raises.
+    :param known: by name, the class or a function that makes one, or the error that loading it
+        raises.
     """
     names, load = plugin_system.names, plugin_system.load
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contract of every provider, as tests."""
+"""The contract of every provider, as tests for pytest."""
 
-# ruff: noqa: D102 - a test says in its name what it holds
+# ruff: noqa: D102 - the name of a test states the behaviour
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ import uuid
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
+    FogError,
     MachineNotFound,
     NameTaken,
     ProviderError,
     Unsupported,
 )
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import Provider, TAG_NAME
+from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_NAME
+from fogros2.provider.offers import wants
 from fogros2.testing.shell_contract import raised
+from fogros2.waiting import wait_until
 
 #: A public key without a known private key; providers check its format.
 PUBLIC_KEY = ('ssh-ed25519 '
@@ -33,7 +36,7 @@ PUBLIC_KEY = ('ssh-ed25519 '
 
 
 def request_for(spec: MachineSpec, *, token: Optional[str] = None, **tags: str) -> CreateRequest:
-    """Return a request like the core's, for a machine without logins."""
+    """Return a request as the core makes it, with a key that nobody can log in with."""
     return CreateRequest(
         token=token or str(uuid.uuid4()), authorized_key=PUBLIC_KEY,
         tags={TAG_NAME: spec.name, **tags}, vpn_port=51820)
@@ -43,11 +46,12 @@ class ProviderContract:
     """
     The contract of every provider; pytest collects its subclasses.
 
-    Tests of optional features depend on a class attribute (``owned``, ``firewall``, ...).
+    A test of an optional method depends on the provider's capabilities: with the capability the
+    method works, without it the method has the effect of the default.
     """
 
     #: Seconds until a machine is reachable, and until a deleted machine is gone.
-    patience: ClassVar[float] = 60.0
+    timeout: ClassVar[float] = 60.0
 
     def make(self) -> tuple[Provider, dict[str, Any]]:
         """Return a provider, and the options of machines for the tests."""
@@ -58,6 +62,8 @@ class ProviderContract:
         """Yield a new machine, and delete it afterwards."""
         provider, options = self.make()
         spec = MachineSpec(f't{secrets.token_hex(3)}', provider.name, options)
+        if provider.capabilities.stop:
+            spec = dataclasses.replace(spec, on_exit='stop')
         request = request_for(spec, **tags)
         machine_id = provider.create(spec, request)
         try:
@@ -67,10 +73,18 @@ class ProviderContract:
 
     def reached(self, provider: Provider, machine_id: str, name: str = 'it') -> Machine:
         """Wait until a machine is reachable, and return it."""
-        return provider.reachable(
-            machine_id, name=name, timeout=self.patience, cancel=threading.Event())
+        return provider.reachable(machine_id, name=name, timeout=self.timeout)
 
-    def test_check_accepts_what_create_takes(self) -> None:
+    # -- before a machine exists ----------------------------------------------------------------
+
+    def test_provider_is_configured_and_answers(self) -> None:
+        provider, _ = self.make()
+        assert isinstance(provider.capabilities, Capabilities)
+        assert provider.configured() is True
+        if provider.capabilities.owned:
+            assert provider.answers()
+
+    def test_check_accepts_the_options_of_create(self) -> None:
         provider, options = self.make()
         provider.check(MachineSpec('planner', provider.name, options))
 
@@ -81,7 +95,37 @@ class ProviderContract:
         assert 'sizee' in str(error)
         assert error.hint
 
-    def test_a_machine_comes_up_and_can_be_reached(self) -> None:
+    def test_containers_are_refused_without_the_capability(self) -> None:
+        provider, options = self.make()
+        spec = MachineSpec('planner', provider.name, options)
+        if provider.capabilities.containers:
+            provider.check_containers(spec)
+        else:
+            assert raised(Unsupported, lambda: provider.check_containers(spec)).hint
+
+    def test_resolve_chooses_once_and_create_accepts_it(self) -> None:
+        provider, options = self.make()
+        spec = MachineSpec('planner', provider.name, options)
+        chosen = provider.resolve(spec)
+        assert dataclasses.replace(chosen, options=spec.options) == spec
+        if not provider.capabilities.choices:
+            assert chosen == spec
+        provider.check(chosen)
+        assert provider.resolve(chosen) == chosen
+        assert all(isinstance(words, str) for words in provider.choices(spec, chosen))
+
+    def test_resolved_spec_has_price_and_architecture(self) -> None:
+        provider, options = self.make()
+        spec = provider.resolve(MachineSpec('planner', provider.name, options))
+        price = provider.cost_per_hour(spec)
+        assert price is None or price >= 0
+        assert provider.architecture(spec) in ('', 'x86_64', 'aarch64', 'armv7l', 'riscv64')
+        assert all(folder.startswith('/') for folder in provider.shared_folders(spec))
+        assert isinstance(provider.has_own_packages(spec), bool)
+
+    # -- a machine's life -----------------------------------------------------------------------
+
+    def test_machine_starts_and_can_be_reached(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
             machine = self.reached(provider, machine_id)
             assert machine.id == machine_id
@@ -89,31 +133,33 @@ class ProviderContract:
             assert machine.provider == provider.name
             assert machine.state is MachineState.RUNNING
             assert machine.vpn_host or machine.robot_host
-            assert machine.shell is not None and machine.shell.kind == provider.shell_kind
+            assert machine.shell is not None
+            assert machine.shell.kind == provider.capabilities.shell_kind
             assert provider.describe(machine_id).shell == machine.shell
-            assert machine.owned is provider.owned
-            if provider.owned:
+            assert machine.owned is provider.capabilities.owned
+            assert isinstance(provider.capabilities_of(machine), Capabilities)
+            if provider.capabilities.owned:
                 assert machine.end_command
                 assert machine.created is not None
-                assert abs(machine.created - time.time()) < self.patience + 60.0
+                assert abs(machine.created - time.time()) < self.timeout + 60.0
 
-    def test_one_token_makes_one_machine(self) -> None:
+    def test_one_token_creates_one_machine(self) -> None:
         with self.machine() as (provider, spec, request, machine_id):
             assert provider.create(spec, request) == machine_id
-            if provider.owned:
+            if provider.capabilities.owned:
                 assert len(list(provider.find({TAG_NAME: spec.name}))) == 1
 
-    def test_a_name_is_taken_once(self) -> None:
+    def test_taken_name_is_refused(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
-            if not provider.owned:
+            if not provider.capabilities.owned:
                 return
             raised(NameTaken, lambda: provider.create(spec, request_for(spec)))
             assert provider.describe(machine_id).state is not MachineState.DELETED
 
-    def test_machines_are_found_by_all_their_tags(self) -> None:
+    def test_find_returns_machines_with_all_tags(self) -> None:
         mark = secrets.token_hex(4)
         provider, _ = self.make()
-        if not provider.owned:
+        if not provider.capabilities.owned:
             raised(Unsupported, lambda: list(provider.find({})))
             return
         with self.machine(**{'fogros2-test': mark}) as (provider, spec, _, machine_id):
@@ -130,17 +176,17 @@ class ProviderContract:
         with self.machine() as (provider, spec, _, machine_id):
             provider.destroy(machine_id)
             provider.destroy(machine_id)
-            if provider.owned:
+            if provider.capabilities.owned:
                 raised(MachineNotFound, lambda: provider.describe(machine_id))
                 assert not list(provider.find({TAG_NAME: spec.name}))
 
-    def test_nothing_is_known_of_an_unknown_machine(self) -> None:
+    def test_unknown_machine_is_not_found(self) -> None:
         provider, _ = self.make()
         raised(MachineNotFound, lambda: provider.describe('no-such-machine'))
 
-    def test_a_machine_created_again_after_its_end_is_a_new_one(self) -> None:
+    def test_machine_created_after_destroy_is_new(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
-            if not provider.owned:
+            if not provider.capabilities.owned:
                 return
             provider.destroy(machine_id)
             again = provider.create(spec, request_for(spec))
@@ -149,36 +195,52 @@ class ProviderContract:
             finally:
                 provider.destroy(again)
 
-    def test_choices_are_made_once_and_create_takes_them(self) -> None:
-        provider, options = self.make()
-        spec = MachineSpec('planner', provider.name, options)
-        chosen = provider.resolve(spec)
-        assert dataclasses.replace(chosen, options=spec.options) == spec
-        provider.check(chosen)
-        assert provider.resolve(chosen) == chosen
-        price = provider.cost_per_hour(chosen)
-        assert price is None or price >= 0
-
-    def test_waiting_for_a_machine_ends_with_the_launch(self) -> None:
-        cancel = threading.Event()
-        cancel.set()
+    def test_cancel_ends_reachable_but_not_destroy(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
-            raised(Cancelled, lambda: provider.reachable(
-                machine_id, name=spec.name, timeout=self.patience, cancel=cancel))
+            provider.cancel = threading.Event()
+            provider.cancel.set()
+            raised(Cancelled, lambda: self.reached(provider, machine_id))
+            provider.destroy(machine_id)
 
-    def test_waiting_for_a_machine_that_is_gone_ends_at_once(self) -> None:
+    def test_reachable_fails_at_once_for_a_deleted_machine(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
-            if not provider.owned:
+            if not provider.capabilities.owned:
                 return
             provider.destroy(machine_id)
             begin = time.monotonic()
-            raised(ProviderError, lambda: provider.reachable(
-                machine_id, name=spec.name, timeout=self.patience, cancel=threading.Event()))
-            assert time.monotonic() - begin < self.patience / 2
+            raised(ProviderError, lambda: self.reached(provider, machine_id))
+            assert time.monotonic() - begin < self.timeout / 2
 
-    def test_a_firewall_lets_the_robot_in_and_is_closed_again(self) -> None:
+    def test_adopted_machine_has_the_tags_of_its_launch(self) -> None:
+        with self.machine(**{TAG_EXPIRES: '1'}) as (provider, spec, _, machine_id):
+            self.reached(provider, machine_id)
+            provider.adopt(machine_id, spec, {TAG_EXPIRES: '2'})
+            if provider.capabilities.adopt:
+                assert provider.describe(machine_id).tags[TAG_EXPIRES] == '2'
+
+    def test_stopped_machine_starts_again(self) -> None:
         with self.machine() as (provider, _, _, machine_id):
-            if not provider.firewall:
+            if not provider.capabilities.stop:
+                raised(Unsupported, lambda: provider.stop(machine_id))
+                raised(Unsupported, lambda: provider.start(machine_id))
+                return
+            self.reached(provider, machine_id)
+            provider.stop(machine_id)
+            wait_until(lambda: provider.describe(machine_id).state is MachineState.STOPPED,
+                       timeout=self.timeout, what='the machine to stop')
+            provider.start(machine_id)
+            assert self.reached(provider, machine_id).id == machine_id
+
+    def test_tidy_keeps_a_machine_that_exists(self) -> None:
+        with self.machine() as (provider, _, _, machine_id):
+            assert all(isinstance(words, str) for words in provider.tidy())
+            assert provider.describe(machine_id).state is not MachineState.DELETED
+
+    # -- its network ----------------------------------------------------------------------------
+
+    def test_firewall_admits_the_robot_and_closes(self) -> None:
+        with self.machine() as (provider, _, _, machine_id):
+            if not provider.capabilities.firewall:
                 raised(Unsupported, lambda: provider.allow(machine_id, 22, []))
                 raised(Unsupported, provider.robot_address)
                 return
@@ -187,19 +249,19 @@ class ProviderContract:
             for sources in ([robot], [robot], [], [], [robot]):
                 provider.allow(machine_id, 22, sources)
 
-    def test_a_port_is_published_and_closed_again(self) -> None:
+    def test_port_opens_and_closes(self) -> None:
         with self.machine() as (provider, _, _, machine_id):
             machine = self.reached(provider, machine_id)
             for sources in (['198.51.100.0/28'], ['198.51.100.0/28', '198.51.100.77/32']):
-                host, port = provider.publish(machine, 8766, sources)
+                host, port = provider.open_port(machine, 8766, sources)
                 assert host and 0 < port < 65536
             for _ in range(2):
-                provider.publish(machine, 8766, [])
+                provider.open_port(machine, 8766, [])
 
-    def test_a_host_key_of_the_machine_s_own_is_told_from_then_on(self) -> None:
+    def test_pinned_host_key_is_reported_everywhere(self) -> None:
         with self.machine() as (provider, _, _, machine_id):
             key = ' '.join(PUBLIC_KEY.split()[:2])
-            if not provider.one_time_host_key:
+            if not provider.capabilities.one_time_host_key:
                 raised(Unsupported, lambda: provider.pin(machine_id, key))
                 return
             self.reached(provider, machine_id)
@@ -207,3 +269,43 @@ class ProviderContract:
             another, _ = self.make()
             shell = another.describe(machine_id).shell
             assert shell is not None and shell.host_key == key
+
+    # -- images, regions, prices ----------------------------------------------------------------
+
+    def test_baked_image_is_listed_and_deleted(self) -> None:
+        with self.machine() as (provider, spec, _, machine_id):
+            if not provider.capabilities.images:
+                raised(Unsupported, lambda: provider.bake(machine_id, 'image', 'abcd'))
+                raised(Unsupported, lambda: list(provider.images()))
+                raised(Unsupported, lambda: provider.delete_image('image'))
+                return
+            self.reached(provider, machine_id)
+            image_id = provider.bake(machine_id, spec.name, 'abcd')
+            try:
+                image, = (one for one in provider.images() if one.id == image_id)
+                assert (image.name, image.dependencies) == (spec.name, 'abcd')
+            finally:
+                provider.delete_image(image_id)
+            provider.delete_image(image_id)
+            assert image_id not in [one.id for one in provider.images()]
+
+    def test_regions_are_known_without_a_request(self) -> None:
+        provider, _ = self.make()
+        provider.search_in(())
+        if not provider.capabilities.regions:
+            assert not provider.region_names()
+            raised(Unsupported, provider.regions)
+            return
+        assert len(set(provider.region_names())) == len(provider.region_names()) > 0
+        raised(ConfigurationError, lambda: provider.regions(['no-such-region']))
+
+    def test_offers_are_sorted_by_price(self) -> None:
+        provider, _ = self.make()
+        asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+        if not provider.capabilities.prices:
+            raised(Unsupported, lambda: provider.offers(asked))
+            return
+        with contextlib.suppress(FogError):  # a simulated service may have no price list
+            found = provider.offers(asked)
+            prices = [offer.price for offer in found.offers if offer.price is not None]
+            assert prices == sorted(prices) and found.regions

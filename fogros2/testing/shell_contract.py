@@ -96,7 +96,7 @@ class ShellContract:
             shell.run(Command(('seq', '20000')), timeout=30.0, on_output=lines.append)
         assert lines == [str(n + 1) for n in range(20000)]
 
-    def test_a_command_that_takes_too_long_is_given_up(self, tmp_path: Path) -> None:
+    def test_command_that_takes_too_long_is_given_up(self, tmp_path: Path) -> None:
         with self.connected(tmp_path) as (shell, _):
             begin = time.monotonic()
             raised(DeadlineExceeded,

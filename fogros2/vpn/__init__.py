@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plugin interface of VPNs: pure functions from interfaces and peers to commands."""
+"""
+The plugin interface of VPNs: pure functions from interfaces and peers to commands.
+
+``addresses`` chooses the subnet of a launch. ``wireguard`` writes the commands, and
+``receive_buffer`` is a program that they run. ``helped`` is the plugin: on the robot it may use
+the root helper.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +36,7 @@ class Vpn(abc.ABC):
         """Yield the commands that replace the peers of a running interface; sessions continue."""
 
     @abc.abstractmethod
-    def alive(self, interface: VpnInterface) -> Command:
+    def health_check(self, interface: VpnInterface) -> Command:
         """Return a cheap command with exit status 0 while the interface's program runs."""
 
     @abc.abstractmethod

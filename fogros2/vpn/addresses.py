@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 import ipaddress
 import json
 import socket
@@ -73,11 +73,6 @@ def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
     ours = _Network(subnet)
     return [text for text in used
             if (network := _network(text)) is not None and network.overlaps(ours)]
-
-
-def addresses(subnet: str) -> Iterator[str]:
-    """Yield the addresses of a launch's subnet: the robot's (.1), then the machines' (.2, ...)."""
-    return map(str, _Network(subnet).hosts())
 
 
 def used_networks() -> Command:

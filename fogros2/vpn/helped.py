@@ -10,7 +10,7 @@ always create the interfaces of machines.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import functools
 import json
 import os
@@ -56,7 +56,8 @@ def _ask(verb: str, request: Mapping[str, object], what: str = '') -> Command:
     return Command((HELPER, verb), sudo=True, input=json.dumps(request).encode(), what=what)
 
 
-def _made(interface: VpnInterface) -> bool:
+def made(interface: VpnInterface) -> bool:
+    """Return whether the helper creates, or has created, an interface."""
     return interface.key_file == key_file(interface.name)
 
 
@@ -70,44 +71,37 @@ class HelpedWireGuard(WireGuard):
 
     def keys(self, interface: VpnInterface) -> Command:
         """Return the command that reserves the interface's name, and prints the public key."""
-        command = super().keys(interface)
-        if not _made(interface):
-            return command
-        return _ask('keys', {'name': interface.name, 'pid': os.getpid()}, command.what)
+        return next(self._ask(
+            'keys', interface, [super().keys(interface)], pid=os.getpid()))
 
     def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that create the interface."""
-        for command in super().up(interface, peers):
-            yield command if not _made(interface) else _ask('up', {
-                'name': interface.name, 'network': interface.network, 'port': interface.port,
-                'domain': self.domain, 'ports': [list(pair) for pair in self.ports[1:]],
-                'peers': _peers(peers)}, command.what)
+        return self._ask(
+            'up', interface, super().up(interface, peers), peers=_peers(peers),
+            network=interface.network, port=interface.port, domain=self.domain,
+            ports=[list(pair) for pair in self.ports[1:]])
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers."""
-        return self._with('peers', interface, super().peers(interface, peers), peers)
+        return self._ask('peers', interface, super().peers(interface, peers), peers=_peers(peers))
 
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that restart the interface's program."""
-        return self._with('repair', interface, super().repair(interface, peers), peers)
-
-    def _with(
-        self, verb: str, interface: VpnInterface, commands: Iterator[Command],
-        peers: Sequence[Peer],
-    ) -> Iterator[Command]:
-        for command in commands:
-            yield command if not _made(interface) else _ask(
-                verb, {'name': interface.name, 'peers': _peers(peers)}, command.what)
+        return self._ask(
+            'repair', interface, super().repair(interface, peers), peers=_peers(peers))
 
     def status(self, interface: VpnInterface) -> Command:
         """Return the command that prints the counters."""
-        command = super().status(interface)
-        if not _made(interface):
-            return command
-        return _ask('status', {'name': interface.name}, command.what)
+        return next(self._ask('status', interface, [super().status(interface)]))
 
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield the commands that delete the interface and its key."""
-        for command in super().down(interface):
-            yield command if not _made(interface) else _ask(
-                'down', {'name': interface.name}, command.what)
+        return self._ask('down', interface, super().down(interface))
+
+    def _ask(
+        self, verb: str, interface: VpnInterface, commands: Iterable[Command], **request: object,
+    ) -> Iterator[Command]:
+        """Yield requests to the helper instead of commands, if the helper has the interface."""
+        for command in commands:
+            yield command if not made(interface) else _ask(
+                verb, {'name': interface.name, **request}, command.what)

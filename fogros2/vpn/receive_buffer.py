@@ -22,7 +22,7 @@ import time
 #: Buffer size in bytes that newer releases of wireguard-go request.
 SIZE = 7 << 20
 #: Seconds that wireguard-go may need to open its sockets.
-PATIENCE = 2.0
+TIMEOUT = 2.0
 #: <asm-generic/unistd.h> and <asm-generic/socket.h>; Python has neither.
 _PIDFD_GETFD, _SO_RCVBUFFORCE = 438, 33
 
@@ -75,7 +75,7 @@ def enlarge(process: int) -> int:
 def main() -> None:
     """Set the buffers of an interface's process when it has opened its sockets."""
     for process in processes(sys.argv[1]):
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         try:
             while not enlarge(process) and time.monotonic() < end:
                 time.sleep(0.01)

@@ -25,7 +25,7 @@ from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn import Vpn
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
-#: for kernels without the module, ``nft`` only for guarded interfaces.
+#: for kernels without the module, ``nft`` only for interfaces with a firewall.
 PACKAGES = {
     'wg': 'wireguard-tools', 'ip': 'iproute2', 'nft': 'nftables', 'wireguard-go': 'wireguard-go'}
 #: Interval of keepalive packets in seconds: routers keep a NAT mapping for 30 s or more.
@@ -61,7 +61,7 @@ class WireGuard(Vpn):
     """
     Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
-    :param domain: ROS_DOMAIN_ID, whose DDS ports a guarded interface admits.
+    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits.
     :param ports: further ranges of UDP ports to admit, as (first, last).
     """
 
@@ -101,7 +101,7 @@ class WireGuard(Vpn):
                        _buffer(interface)]), sudo=True,
             what=_what('tell', interface, 'its peers'))
 
-    def alive(self, interface: VpnInterface) -> Command:
+    def health_check(self, interface: VpnInterface) -> Command:
         """
         Return the health check: a few milliseconds, and no root on the robot.
 
@@ -118,7 +118,7 @@ class WireGuard(Vpn):
         lines = [
             f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
             '[ "$carrier" = 1 ]']
-        if interface.guarded:
+        if interface.firewall:
             noted = _noted(interface)
             lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
                          f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
@@ -126,7 +126,7 @@ class WireGuard(Vpn):
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
         return Command.script(
-            '\n'.join(lines), sudo=not interface.guarded, what=_what('look at', interface))
+            '\n'.join(lines), sudo=not interface.firewall, what=_what('look at', interface))
 
     def repair(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """
@@ -178,9 +178,9 @@ class WireGuard(Vpn):
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
     ) -> list[_Step]:
-        guard = [_guard(interface, self.ports)] if interface.guarded else []
+        firewall = [_firewall(interface, self.ports)] if interface.firewall else []
         return [
-            *guard, _link(interface), _Step(_configure(interface, peers, recall=recall)),
+            *firewall, _link(interface), _Step(_configure(interface, peers, recall=recall)),
             _address(interface, peers), _Step(_buffer(interface))]
 
 
@@ -207,7 +207,7 @@ def _name(interface: VpnInterface) -> str:
     return name
 
 
-def _guard(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
+def _firewall(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
     Return the step that admits only DDS and ping from a machine, which may be hijacked.
 
@@ -324,7 +324,7 @@ def _configure(
             config = []
     lines += [_print(config)] if config else []
     lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
-    if interface.guarded:
+    if interface.firewall:
         # for the health check, which runs without root
         lines += [f'ask=$(wg show {_name(interface)} endpoints | {_ASK})',
                   f'(umask 022; {{ echo "#" $(echo "$ask" | {_FROM}); echo "$ask"; }} '

@@ -5,8 +5,7 @@ Serve the page and its data on the loopback interface, to clients that have the 
 The token is in the fragment of the page's URL, which browsers never send. The page puts the token
 into a header of each request; pages of other sites cannot do that. ``Host`` must be a name of the
 loopback interface, because an attacker can point another name to it. ``Origin``, if the browser
-sends it, must be the page's own. The URL of a started browser has a ticket instead, which the page
-exchanges for the token once, because other users of this computer can read the command line.
+sends it, must be the page's own.
 """
 
 from __future__ import annotations
@@ -21,8 +20,6 @@ from pathlib import Path
 import re
 import secrets
 import socket
-import threading
-import time
 from typing import Any, Optional, Protocol
 import urllib.parse
 
@@ -32,8 +29,6 @@ from fogros2.errors import FogError
 HEADER = 'X-Fogros2-Token'
 #: Seconds to wait for a new state, idle time-out of a client in seconds, largest request in bytes.
 PATIENCE, SILENCE, MOST = 15.0, 60.0, 10_000
-#: Seconds for which a ticket is valid, and the prefix of a ticket.
-VALID, TICKET = 60.0, 'ticket-'
 _REFUSAL = ('the token is missing or wrong: open the address that `ros2 fog dashboard` has '
             'printed')
 PAGE = Path(__file__).with_name('page.html')
@@ -70,8 +65,6 @@ class Dashboard:
     def __init__(self, source: Source, *, port: int = 0) -> None:
         self.source = source
         self.token = secrets.token_urlsafe(24)
-        self._tickets: dict[str, float] = {}
-        self._lock = threading.Lock()
         self.page = PAGE.read_bytes()
         self.policy = content_policy(self.page.decode())
         self._server = _Server(('127.0.0.1', port), self)
@@ -82,19 +75,6 @@ class Dashboard:
     def url(self) -> str:
         """The URL for a browser; everyone who knows it can read the page and delete machines."""
         return f'http://{self.hosts[0]}/#{self.token}'
-
-    def url_with_ticket(self) -> str:
-        """Return a URL that admits a browser once, within a minute."""
-        ticket = TICKET + secrets.token_urlsafe(24)
-        with self._lock:
-            self._tickets[ticket] = time.monotonic() + VALID
-        return f'http://{self.hosts[0]}/#{ticket}'
-
-    def exchange(self, ticket: str) -> Optional[str]:
-        """Return the token for a ticket, None for a used, unknown or expired one."""
-        with self._lock:
-            valid = self._tickets.pop(ticket, 0.0)
-        return self.token if time.monotonic() < valid else None
 
     def serve(self) -> None:
         """Answer requests until a signal, or until another thread calls close()."""
@@ -155,7 +135,7 @@ class _Handler(BaseHTTPRequestHandler):
             check_host(self.headers.get('Host'), self.headers.get('Origin'),
                        self.headers.get('Sec-Fetch-Site'), self.server.dashboard.hosts)
             path, _, query = self.path.partition('?')
-            if path.startswith('/api/') and path != '/api/enter' and not hmac.compare_digest(
+            if path.startswith('/api/') and not hmac.compare_digest(
                     self.headers.get(HEADER, '').encode(),
                     self.server.dashboard.token.encode()):
                 raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
@@ -177,42 +157,30 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == '/api/picture':
             picture = source.picture(query.get('of', ''))
             if picture is None:
-                raise _Refused(HTTPStatus.NOT_FOUND, 'there is no picture of it')
+                raise _Refused(HTTPStatus.NOT_FOUND, 'there is no picture of this stream')
             self._send(picture, 'image/jpeg')
         else:
-            raise _Refused(HTTPStatus.NOT_FOUND, 'there is nothing of that name')
+            raise _Refused(HTTPStatus.NOT_FOUND, 'there is no such page')
 
     def _post(self, path: str, query: dict[str, str]) -> None:
-        dashboard = self.server.dashboard
-        if path == '/api/enter':
-            token = dashboard.exchange(self._wish('ticket')['ticket'])
-            if token is None:
-                raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
-            self._json({'token': token})
-        elif path == '/api/delete':
-            wish = self._wish('name')
-            force = wish.get('force', False)
-            if not isinstance(force, bool):
-                raise _Refused(HTTPStatus.BAD_REQUEST, "'force' is no wish: true or false")
-            dashboard.source.delete(wish['name'], force)
-            self._json({})
-        else:
-            raise _Refused(HTTPStatus.NOT_FOUND, 'there is nothing of that name')
-
-    def _wish(self, key: str) -> dict[str, Any]:
-        """Return the JSON object of the request, which must have a text for ``key``."""
+        if path != '/api/delete':
+            raise _Refused(HTTPStatus.NOT_FOUND, 'there is no such page')
         length = self.headers.get('Content-Length', '')
         if not length.isdigit() or int(length) > MOST:
-            raise _Refused(HTTPStatus.BAD_REQUEST, 'a wish has a length, and a small one')
+            raise _Refused(HTTPStatus.BAD_REQUEST, 'the request needs a length, and a small one')
         if self.headers.get_content_type() != 'application/json':
-            raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, 'a wish is JSON')
+            raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, 'the request must be JSON')
         try:
-            wish = json.loads(self.rfile.read(int(length)))
+            request = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
-            wish = None
-        if not isinstance(wish, dict) or not isinstance(wish.get(key), str):
-            raise _Refused(HTTPStatus.BAD_REQUEST, f"a wish is an object with '{key}'")
-        return wish
+            request = None
+        if not isinstance(request, dict) or not isinstance(request.get('name'), str):
+            raise _Refused(HTTPStatus.BAD_REQUEST, "the request must be an object with 'name'")
+        force = request.get('force', False)
+        if not isinstance(force, bool):
+            raise _Refused(HTTPStatus.BAD_REQUEST, "'force' in a request must be true or false")
+        self.server.dashboard.source.delete(request['name'], force)
+        self._json({})
 
     def _json(self, data: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(json.dumps(data, separators=(',', ':')).encode(), 'application/json', status)
@@ -242,11 +210,11 @@ def check_host(
     :param hosts: the server's own names with port.
     """
     if host not in hosts:
-        raise _Refused(HTTPStatus.MISDIRECTED_REQUEST, 'this page is for the loopback alone')
+        raise _Refused(HTTPStatus.MISDIRECTED_REQUEST, 'this page is served on the loopback only')
     if origin is not None and origin != f'http://{host}':
-        raise _Refused(HTTPStatus.FORBIDDEN, 'another site has no business here')
+        raise _Refused(HTTPStatus.FORBIDDEN, 'requests of other sites are refused')
     if site not in (None, 'same-origin', 'none'):
-        raise _Refused(HTTPStatus.FORBIDDEN, 'another site has no business here')
+        raise _Refused(HTTPStatus.FORBIDDEN, 'requests of other sites are refused')
 
 
 def content_policy(page: str) -> str:

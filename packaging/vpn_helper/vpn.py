@@ -32,6 +32,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+import time
 from typing import Any, NoReturn, Optional, Union
 
 sys.dont_write_bytecode = True
@@ -59,6 +60,8 @@ LONGEST = 256 * 1024
 #: Seconds that the caller has to say what it wants, and that a script has.
 PATIENCE = 5
 TIME = 25.0
+#: Seconds to wait for another request, whose scripts may take ``TIME``.
+QUEUE = 60.0
 #: Below are the ports of services of the computer's own, which no user may take or open.
 FIRST_PORT = 1024
 
@@ -204,7 +207,7 @@ class Record:
         """Return what the VPN makes of it."""
         network = self.network or '127.0.0.0/24'
         return VpnInterface(self.name, own_address(network), network, self.port,
-                            str(RECORDS / self.name / 'key'), guarded=True)
+                            str(RECORDS / self.name / 'key'), firewall=True)
 
     def vpn(self) -> WireGuard:
         """Return what knows the commands."""
@@ -235,12 +238,18 @@ def records() -> list[Record]:
 
 
 def prepare() -> None:
-    """Make the folder of the records, root's alone to change."""
+    """
+    Make the folder of the records, root's alone to change.
+
+    Users may look up a name in it (``helped.key_of``), but not open it: who can open a folder can
+    lock it.
+    """
     with contextlib.suppress(FileExistsError):
-        RECORDS.mkdir(mode=0o755)
+        RECORDS.mkdir(mode=0o711)
     status = RECORDS.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != 0 or status.st_mode & 0o022:
         raise Refused(f"{RECORDS} isn't root's alone")
+    RECORDS.chmod(0o711)  # an older version made it with 0755
 
 
 @contextlib.contextmanager
@@ -249,10 +258,19 @@ def locked(folder: Path) -> Iterator[None]:
     Hold a folder for oneself.
 
     :raises FileNotFoundError: it is gone, or went meanwhile.
+    :raises Refused: another process has held it for ``QUEUE`` seconds.
     """
     held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    deadline = time.monotonic() + QUEUE
     try:
-        fcntl.flock(held, fcntl.LOCK_EX)
+        while True:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise Refused(f'another process has held {folder} for {QUEUE:g} s') from None
+                time.sleep(0.02)
         if not os.path.samestat(os.fstat(held), os.lstat(folder)):
             raise FileNotFoundError(folder)
         yield
@@ -451,6 +469,8 @@ def settle() -> None:
     os.chdir('/')
     for each in (signal.SIGCHLD, signal.SIGPIPE, signal.SIGALRM):
         signal.signal(each, signal.SIG_DFL)
+    for each in (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):
+        signal.signal(each, signal.SIG_IGN)  # a stopped request would keep its lock
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
     for limit in (resource.RLIMIT_FSIZE, resource.RLIMIT_CPU, resource.RLIMIT_AS):
         try:

@@ -23,19 +23,12 @@ class ROSAdapter:
         self.ros_node = rclpy.create_node(f'launch_ros_{os.getpid()}', context=self.ros_context)
         self.ros_executor = SingleThreadedExecutor(context=self.ros_context)
         self.ros_executor.add_node(self.ros_node)
-        self.__is_running = True
-        self.__thread = threading.Thread(target=self._run, name='launch_ros')
+        self.__thread = threading.Thread(target=self.ros_executor.spin, name='launch_ros')
         self.__thread.start()
-
-    def _run(self) -> None:
-        while self.__is_running:
-            self.ros_executor.spin_once(timeout_sec=1.0)
 
     def shutdown(self) -> None:
         import rclpy
-        self.__is_running = False
-        # The thread may be waiting for its next second.
-        self.ros_executor.wake()
+        self.ros_executor.shutdown()
         self.__thread.join()
         self.ros_node.destroy_node()
         rclpy.shutdown(context=self.ros_context)

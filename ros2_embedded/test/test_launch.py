@@ -116,7 +116,7 @@ def test_a_condition_that_is_neither_true_nor_false_is_refused():
         evaluate_condition_expression(LaunchContext(), [TextSubstitution(text='maybe')])
 
 
-def test_a_scoped_group_leaves_configurations_and_environment_as_they_were(monkeypatch):
+def test_scoped_group_restores_configurations_and_environment(monkeypatch):
     monkeypatch.setenv('FOG_TEST', 'outer')
     notes = []
     everything = note(notes, lambda context: (
@@ -178,7 +178,7 @@ def test_arguments(capsys):
     assert DeclareLaunchArgument('one', choices=['a']).description == "One of: ['a']"
 
 
-def test_an_exception_is_logged_in_one_line_and_shuts_down_with_status_1(capsys):
+def test_exception_is_logged_in_one_line_and_ends_with_status_1(capsys):
     def fail(context):
         raise ValueError('no good')
 
@@ -252,7 +252,7 @@ def test_the_launch_waits_for_completion_futures():
     assert notes == ['done']
 
 
-def test_a_service_runs_again_and_takes_events_from_other_threads():
+def test_service_runs_again_and_takes_events_of_other_threads():
     service = LaunchService(noninteractive=True)
     notes = []
     assert service.event_loop is None and service.shutdown() is None
@@ -387,7 +387,7 @@ def test_circular_includes(tmp_path, capsys, name, content):
     ('launch.utilities.type_utils', 'SomeValueType'), ('launch.events', 'ExecutionComplete'),
     ('launch_ros.parameter_descriptions', 'Parameter'), ('rclpy.clock', 'JumpThreshold'),
     ('rclpy.logging', 'initialize'), ('rosidl_runtime_py', 'message_to_csv')])
-def test_what_is_lacking_is_named(tmp_path, capsys, module, name):
+def test_missing_dependency_is_named(tmp_path, capsys, module, name):
     path = tmp_path / 'asks.launch.py'
     path.write_text(f'from {module} import {name}\n')
     assert run(IncludeLaunchDescription(str(path))) == 1

@@ -102,7 +102,7 @@ def test_start_output_and_exit(capsys):
         f"[ERROR] [{name}]: process has died [pid {pid}, exit code 3, cmd '") for line in out)
 
 
-def test_output_goes_to_the_log_and_errors_to_the_screen_by_default(capsys, tmp_path):
+def test_output_goes_to_the_log_and_errors_to_the_screen(capsys, tmp_path):
     action = python('import sys; print("out"); print("err", file=sys.stderr)')
     assert run(action) == 0
     out = capsys.readouterr().out
@@ -171,7 +171,7 @@ def test_prefix_and_its_filter():
     assert command('/bin/cat', name='dog') == (['/bin/cat'], 'dog')
 
 
-def test_before_it_executes_a_process_is_described_by_substitutions():
+def test_process_is_described_by_substitutions_before_it_runs():
     action = ExecuteProcess(
         cmd=['ls', LaunchConfiguration('a')], name='n', respawn=LaunchConfiguration('r'))
     assert [[sub.describe() for sub in word] for word in action.cmd] == [

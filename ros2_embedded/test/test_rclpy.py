@@ -309,7 +309,7 @@ def test_profiles():
     assert qos_check_compatible(strict, sensor)[0] != QoSCompatibility.ERROR
 
 
-def test_profiles_that_do_not_go_together_are_told_so():
+def test_contradictory_profiles_are_reported():
     def said(publisher, subscription):
         return qos_check_compatible(QoSProfile(depth=1, **publisher),
                                     QoSProfile(depth=1, **subscription))
@@ -591,7 +591,7 @@ def test_spin_until_future_complete(world):
     assert future.result() == 1
 
 
-def test_callbacks_run_at_the_same_time_only_where_groups_let_them(context):
+def test_callback_groups_decide_which_callbacks_run_in_parallel(context):
     from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
     for group, together in ((ReentrantCallbackGroup(), 2), (MutuallyExclusiveCallbackGroup(), 1)):
         node = rclpy.create_node('busy', context=context)
@@ -754,7 +754,7 @@ threading.kept.spin_once(timeout_sec=0)
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
                     reason="ROS 2's own executors stumble over what is gone by then")
-def test_an_executor_that_outlives_its_modules_ends_without_a_word():
+def test_executor_ends_silently_at_interpreter_exit():
     done = subprocess.run([sys.executable, '-c', LATE], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, '')
 

@@ -117,7 +117,7 @@ def test_help_names_the_commands(package):
 @pytest.mark.parametrize('words', [
     ('bag', 'record', '-a'), ('action', 'list', '-t'), ('topic', 'delay', '/x'),
     ('service', 'type', '/x')])
-def test_what_is_lacking_is_named(words):
+def test_missing_dependency_is_named(words):
     status, out, err = ros2(*words)
     name = words[0] if words[0] in ('bag', 'action') else ' '.join(words[:2])
     assert (status, out) == (1, '') and err.startswith(

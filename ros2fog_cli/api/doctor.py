@@ -11,21 +11,22 @@ from importlib import metadata
 import importlib.util
 import os
 from pathlib import Path
-import queue
 import re
 import sys
 import threading
-from typing import Literal, Optional, Union
+from typing import Literal, Optional
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import deploy, plan, plugin_system, process
 from fogros2.dds.cyclonedds import RECEIVE_BUFFER
-from fogros2.errors import FogError, Unsupported
-from fogros2.host import DISTRO
+from fogros2.errors import Cancelled, FogError, Unsupported
+from fogros2.host.inspection import DISTRO
 from fogros2.model import Command
-from fogros2.provider import container, container_engine, Provider
+from fogros2.provider import container, Provider
+from fogros2.provider.container import engine as container_engine
 from fogros2.store import state_home, Store
 from fogros2.vpn import addresses, helped
+from fogros2.waiting import cancellable
 from ros2fog_cli.api import lan, reach
 
 Verdict = Literal['ok', 'warning', 'failed']
@@ -92,29 +93,16 @@ def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> 
 
 
 def _in_time(ask: Callable[[], str], patience: float) -> Optional[str]:
-    """
-    Call ``ask`` and return its answer, or None after ``patience`` seconds.
-
-    After the time-out, ``ask`` continues in its thread, and its answer is ignored.
-
-    :raises FogError: an error that ``ask`` raised.
-    """
-    answers: queue.SimpleQueue[Union[str, FogError]] = queue.SimpleQueue()
-
-    def run() -> None:
-        try:
-            answers.put(ask())
-        except FogError as error:
-            answers.put(error)
-
-    threading.Thread(target=run, name='fog-doctor-ask', daemon=True).start()
+    """Call ``ask`` and return its answer, or None after ``patience`` seconds."""
+    over = threading.Event()
+    timer = threading.Timer(patience, over.set)
+    timer.start()
     try:
-        answer = answers.get(timeout=patience)
-    except queue.Empty:
+        return cancellable(ask, over, what='asking a provider', grace=lambda: 0.0)
+    except Cancelled:
         return None
-    if isinstance(answer, FogError):
-        raise answer
-    return answer
+    finally:
+        timer.cancel()
 
 
 def python() -> Check:
@@ -320,8 +308,8 @@ def firewall() -> Check:
     try:
         said = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
                            check=False)
-    except FogError:
-        return Check('firewall', 'warning', 'can not be looked at without nft')
+    except FogError as error:
+        return Check('firewall', 'warning', f'can not be looked at: {error.args[0]}', error.hint)
     if said.returncode != 0:
         return Check('firewall', 'warning', 'can be looked at by root alone')
     chains = re.findall(

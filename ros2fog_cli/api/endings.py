@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 import contextlib
 import dataclasses
+import functools
 import json
 from pathlib import Path
 import re
@@ -35,20 +36,12 @@ from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
-#: Seconds for which gc keeps a stopped machine by default.
+#: Seconds for which gc keeps a stopped machine by default; see ``--keep-stopped``.
 KEEP_STOPPED = 7 * 86400.0
 #: Seconds after the end of its lifetime in which a machine may still be deleting itself.
 GRACE = 60.0
 #: Age in seconds after which gc deletes a launch's folder that has no process file.
 FOLDER_AGE = 86400.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Leftover:
-    """The folder of a launch that is gone; the launch's VPN interface may still exist."""
-
-    launch: str
-    folder: Path
 
 
 def check_free(entry: Entry, *, force: bool) -> None:
@@ -72,7 +65,8 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
     :raises FogError: the machine or one of its resources still exists.
     """
     check_free(entry, force=force)
-    with _lock(entry, store, force=force):
+    with contextlib.nullcontext() if entry.record is None or force \
+            else store.lock(entry.name):
         if not entry.asked and not force:
             raise ConfigurationError(
                 f"the provider '{entry.provider}' of '{entry.name}' can't be asked",
@@ -88,7 +82,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
             # The machine deleted itself; resources that belong to it may still exist.
             machines.load(record.provider).destroy(record.machine_id)
         if record.damage:
-            store.machine(record.name).delete()
+            store.delete(record.name)
             return
         if force and record.launch_alive:
             # The launch will notice that the machine is gone, and will clean up itself.
@@ -129,16 +123,6 @@ def _destroy(machine: Machine) -> None:
                             f'ros2 fog delete {machine.name} tries again')
 
 
-@contextlib.contextmanager
-def _lock(entry: Entry, store: Store, *, force: bool) -> Iterator[None]:
-    """Lock the machine's name, unless ``force`` is set or the machine has no record here."""
-    if entry.record is None or force:
-        yield
-        return
-    with store.machine(entry.name).lock():
-        yield
-
-
 def _leave(record: Record, *, force: bool) -> None:
     """Remove the agent, its nodes and the VPN from a computer that FogROS2 does not own."""
     if record.shell is None:
@@ -153,7 +137,7 @@ def _leave(record: Record, *, force: bool) -> None:
             client = AgentClient(shell, record.agent, agent_path=record.agent_program,
                                  python=record.python)
             try:
-                launch = client.request('status')['launch']
+                launch = client.status()['launch']
                 if launch not in ('', record.launch, record.last):
                     return  # our agent is gone, and another robot uses the computer now
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
@@ -173,6 +157,47 @@ def _leave(record: Record, *, force: bool) -> None:
             raise
     finally:
         shell.close()
+
+
+@dataclasses.dataclass(frozen=True)
+class Due:
+    """
+    Something that gc should clear.
+
+    :param what: kind of thing; ``name`` is its name, and ``reason`` says why it is due.
+    :param end: function that clears it; raises FogError if that fails.
+    :param error: why it cannot be cleared; ``end`` then does nothing.
+    """
+
+    what: str
+    name: str
+    reason: str
+    end: Callable[[], None] = lambda: None
+    error: str = ''
+
+
+def due(
+    entries: Iterable[Entry], store: Store, keep_stopped: float, report: Reporter,
+) -> Iterator[Due]:
+    """Yield what gc should clear: machines, and what dead launches left on this robot."""
+    now = time.time()
+    for entry in entries:
+        record = entry.record
+        dead = record is not None and record.launch and not record.launch_alive
+        reason = why_end(entry, now, keep_stopped,
+                         stopped_at(entry.machine, entry.record, store))
+        if dead and not entry.asked:
+            yield Due('machine', entry.name, 'its launch is gone',
+                      error=f"the provider '{entry.provider}' can't be asked")
+        elif reason:
+            yield Due('leftovers of' if entry.gone else 'machine', entry.name, reason,
+                      functools.partial(delete, entry, store, report))
+        elif dead and record is not None and not record.damage:
+            yield Due('leftovers of', entry.name, 'its launch is gone',
+                      functools.partial(let_go, record, store))
+    for folder in leftovers(store, now):
+        yield Due('leftovers of launch', folder.name, 'the launch is gone',
+                  functools.partial(clear, folder))
 
 
 def why_end(
@@ -213,7 +238,7 @@ def stopped_at(
     if record is None:
         return None
     try:
-        return (store.machine(record.name).path / 'record.json').stat().st_mtime
+        return (store.machine(record.name) / 'record.json').stat().st_mtime
     except OSError:
         return None
 
@@ -224,19 +249,9 @@ def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Ite
 
     Yield a line of text for each deleted resource; warn about a provider that does not answer.
     """
-    names = [name for name in plugin_system.names('fogros2.provider')
-             if machines.wanted(name, regions)]
-
-    def ask(name: str) -> list[str]:
-        try:
-            return machines.load(name, regions).tidy()
-        except FogError as error:
-            warn(f'{name}: {error}')
-            return []
-
-    with ThreadPoolExecutor(max(1, len(names)), 'fog-tidy') as pool:
-        for said in pool.map(ask, names):
-            yield from said
+    for said in machines.ask_all(warn, machines.configured(regions),
+                                 lambda name: machines.load(name, regions).tidy()):
+        yield from said or ()
 
 
 def let_go(record: Record, store: Store) -> None:
@@ -246,26 +261,19 @@ def let_go(record: Record, store: Store) -> None:
     :raises FogError: a resource could not be cleaned up.
     """
     folder = store.root / 'launches' / record.launch
-    with store.machine(record.name).lock():
-        if record.robot_vpn is not None:
-            ros2_daemon.stop(folder)
-            _take_down(record.robot_vpn, record.spec.vpn)
-        shutil.rmtree(folder, ignore_errors=True)
-        store.machine(record.name).save(dataclasses.replace(
-            record, launch='', pid=0, pid_start=0, robot_vpn=None))
+    with store.lock(record.name):
+        _take_down(folder, record.robot_vpn, record.spec.vpn)
+        store.save(dataclasses.replace(record, launch='', pid=0, pid_start=0, robot_vpn=None))
 
 
-def leftovers(store: Store, now: Optional[float] = None) -> list[Leftover]:
+def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:
     """Return the folders of dead launches that no machine's record names."""
     now = time.time() if now is None else now
     named = {record.launch for record in store.machines() if record.launch}
     folder = store.root / 'launches'
-    found = []
-    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-        if path.name not in named and re.fullmatch('[0-9a-f]{6}', path.name) \
-                and _dead(path, now):
-            found.append(Leftover(path.name, path))
-    return found
+    return [path for path in (sorted(folder.iterdir()) if folder.is_dir() else [])
+            if path.name not in named and re.fullmatch('[0-9a-f]{6}', path.name)
+            and _dead(path, now)]
 
 
 def _dead(folder: Path, now: float) -> bool:
@@ -281,22 +289,23 @@ def _dead(folder: Path, now: float) -> bool:
             return False
 
 
-def clear(leftover: Leftover) -> None:
+def clear(folder: Path) -> None:
     """
     Delete the VPN interface, firewall rules, key and folder of a dead launch.
 
     :raises FogError: a resource could not be deleted.
     """
-    name = f'fog{leftover.launch}'
-    interface = VpnInterface(
-        name, '127.0.0.1', '127.0.0.1/32', 0,
-        helped.key_of(name) or str(leftover.folder / 'vpn.key'), guarded=True)
-    ros2_daemon.stop(leftover.folder)
-    _take_down(interface, 'wireguard')
-    shutil.rmtree(leftover.folder, ignore_errors=True)
+    name = f'fog{folder.name}'
+    interface = VpnInterface(name, '127.0.0.1', '127.0.0.1/32', 0,
+                             helped.key_of(name) or str(folder / 'vpn.key'), firewall=True)
+    _take_down(folder, interface, 'wireguard')
 
 
-def _take_down(interface: VpnInterface, kind: str) -> None:
-    vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
-    for command in vpn.down(interface):
-        process.run(command, timeout=Timeouts().vpn)
+def _take_down(folder: Path, interface: Optional[VpnInterface], kind: str) -> None:
+    """Delete a launch's VPN interface and folder, and stop the ROS 2 daemon that it had."""
+    if interface is not None:
+        ros2_daemon.stop(folder)
+        vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
+        for command in vpn.down(interface):
+            process.run(command, timeout=Timeouts().vpn)
+    shutil.rmtree(folder, ignore_errors=True)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import contextlib
 import dataclasses
 import threading
@@ -14,6 +14,7 @@ from typing import Any, Optional
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.errors import ConnectError, FogError
+from fogros2.events import Event, Status
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Record
@@ -116,7 +117,7 @@ class Follower:
                         pause = RETRY
                         self._stopped.wait(self._interval)
             except FogError as error:
-                self._trouble('agent', str(error))
+                self.problems['agent'] = str(error)
                 self.agent = None
                 self._look_at_vpn()
                 self._changed()
@@ -126,7 +127,7 @@ class Follower:
     def _connect(self, undo: contextlib.ExitStack) -> tuple[AgentClient, Shell]:
         entry = self._entry
         to = reach.endpoint(entry)
-        if machines.load(entry.provider).firewall:
+        if machines.load(entry.provider).capabilities.firewall:
             # Reading the state must not open a port.
             inside = reach.through_vpn(entry, to)
             if inside is None:
@@ -136,14 +137,14 @@ class Follower:
         undo.callback(shell.close)
         client = reach.agent(entry, shell)
         undo.callback(client.close)
-        reply = client.request('status', timeout=15.0)
-        if int(reply['next']) <= self._seq:
+        following = client.status(timeout=15.0)['next']
+        if following <= self._seq:
             self._seq = 0  # a new agent, which numbers its log from 1 again
-        client.subscribe(self._take, since=max(self._seq + 1, int(reply['next']) - LINES))
+        client.subscribe(self._take, since=max(self._seq + 1, following - LINES))
         return client, shell
 
     def _ask(self, client: AgentClient, shell: Shell) -> None:
-        agent = agent_state(client.request('status', timeout=15.0))
+        agent = agent_state(client.status(timeout=15.0))
         self.problems.pop('agent', None)
         pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid']))
         if pids != self._pids:
@@ -160,55 +161,41 @@ class Follower:
         try:
             link = reach.link(self._record, pings=1)
         except FogError as error:
-            self._trouble('VPN', str(error))
+            self.problems['VPN'] = str(error)
             return
         self.problems.pop('VPN', None)
         self.vpn = None if link is None else {
             **rates(self.vpn, link, time.monotonic()), **dataclasses.asdict(link)}
 
-    def _trouble(self, part: str, text: str) -> None:
-        self.problems[part] = text
-
-    def _take(self, event: dict[str, Any]) -> None:
-        self._seq = int(_number(event.get('seq')) or self._seq)
+    def _take(self, event: Event) -> None:
+        seq, at = event.get('seq'), event.get('time')
+        self._seq = seq if isinstance(seq, int) else self._seq
         text = describe(event)
         if text is None:
             return
-        node, at = str(event.get('name') or ''), _number(event.get('time')) or time.time()
+        error = event['event'] == 'output' and event['stream'] == 'stderr'
         with self._lock:
             for line in text.splitlines():
                 self._number += 1
                 self._lines.append(LogLine(
-                    self._number, at, node, event.get('stream') == 'stderr', line[:WIDTH]))
+                    self._number, at if isinstance(at, (int, float)) else time.time(),
+                    str(event.get('name', '')), error, line[:WIDTH]))
         self._changed()
 
 
-def agent_state(reply: Mapping[str, Any]) -> dict[str, Any]:
+def agent_state(status: Status) -> dict[str, Any]:
     """
-    Validate an agent's status reply, and return its state with the expected types.
+    Return the part of an agent's status that the screens show.
 
-    ``since`` is in seconds since the epoch, ``rss`` in bytes, ``heartbeat_age`` in seconds; each
-    is None if unknown. ``nodes`` has name, state and error as text, pid, returncode and restarts.
+    ``since`` is in seconds since the epoch, ``heartbeat_age`` in seconds, ``rss`` in bytes.
     """
-    rss, nodes = _number(reply.get('rss_kb')), reply.get('nodes')
     return {
-        'since': _number(reply.get('since')), 'rss': None if rss is None else int(1000 * rss),
-        'heartbeat_age': _number(reply.get('heartbeat_age')),
+        'since': status['since'], 'rss': 1000 * status['rss_kb'],
+        'heartbeat_age': status['heartbeat_age'],
         'nodes': [{
-            'name': str(node.get('name') or ''), 'state': str(node.get('state') or ''),
-            'pid': int(_number(node.get('pid')) or 0),
-            'returncode': None if (code := _number(node.get('returncode'))) is None
-            else int(code),
-            'restarts': int(_number(node.get('restarts')) or 0),
-            'error': str(node.get('error') or '')}
-            for node in (nodes if isinstance(nodes, list) else []) if isinstance(node, dict)]}
-
-
-def _number(value: Any) -> Optional[float]:
-    """Return a finite number as it is, None for any other value."""
-    usable = isinstance(value, (int, float)) and not isinstance(value, bool) \
-        and abs(value) < 1e15  # excludes infinity and NaN
-    return value if usable else None
+            'name': node['name'], 'state': node['state'], 'pid': node['pid'] or 0,
+            'returncode': node['returncode'], 'restarts': node['restarts'],
+            'error': node.get('error', '')} for node in status['nodes']]}
 
 
 def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dict[str, Any]:

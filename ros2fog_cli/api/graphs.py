@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections import deque
+from collections.abc import Sequence
 import contextlib
 import json
 import os
@@ -17,7 +18,6 @@ from fogros2.errors import FogError
 from fogros2.store import Record, Store
 from fogros2_monitor import GRAPH
 from ros2fog_cli.api import reach
-from ros2fog_cli.api.live import Live
 
 #: Seconds before an ended program is restarted, and time-out of a program's end in seconds.
 AGAIN, PATIENCE = 10.0, 5.0
@@ -58,7 +58,7 @@ class Graph:
         """The last line of the program's standard error, or its exit status."""
         return self._said[-1] if self._said else f'exit status {self._process.returncode}'
 
-    def know(self, machines: dict[str, tuple[str, ...]], *, pictures: bool = True) -> None:
+    def know(self, machines: dict[str, Sequence[str]], *, pictures: bool) -> None:
         """Send the program the nodes of each machine, and whether to take pictures."""
         line = json.dumps({'machines': machines, 'pictures': pictures})
         if line != self._told and self._process.stdin is not None:
@@ -118,34 +118,25 @@ class Graphs:
     :param pictures: whether the programs take pictures.
     """
 
-    def __init__(self, store: Store, *, pictures: bool = True) -> None:
+    def __init__(self, store: Store, *, pictures: bool) -> None:
         self._store, self._pictures = store, pictures
         self._graphs: dict[str, Graph] = {}
         self._refused: dict[str, tuple[float, str]] = {}
 
-    def look(self, live: Live) -> dict[str, Any]:
-        """Return the graphs' part of the live state; while nobody watches, stop the programs."""
-        return self.update(live.running() if live.watched else [], live.names())
-
-    def update(
-        self, records: list[Record], machines: dict[str, tuple[str, ...]],
-    ) -> dict[str, Any]:
+    def update(self, machines: Sequence[tuple[Record, Sequence[str]]]) -> dict[str, Any]:
         """
         Run one program for each launch of these machines, and return the collected data.
 
-        :param records: records of machines that are up.
-        :param machines: node names by machine name.
+        :param machines: records of machines that are up, each with the names of its nodes.
         """
-        launches: dict[str, list[Record]] = {}
-        for record in records:
-            launches.setdefault(record.launch, []).append(record)
+        launches = {record.launch: record for record, _ in machines}
         for launch in [launch for launch in self._graphs if launch not in launches]:
             self._graphs.pop(launch).close()
-        for launch, several in launches.items():
-            graph = self._graph(launch, several[0])
+        for launch, one in launches.items():
+            graph = self._graph(launch, one)
             if graph is not None:
-                graph.know({record.name: machines.get(record.name, ()) for record in several},
-                           pictures=self._pictures)
+                graph.know({record.name: nodes for record, nodes in machines
+                            if record.launch == launch}, pictures=self._pictures)
         trouble = [why for launch, (_, why) in self._refused.items()
                    if launch in launches and launch not in self._graphs]
         return {

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import time
 from typing import Any, Optional
 
-from fogros2 import plugin_system
-from fogros2.errors import ConfigurationError, FogError, ProviderError, Unsupported
+from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.model import Command, Image, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.waiting import wait_until
@@ -101,21 +99,10 @@ def wait(
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:
     """Return the images of all providers; warn about a provider that does not answer."""
-    names = [name for name in plugin_system.names('fogros2.provider')
-             if machines.wanted(name, regions)]
-
-    def ask(name: str) -> list[Image]:
-        try:
-            return list(machines.load(name, regions).images())
-        except Unsupported:
-            return []
-        except FogError as error:
-            warn(f'{name}: {error}')
-            return []
-
-    with ThreadPoolExecutor(max(1, len(names)), 'fog-images') as pool:
-        found = [image for images in pool.map(ask, names) for image in images]
-    return sorted(found, key=lambda image: (image.name, image.place, image.id))
+    answers = machines.ask_all(warn, machines.configured(regions),
+                               lambda name: list(machines.load(name, regions).images()))
+    return sorted((image for images in answers for image in images or ()),
+                  key=lambda image: (image.name, image.region, image.id))
 
 
 def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:
@@ -147,4 +134,6 @@ def delete(image: Image) -> None:
 
 def to_json(image: Image) -> dict[str, Any]:
     """Return an image as JSON data: times in seconds since the epoch, size in GB."""
-    return {field.name: getattr(image, field.name) for field in dataclasses.fields(image)}
+    # programs that read this output know the region as 'place'
+    return {'place' if field.name == 'region' else field.name: getattr(image, field.name)
+            for field in dataclasses.fields(image)}

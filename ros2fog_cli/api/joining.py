@@ -30,7 +30,7 @@ def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
 
     :raises ConfigurationError: no running launch uses the machine.
     """
-    record = store.machine(name).load()
+    record = store.load(name)
     variables = reach.robot_environment(record, store)
     if variables is None:
         raise ConfigurationError(f"no launch is running with the machine '{name}'",

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Keep a live state of this robot's launches, machines, steps, nodes and VPN links.
+Keep a live state of this robot's launches, machines, steps, nodes, VPN links and topics.
 
 ``ros2 fog status --watch`` prints the state, ``ros2 fog dashboard`` serves it. While nobody
-watches, no provider and no agent is polled.
+watches, no provider and no agent is polled, and no launch is joined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import dataclasses
 import json
 import threading
@@ -19,6 +19,7 @@ from fogros2.errors import FogError, MachineNotFound
 from fogros2.store import Record, robot_name, Store
 from ros2fog_cli.api import endings, machines
 from ros2fog_cli.api.follower import Follower, LogLine
+from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.shown import as_json, machine_json, phase, process_of, Shown, ShownLaunch
 
@@ -33,19 +34,23 @@ class Live:
     """
     The live state, updated by threads that :meth:`start` starts and :meth:`close` ends.
 
+    It is a :class:`fogros2_monitor.dashboard.server.Source`.
+
     :param name: name of the one machine to watch; None: all machines.
     :param regions: regions to ask, for providers with regions.
     :param interval: poll interval of agents in seconds.
-    :param more: callback at each update, which returns further parts of the state.
+    :param topics: whether to join launches and measure the rates of topics.
+    :param pictures: with ``topics``: whether to take pictures of streams, too.
     """
 
     def __init__(
         self, store: Optional[Store] = None, *, name: Optional[str] = None,
-        regions: Optional[list[str]] = None, interval: float = 1.0,
-        more: Optional[Callable[[Live], dict[str, Any]]] = None,
+        regions: Optional[list[str]] = None, interval: float = 1.0, topics: bool = False,
+        pictures: bool = False,
     ) -> None:
         self.store = store or Store()
-        self._name, self._regions, self._interval, self._more = name, regions, interval, more
+        self._name, self._regions, self._interval = name, regions, interval
+        self._graphs = Graphs(self.store, pictures=pictures) if topics else None
         #: Machines by their keys, see :meth:`_key`.
         self._shown: dict[str, Shown] = {}
         self._launches: dict[str, ShownLaunch] = {}
@@ -86,6 +91,8 @@ class Live:
         self._threads[0].join(5.0)
         for launch in self._launches.values():
             launch.close()
+        if self._graphs is not None:
+            self._graphs.close()
 
     # -- for readers of the state ---------------------------------------------------------------
 
@@ -119,7 +126,15 @@ class Live:
             shown = self._shown.get(key)
         return shown.follower.lines(after) if shown and shown.follower else []
 
-    def delete(self, key: str, *, force: bool = False) -> None:
+    def log(self, machine: str, after: int) -> list[dict[str, Any]]:
+        """Return the lines of a machine's log after line number ``after``, as JSON values."""
+        return [dataclasses.asdict(line) for line in self.lines(machine, after)]
+
+    def picture(self, stream: str) -> Optional[bytes]:
+        """Return the last picture of a stream, by the stream's id."""
+        return self._graphs.picture(stream) if self._graphs is not None else None
+
+    def delete(self, key: str, force: bool = False) -> None:
         """
         Start to delete a machine; the state shows the result.
 
@@ -151,18 +166,6 @@ class Live:
             shown.deleting = False
             self._asked = -1e9
             self._wake.set()
-
-    def names(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the running machines' nodes in the ROS graph, by machine."""
-        with self._lock:
-            return {shown.entry.name: shown.follower.names for shown in self._shown.values()
-                    if shown.follower is not None}
-
-    def running(self) -> list[Record]:
-        """Return the records of machines that are up under a running launch."""
-        with self._lock:
-            return [shown.entry.record for shown in self._shown.values()
-                    if shown.follower is not None and shown.entry.record is not None]
 
     # -- the threads ----------------------------------------------------------------------------
 
@@ -210,7 +213,11 @@ class Live:
                 if shown.ended and now - shown.ended > KEPT:
                     del self._shown[key]
             state = self._make()
-        state.update(self._more(self) if self._more is not None else {})
+            followed = [(shown.entry.record, shown.follower.names)
+                        for shown in self._shown.values()
+                        if shown.follower is not None and shown.entry.record is not None]
+        if self._graphs is not None:
+            state.update(self._graphs.update(followed if self.watched else []))
         text = json.dumps(state, sort_keys=True)
         with self._news:
             if text != self._last:

@@ -3,24 +3,23 @@
 
 from __future__ import annotations
 
-from typing import Any, Optional
+from typing import Optional
+
+from fogros2.events import Event
+
+#: The text of each event that is for users.
+_TEXTS = {
+    'output': '{text}',
+    'started': 'process started with pid [{pid}]',
+    'exited': 'process has finished with exit code {returncode}',
+    'refused': 'could not be started: {error}',
+    'watchdog': 'watchdog: {reason}, {action}',
+    'notice': 'the provider takes the machine away: {reason}',
+    'gap': '{count} older events are not kept any more',
+}
 
 
-def describe(event: dict[str, Any]) -> Optional[str]:
+def describe(event: Event) -> Optional[str]:
     """Return an event as text, None for an event that is not for users."""
-    kind = event.get('event')
-    if kind == 'output':
-        return str(event.get('text', ''))
-    if kind == 'started':
-        return f"process started with pid [{event.get('pid')}]"
-    if kind == 'exited':
-        return f"process has finished with exit code {event.get('returncode')}"
-    if kind == 'refused':
-        return f"could not be started: {event.get('error')}"
-    if kind == 'watchdog':
-        return f"watchdog: {event.get('reason')}, {event.get('action')}"
-    if kind == 'notice':
-        return f"the provider takes the machine away: {event.get('reason')}"
-    if kind == 'gap':
-        return f"{event.get('count')} older events are not kept any more"
-    return None
+    text = _TEXTS.get(event['event'])
+    return None if text is None else text.format_map(event)

@@ -10,7 +10,7 @@ import dataclasses
 from decimal import Decimal
 import threading
 import time
-from typing import Any, Optional, Protocol, runtime_checkable
+from typing import Any, Optional, TypeVar
 
 from fogros2 import monitor_addresses, plugin_system
 from fogros2.errors import (
@@ -26,14 +26,9 @@ from fogros2.store import Record, robot_name, Store
 from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
-
-
-@runtime_checkable
-class HasRegions(Protocol):
-    """A provider whose machines are in regions."""
-
-    def set_regions(self, regions: Sequence[str]) -> None:
-        """Search these regions from now on; ``['all']`` stands for every region."""
+T = TypeVar('T')
+#: Stands for a machine that its provider does not know, or that nobody has asked for.
+_UNKNOWN = Machine('', '', '', MachineState.DELETED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +48,13 @@ class Entry:
     asked: bool = True
 
     @property
+    def _known(self) -> Machine:
+        return self.machine or _UNKNOWN
+
+    @property
     def gone(self) -> bool:
         """Whether the provider no longer knows the machine, or reports it as deleted."""
-        return self.asked and (self.machine is None
-                               or self.machine.state is MachineState.DELETED)
+        return self.asked and self._known.state is MachineState.DELETED
 
     @property
     def state(self) -> str:
@@ -66,10 +64,10 @@ class Entry:
             return f'{state} (record damaged)'
         if not self.asked:
             return 'unknown'
-        if self.machine is None or self.gone:
+        if self.gone:
             return 'gone'
-        text = str(self.machine.state)
-        if self.machine.state is MachineState.STOPPED:
+        text = str(self._known.state)
+        if self._known.state is MachineState.STOPPED:
             return f'{text} (keeps its disk)'
         if self.record is None:
             return f'{text} (orphan)' if self.own else f'{text} (robot {self.robot})'
@@ -80,9 +78,7 @@ class Entry:
     @property
     def robot(self) -> str:
         """The robot that created the machine, '' if unknown."""
-        if self.machine is not None and TAG_ROBOT in self.machine.tags:
-            return self.machine.tags[TAG_ROBOT]
-        return robot_name() if self.record is not None else ''
+        return self._known.tags.get(TAG_ROBOT, robot_name() if self.record is not None else '')
 
     @property
     def own(self) -> bool:
@@ -92,16 +88,15 @@ class Entry:
     @property
     def created(self) -> Optional[float]:
         """When the machine was created, in seconds since the epoch."""
-        if self.machine is not None and self.machine.created:
-            return self.machine.created
-        return self.record.created or None if self.record is not None else None
+        return self._known.created or (
+            self.record.created or None if self.record is not None else None)
 
     @property
     def expires(self) -> Optional[float]:
         """When the lifetime ends, in seconds since the epoch; None for a stopped machine."""
-        if self.machine is not None and self.machine.state is MachineState.STOPPED:
+        if self._known.state is MachineState.STOPPED:
             return None
-        tag = self.machine.tags.get(TAG_EXPIRES, '') if self.machine is not None else ''
+        tag = self._known.tags.get(TAG_EXPIRES, '')
         known = [float(tag)] if tag.isdigit() else []
         record = self.record
         if record is not None and record.armed:
@@ -114,9 +109,8 @@ class Entry:
     @property
     def address(self) -> str:
         """The host of the machine's shell, '' if there is none."""
-        if self.machine is not None and self.machine.shell is not None:
-            return self.machine.shell.host
-        return self.record.shell.host if self.record is not None and self.record.shell else ''
+        shell = self._known.shell or (self.record.shell if self.record is not None else None)
+        return shell.host if shell is not None else ''
 
     @property
     def monitor(self) -> str:
@@ -131,15 +125,14 @@ class Entry:
         """The launch that uses the machine, or used it last."""
         if self.record is not None and self.record.launch:
             return self.record.launch
-        return self.machine.tags.get(TAG_LAUNCH, '') if self.machine is not None else ''
+        return self._known.tags.get(TAG_LAUNCH, '')
 
     @property
     def cost(self) -> Optional[Decimal]:
         """US dollars per hour; None if the machine does not run or its price is unknown."""
-        if self.machine is None or self.machine.state not in (
-                MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING):
-            return None
-        return self.machine.cost_per_hour
+        running = self._known.state in (
+            MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING)
+        return self._known.cost_per_hour if running else None
 
     def spent(self, now: float) -> Optional[Decimal]:
         """Return the US dollars since the creation at today's price, None if unknown."""
@@ -149,14 +142,14 @@ class Entry:
         return rate * Decimal(max(0.0, now - self.created)) / 3600
 
     @property
-    def place(self) -> str:
+    def region(self) -> str:
         """Region, context or engine; '' if the provider names none."""
-        return self.machine.place if self.machine is not None else ''
+        return self._known.region
 
     @property
     def kind(self) -> str:
         """The kind of machine, such as an instance type; '' if the provider names none."""
-        return self.machine.kind if self.machine is not None else ''
+        return self._known.kind
 
     @property
     def machine_id(self) -> Optional[str]:
@@ -176,10 +169,9 @@ class Entry:
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address, 'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
-            'place': self.place, 'kind': self.kind,
-            'image': self.machine.image or None if self.machine is not None else None,
-            'key': self.machine.key or None if self.machine is not None else None,
-            'disk_gb': self.machine.disk_gb if self.machine is not None else None,
+            'place': self.region, 'kind': self.kind,
+            'image': self._known.image or None, 'key': self._known.key or None,
+            'disk_gb': self._known.disk_gb,
             'monitor': self.monitor or None,
             'monitor_open': self.record.monitor_open or None
             if self.record is not None and self.monitor else None,
@@ -208,10 +200,9 @@ def survey(
         records = {key: value for key, value in records.items() if key == name}
     tags = {} if name is None else {TAG_NAME: name}
     providers = plugin_system.names('fogros2.provider')
-    with contextlib.nullcontext(cancel) if cancel is not None else interruptible() as given_up, \
-            ThreadPoolExecutor(max(1, len(providers)), 'fog-list') as pool:
-        answers = list(pool.map(lambda provider: _ask(
-            provider, tags, regions, records.values(), warn, given_up), providers))
+    with contextlib.nullcontext(cancel) if cancel is not None else interruptible() as given_up:
+        answers = ask_all(warn, providers, lambda provider: _ask(
+            provider, tags, regions, records.values(), given_up))
     entries: list[Entry] = []
     matched: set[str] = set()
     for machines in answers:
@@ -229,6 +220,28 @@ def survey(
     return sorted(entries, key=lambda entry: (entry.name, entry.provider))
 
 
+def ask_all(
+    warn: Warn, providers: Sequence[str], ask: Callable[[str], T],
+) -> list[Optional[T]]:
+    """Return ``ask(name)`` for each provider, None where that failed; ask them in parallel."""
+    def answer(name: str) -> Optional[T]:
+        try:
+            return ask(name)
+        except (Cancelled, Unsupported):
+            return None  # Ctrl-C ends the whole program
+        except FogError as error:
+            warn(f'{name}: {error}')
+            return None
+
+    with ThreadPoolExecutor(max(1, len(providers)), 'fog-ask') as pool:
+        return list(pool.map(answer, providers))
+
+
+def configured(regions: Optional[Sequence[str]]) -> list[str]:
+    """Return the providers to ask for more than the machines that this robot's records name."""
+    return [name for name in plugin_system.names('fogros2.provider') if wanted(name, regions)]
+
+
 def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
     """Return whether to ask a provider that no record of this robot names."""
     if not regions and name in plugin_system.names('fogros2.configured'):
@@ -238,7 +251,7 @@ def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
     except FogError:
         return True  # the caller loads it again, and reports the error with the provider's name
-    return kind.configured() or bool(regions) and issubclass(kind, HasRegions)
+    return kind.configured() or bool(regions) and kind.capabilities.regions
 
 
 def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
@@ -248,28 +261,26 @@ def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Reco
         return None
     if record.damage:
         return record if machine.tags.get(TAG_ROBOT, robot_name()) == robot_name() else None
+    if record.machine_id is None:
+        # the launch was killed after the provider had created the machine, before it saved the id
+        launch = machine.tags.get(TAG_LAUNCH)
+        return record if launch and launch in (record.launch, record.last) else None
     return record if record.machine_id == machine.id else None
 
 
 def _ask(
     name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
-    records: Iterable[Record], warn: Warn, cancel: threading.Event,
-) -> Optional[list[Machine]]:
-    """Return a provider's machines, None if the provider cannot be asked."""
+    records: Iterable[Record], cancel: threading.Event,
+) -> list[Machine]:
+    """Return a provider's machines."""
+    if not any(record.provider == name for record in records) and not wanted(name, regions):
+        return []
+    provider = load(name, regions)
+    provider.cancel = cancel
     try:
-        if not any(record.provider == name for record in records) and not wanted(name, regions):
-            return []
-        provider = load(name, regions)
-        provider.cancel = cancel
-        try:
-            return list(provider.find(tags))
-        except Unsupported:
-            return _described(provider, [r for r in records if r.provider == name])
-    except Cancelled:
-        return None  # Ctrl-C ends the whole program
-    except FogError as error:
-        warn(f'{name}: {error}')
-        return None
+        return list(provider.find(tags))
+    except Unsupported:
+        return _described(provider, [r for r in records if r.provider == name])
 
 
 def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
@@ -292,9 +303,28 @@ def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
     :raises FogError: no provider has that name, or a library of the provider is not installed.
     """
     provider: Provider = plugin_system.load('fogros2.provider', name)()
-    if regions and isinstance(provider, HasRegions):
-        provider.set_regions(['all'] if {'all', '*'} & set(regions) else list(regions))
+    if regions:
+        provider.search_in(['all'] if {'all', '*'} & set(regions) else list(regions))
     return provider
+
+
+def able(capability: str) -> str:
+    """
+    Return the first provider with a capability; one that is set up here comes first.
+
+    :param capability: a field of :class:`~fogros2.provider.Capabilities`.
+    :raises ConfigurationError: no provider has it.
+    """
+    found: list[tuple[bool, str]] = []
+    for name in plugin_system.names('fogros2.provider'):
+        with contextlib.suppress(FogError):
+            kind: type[Provider] = plugin_system.load('fogros2.provider', name)
+            if getattr(kind.capabilities, capability):
+                found.append((not kind.configured(), name))
+    if not found:
+        raise ConfigurationError(f'no provider here has {capability}',
+                                 'pip list shows whether the plugin of one is installed')
+    return min(found)[1]
 
 
 def total(entries: Sequence[Entry], now: float) -> Optional[tuple[Decimal, Decimal]]:

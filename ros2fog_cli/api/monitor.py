@@ -6,17 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import http.client
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-import secrets
 import socket
 import threading
-import time
 from typing import Optional
 import urllib.parse
 
 from fogros2 import monitor_addresses
-from fogros2.deploy.guarding import AGENT_FOLDER
+from fogros2.deploy.machine_job import AGENT_FOLDER
 from fogros2.errors import AgentError, CommandError, ConfigurationError
 from fogros2.model import Command
 from fogros2.shell import Shell
@@ -28,8 +25,6 @@ from ros2fog_cli.api.machines import Entry
 
 #: Time-out of the answer of the machine's gate, in seconds.
 _PATIENCE = 15.0
-#: Seconds within which a started browser must open the ticket's address.
-_VALID = 60.0
 
 
 @contextlib.contextmanager
@@ -48,69 +43,6 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
     finally:
         tunnel.close()
         thread.join(5.0)
-
-
-class Ticket:
-    """
-    A loopback URL that redirects a browser to a page, once and within a minute.
-
-    The page's own URL contains the token. Other users of this computer could read that URL in
-    the command line of the started browser.
-
-    :param page: URL of the page.
-    """
-
-    def __init__(self, page: str) -> None:
-        target = f'/{secrets.token_urlsafe(24)}'
-        until = time.monotonic() + _VALID
-        #: Set when a browser was redirected.
-        self.used = used = threading.Event()
-        once = threading.Lock()
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                # The lock is never released, so only one request gets the page.
-                valid = (self.path == target and time.monotonic() < until
-                         and once.acquire(blocking=False))
-                self.send_response(303 if valid else 404)
-                if valid:
-                    used.set()
-                    self.send_header('Location', page)
-                self.send_header('Cache-Control', 'no-store')
-                self.send_header('Content-Length', '0')
-                self.end_headers()
-
-            def log_message(self, format: str, *args: object) -> None:
-                """Log nothing: the terminal shows the pages."""
-
-        # Threads, because browsers open connections in advance that send no request.
-        self._server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
-        self.url = f'http://127.0.0.1:{self._server.server_port}{target}'
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name='fog-ticket', daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
-
-
-@contextlib.contextmanager
-def browser_at(page: str, *, start: bool) -> Iterator[threading.Event]:
-    """
-    Start a browser that shows a page, without the page's URL on its command line.
-
-    Yield an event that is set when the browser came, or when no browser was started.
-
-    :param start: False: start no browser.
-    """
-    import webbrowser
-    with contextlib.closing(Ticket(page)) as ticket:
-        if not start or not webbrowser.open(ticket.url):
-            ticket.used.set()
-        yield ticket.used
 
 
 def has_application(port: int, token: str) -> bool:
@@ -145,7 +77,8 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
     """
     record = entry.record
     folder = (record.agent if record is not None else '') \
-        or machines.load(entry.provider).agent_directory or f'{AGENT_FOLDER}/{entry.name}'
+        or machines.load(entry.provider).capabilities.agent_directory \
+        or f'{AGENT_FOLDER}/{entry.name}'
     return _read(entry, shell, ('sh', '-c', 'cat "$1"/*/token', 'sh',
                                 str(Path(monitor_addresses.folder_of(folder, port, '')))))
 
@@ -163,7 +96,7 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
                          'ros2 fog list shows whose it is')
     if not record.monitor_open:
         raise ConfigurationError(
-            f"nobody but this robot may watch '{entry.name}'",
+            f"only this robot may watch '{entry.name}'",
             "monitor_allow=['198.51.100.0/28'] in its launch file lets others in")
     made = credentials.Credentials(Path(
         monitor_addresses.folder_of(record.agent, record.monitor, record.launch)))

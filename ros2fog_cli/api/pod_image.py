@@ -9,8 +9,10 @@ from pathlib import Path
 import shutil
 from typing import Optional
 
-from fogros2 import bootstrap, host, plan, workspace
+from fogros2 import plan
 from fogros2.errors import PrerequisiteError
+from fogros2.host import bootstrap, workspace
+from fogros2.host import inspection as host
 from fogros2.model import MachineSpec
 from fogros2.provider.kubernetes import image
 

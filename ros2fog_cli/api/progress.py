@@ -7,18 +7,14 @@ from collections.abc import Callable, Iterator
 import contextlib
 import sys
 
-from fogros2.report import Event, Reporter, StepFailed
+from fogros2.report import Event, StepFailed
 
 
-@contextlib.contextmanager
-def shown() -> Iterator[Reporter]:
-    """Yield a Reporter that prints failed steps to standard error."""
-    def report(event: Event) -> None:
-        if isinstance(event, StepFailed):
-            where = f'{event.machine}: ' if event.machine else ''
-            print(f'{where}{event.step} failed: {event.reason}', file=sys.stderr)
-
-    yield report
+def report(event: Event) -> None:
+    """Print a failed step to standard error; a :data:`fogros2.report.Reporter`."""
+    if isinstance(event, StepFailed):
+        where = f'{event.machine}: ' if event.machine else ''
+        print(f'{where}{event.step} failed: {event.reason}', file=sys.stderr)
 
 
 @contextlib.contextmanager

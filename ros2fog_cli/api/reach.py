@@ -12,13 +12,14 @@ import socket
 import sys
 import threading
 import time
-from typing import Any, Optional
+from typing import cast, Optional
 
 from fogros2 import journal, plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
+from fogros2.events import Event
 from fogros2.model import Command, Endpoint
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
@@ -35,10 +36,10 @@ def find(
 
     :raises ConfigurationError: no machine, or several machines have that name.
     """
-    folder = Store().machine(name)
-    if folder.exists() and not regions:
+    store = Store()
+    if store.exists(name) and not regions:
         try:
-            record = folder.load()
+            record = store.load(name)
             machine = None
             if record.machine_id is not None:
                 machine = machines.load(record.provider).describe(record.machine_id)
@@ -94,7 +95,7 @@ def session(
 
 def firewalled(entry: Entry) -> bool:
     """Return whether the machine's provider has a firewall."""
-    return entry.machine is not None and machines.load(entry.provider).firewall
+    return entry.machine is not None and machines.load(entry.provider).capabilities.firewall
 
 
 def through_vpn(
@@ -122,7 +123,7 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
         record = entry.record
         if record is not None:
             with contextlib.suppress(FogError):
-                record = Store().machine(entry.name).load()
+                record = Store().load(entry.name)
         if record is None or not record.launch_alive:
             try:
                 provider.allow(machine_id, port, [])
@@ -142,7 +143,7 @@ def let_go(entry: Entry) -> bool:
     An agent that comes with the launch (as in a pod) ends with it.
     """
     return entry.record is not None and not entry.record.launch \
-        and not machines.load(entry.provider).agent_directory
+        and not machines.load(entry.provider).capabilities.agent_directory
 
 
 def agent(entry: Entry, to: Shell) -> AgentClient:
@@ -218,7 +219,7 @@ def clock(record: Record, store: Store) -> Optional[ClockOffset]:
 
 
 def follow(
-    client: AgentClient, show: Callable[[dict[str, Any]], None], *, forever: bool,
+    client: AgentClient, show: Callable[[Event], None], *, forever: bool,
 ) -> bool:
     """
     Pass the agent's events to ``show``, from the first one to the last, or until Ctrl-C.
@@ -228,12 +229,12 @@ def follow(
     :param forever: also pass future events.
     :raises BrokenPipeError: the reader of the output is gone.
     """
-    last = int(client.request('status')['next']) - 1
+    last = client.status()['next'] - 1
     over, absent, unheard = threading.Event(), threading.Event(), threading.Event()
 
-    def take(event: dict[str, Any]) -> None:
-        if event.get('event') == 'connection':
-            if event.get('state') == 'absent':
+    def take(event: Event) -> None:
+        if event['event'] == 'connection':
+            if event['state'] == 'absent':
                 absent.set()
                 over.set()
             return
@@ -242,7 +243,7 @@ def follow(
         except BrokenPipeError:
             unheard.set()  # as with `| head`
             over.set()
-        if not forever and int(event.get('seq', 0)) >= last:
+        if not forever and cast(int, event.get('seq', 0)) >= last:
             over.set()
 
     if last < 1 and not forever:

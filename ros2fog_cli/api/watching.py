@@ -13,10 +13,9 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded
-from fogros2.store import check_name, Store
+from fogros2.store import check_name
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import reach, screen
-from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.live import Live, PRESENT
 
 #: Time-out of the measurement of stream rates, in seconds.
@@ -36,9 +35,7 @@ def watch(
     :raises ConfigurationError: ``name`` is no valid machine name.
     """
     check_name(name)
-    graphs = Graphs(Store(), pictures=False) if topics else None
-    live = Live(name=name, regions=regions, interval=max(0.5, interval),
-                more=graphs.look if graphs is not None else None)
+    live = Live(name=name, regions=regions, interval=max(0.5, interval), topics=topics)
     live.start()
     try:
         if as_json or not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
@@ -51,8 +48,6 @@ def watch(
         reach.hush()
     finally:
         live.close()
-        if graphs is not None:
-            graphs.close()
     return 0
 
 
@@ -62,8 +57,7 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
 
     A node joins the launch for a few seconds to measure the rates.
     """
-    graphs = Graphs(Store(), pictures=False)
-    live = Live(name=name, regions=regions, interval=0.5, more=graphs.look)
+    live = Live(name=name, regions=regions, interval=0.5, topics=True)
     found: list[dict[str, Any]] = []
     begin = time.monotonic()
 
@@ -81,7 +75,6 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
             wait_until(measured, timeout=PATIENCE, what='the rates of streams')
     finally:
         live.close()
-        graphs.close()
     return found
 
 

@@ -43,7 +43,7 @@ class MachineOption:
         """
         self._overrides = None
         if args.machine:
-            from fogros2.actions.override import Overrides
+            from fogros2.describe.overrides import Overrides
             self._overrides = Overrides(args.machine)
 
     def prelaunch(
@@ -72,7 +72,7 @@ def complete(prefix: str, **_: object) -> list[str]:
     if not equals:
         from ros2fog_cli.verb import complete_names
         return [f'{one}=' for one in [*complete_names(name), *(['*'] if not name else [])]]
-    from fogros2.actions import keywords
+    from fogros2.describe import keywords
     before, comma, last = rest.rpartition(',')
     if not comma:
         return [f'{name}={one}' for one in keywords.providers() if one.startswith(last)]

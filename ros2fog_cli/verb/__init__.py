@@ -57,9 +57,16 @@ def add_region(parser: argparse.ArgumentParser) -> None:
 
 
 def complete_regions(prefix: str, **_: object) -> list[str]:
-    """Return the AWS regions that begin with ``prefix``, and 'all', without asking AWS."""
-    from fogros2.provider.aws.regions import REGIONS
-    return [name for name in (*REGIONS, 'all') if name.startswith(prefix)]
+    """Return the regions that begin with ``prefix``, and 'all', without any request."""
+    from fogros2 import plugin_system
+    from fogros2.errors import FogError
+    names = ['all']
+    for provider in plugin_system.names('fogros2.provider'):
+        try:
+            names += plugin_system.load('fogros2.provider', provider).region_names()
+        except FogError:
+            continue  # the verb reports a provider that cannot be loaded
+    return [name for name in names if name.startswith(prefix)]
 
 
 def complete_providers(prefix: str, **_: object) -> list[str]:
@@ -70,7 +77,7 @@ def complete_providers(prefix: str, **_: object) -> list[str]:
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
-    parser.add_argument('--json', action='store_true', help='print JSON for programs to read')
+    parser.add_argument('--json', action='store_true', help='print JSON, for programs')
 
 
 def warn(text: str) -> None:
@@ -81,7 +88,7 @@ def warn(text: str) -> None:
 def agreed(one: str, several: str, number: int) -> bool:
     """Ask the user whether to delete ``number`` things; without a terminal, the answer is no."""
     if not sys.stdin.isatty():
-        warn('not deleted: nobody is here to ask (--yes answers)')
+        warn('not deleted: there is no terminal to ask at (--yes answers)')
         return False
     what = one if number == 1 else f'these {number} {several}'
     return input(f'Delete {what}? [y/N] ').strip().lower() in ('y', 'yes')

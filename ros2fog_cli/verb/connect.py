@@ -16,7 +16,7 @@ class ConnectVerb(VerbExtension):
         add_name(parser)
         _add_options(parser)
         parser.add_argument('command', nargs=argparse.REMAINDER,
-                            help='-- and a command, instead of a login shell')
+                            help='-- and a command to run instead of a login shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Connect the terminal to the session; return the exit status of the session."""
@@ -38,4 +38,4 @@ class ConnectVerb(VerbExtension):
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_region(parser)
-    parser.add_argument('--user', '-u', help='another user than the one nodes run as')
+    parser.add_argument('--user', '-u', help='login user (default: the user of the nodes)')

@@ -15,37 +15,36 @@ class DashboardVerb(VerbExtension):
         """Add the verb's arguments."""
         add_region(parser)
         parser.add_argument('--port', type=int, default=0,
-                            help='of this computer; one that is free unless given')
+                            help='port of this computer (default: any free port)')
         parser.add_argument('--no-browser', action='store_true',
-                            help='only say where the page is')
+                            help='print the address, but start no browser')
         parser.add_argument('--no-topics', action='store_true',
-                            help='join no launch: no rates of topics and no pictures')
+                            help='join no launch: measure no rates, take no pictures')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve the page until Ctrl-C."""
         from fogros2.errors import ConfigurationError
         from fogros2_monitor.dashboard.server import Dashboard
-        from ros2fog_cli.api.board import Board
+        from ros2fog_cli.api.browser import browser_at
+        from ros2fog_cli.api.live import Live
         if not 0 <= args.port < 65536:
             raise ConfigurationError(f'--port {args.port} is no port', 'give one up to 65535')
-        board = Board(regions=args.region, topics=not args.no_topics)
+        live = Live(regions=args.region, topics=not args.no_topics, pictures=True)
         try:
-            dashboard = Dashboard(board, port=args.port)
+            dashboard = Dashboard(live, port=args.port)
         except OSError as error:
             raise ConfigurationError(
                 f'port {args.port} of this computer: {error.strerror}',
                 'another --port, or none for one that is free') from error
-        board.start()
+        live.start()
         print(f'The dashboard is at {dashboard.url} until Ctrl-C.\n'
-              'Everyone with this address may look, and delete machines.', flush=True)
-        if not args.no_browser:
-            import webbrowser
-            webbrowser.open(dashboard.url_with_ticket())
+              'Everyone who has this address can see and delete machines.', flush=True)
         try:
-            dashboard.serve()
+            with browser_at(dashboard.url, start=not args.no_browser):
+                dashboard.serve()
         except KeyboardInterrupt:
             print()
         finally:
             dashboard.close()
-            board.close()
+            live.close()
         return 0

@@ -18,13 +18,13 @@ class DeleteVerb(VerbExtension):
             lambda prefix, **words: [
                 *complete_names(prefix, **words), *(['all'] if 'all'.startswith(prefix) else [])])
         add_region(parser)
-        parser.add_argument('--yes', '-y', action='store_true', help="don't ask")
-        parser.add_argument('--dry-run', action='store_true', help='only say what would go')
+        parser.add_argument('--yes', '-y', action='store_true', help="don't ask for confirmation")
+        parser.add_argument('--dry-run', action='store_true', help='print what would be deleted')
         parser.add_argument(
             '--force', action='store_true',
-            help='also under a launch that runs, or when a computer or provider is out of reach')
+            help='even if a launch runs, or if the computer or its provider does not answer')
         parser.add_argument('--any-robot', action='store_true',
-                            help="also other robots' machines of that name, or with 'all'")
+                            help="also machines of other robots with that name, or with 'all'")
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete the machines; return 1 if something still exists."""
@@ -53,15 +53,13 @@ class DeleteVerb(VerbExtension):
             return 0
         for entry in entries:
             endings.check_free(entry, force=args.force)
-        if not args.yes and not agreed(
-                'this machine', 'machines', len(entries)):
+        if not args.yes and not agreed('this machine', 'machines', len(entries)):
             return 1
         failed = 0
-        with progress.shown() as report:
-            for entry, error in endings.delete_all(entries, store, report, force=args.force):
-                if error is None:
-                    print(f'deleted {entry.name}')
-                else:
-                    warn(f'{entry.name}: {error}')
-                    failed = 1
+        for entry, error in endings.delete_all(entries, store, progress.report, force=args.force):
+            if error is None:
+                print(f'deleted {entry.name}')
+            else:
+                warn(f'{entry.name}: {error}')
+                failed = 1
         return failed

@@ -22,10 +22,10 @@ class DoctorVerb(VerbExtension):
         add_json(parser)
         provider = parser.add_argument(
             '--provider', nargs='+', default=[], metavar='NAME',
-            help='has to work; others are asked where they are set up')
+            help='provider that must work; others are checked if they are configured')
         provider.completer = complete_providers  # type: ignore[attr-defined]
         parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
-                            help='how long to look for ROS 2 on the LAN (0: not at all)')
+                            help='how long to search the LAN for ROS 2 (0: not at all)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print each check, with a remedy unless it passed; return 1 if a check failed."""

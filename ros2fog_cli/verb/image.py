@@ -40,7 +40,7 @@ class ImageVerb(VerbExtension):
                 *(word for word in ('list', 'delete', 'create') if word.startswith(prefix))])
         _add_options(parser)
         parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
-                            help='more of them; options may come anywhere')
+                            help='more names or ids; options may be anywhere')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Run the action that the first argument names."""
@@ -66,7 +66,7 @@ class ImageVerb(VerbExtension):
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_region(parser)
-    parser.add_argument('--dry-run', action='store_true', help='only say what would be done')
+    parser.add_argument('--dry-run', action='store_true', help='print what would be done')
     parser.add_argument('--image-name', metavar='NAME',
                         help="the image's name (default: the machine's, and the time)")
     parser.add_argument('--no-wait', action='store_true',
@@ -90,16 +90,16 @@ def _create(args: argparse.Namespace) -> int:
         description='Build the image for pods, with all in it that a launch from this terminal '
                     'would install, and push it.')
     parser.add_argument('--registry', required=True,
-                        help="where it goes, such as 'registry.example/robots'")
-    parser.add_argument('--base', default='', help='image to begin with')
-    parser.add_argument('--workspace', help='whose dependencies go in (default: the one that is '
-                                            "sourced; '' for none)")
+                        help="where to push it, such as 'registry.example/robots'")
+    parser.add_argument('--base', default='', help='base image')
+    parser.add_argument('--workspace', help='workspace whose dependencies are installed (default: '
+                                            "the sourced one; '' for none)")
     parser.add_argument('--engine', choices=('auto', 'podman', 'docker', 'buildah'),
-                        default='auto', help='what builds it (default: the first that is there)')
+                        default='auto', help='program that builds it (default: the first found)')
     parser.add_argument('--folder', default='fogros2_image',
-                        help='where the Containerfile is written (default: %(default)s)')
-    parser.add_argument('--no-push', action='store_true', help='build it, and leave it here')
-    parser.add_argument('--dry-run', action='store_true', help='print the Containerfile alone')
+                        help='folder for the Containerfile (default: %(default)s)')
+    parser.add_argument('--no-push', action='store_true', help='build it, but do not push it')
+    parser.add_argument('--dry-run', action='store_true', help='only print the Containerfile')
     words = parser.parse_args(args.rest)
     from pathlib import Path
 
@@ -108,9 +108,8 @@ def _create(args: argparse.Namespace) -> int:
     if words.dry_run or args.dry_run:
         print(dict(recipe.files)['Containerfile'], end='')
         return 0
-    made = pod_image.build(
-        recipe, Path(words.folder), engine=words.engine, push=not words.no_push,
-        say=lambda line: print(line, file=sys.stderr))
+    made = pod_image.build(recipe, Path(words.folder), engine=words.engine,
+                           push=not words.no_push, say=warn)
     print(f"{'built' if words.no_push else 'pushed'} {made}")
     registry = made.rpartition(':')[0]
     print(f"launch files take it by container_image='{registry}:{{dependencies}}'")
@@ -128,7 +127,7 @@ def _list(args: argparse.Namespace) -> int:
         now = time.time()
         print(table.table(
             ('NAME', 'IMAGE', 'PROVIDER', 'PLACE', 'STATE', 'AGE', 'SIZE', 'DEPENDENCIES'),
-            [(image.name, image.id, image.provider, image.place or table.NONE,
+            [(image.name, image.id, image.provider, image.region or table.NONE,
               image.state or table.NONE,
               table.duration(None if image.created is None else max(0.0, now - image.created)),
               table.NONE if image.size_gb is None else f'{image.size_gb} GB',

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any, Optional
+from typing import Optional, TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
+
+if TYPE_CHECKING:
+    from fogros2.events import Event
 
 
 class LogsVerb(VerbExtension):
@@ -17,8 +20,8 @@ class LogsVerb(VerbExtension):
         """Add the verb's arguments."""
         add_name(parser)
         add_region(parser)
-        parser.add_argument('-f', '--follow', action='store_true', help='go on until Ctrl-C')
-        parser.add_argument('--node', help='of this node alone (its name in the launch: talker-1)')
+        parser.add_argument('-f', '--follow', action='store_true', help='continue until Ctrl-C')
+        parser.add_argument('--node', help='only this node (its name in the launch: talker-1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the log."""
@@ -41,13 +44,13 @@ class LogsVerb(VerbExtension):
         return 0 if there else 1
 
 
-def show(event: dict[str, Any], node: Optional[str]) -> None:
+def show(event: Event, node: Optional[str]) -> None:
     """Print one event of the agent's log."""
     from ros2fog_cli.api.log import describe
     text = describe(event)
-    if text is None or (node and event.get('name') not in (node, None)):
+    if text is None or (node and event.get('name', node) != node):
         return
-    name = f"[{event['name']}] " if event.get('name') else ''
+    name = f"[{event.get('name')}] " if event.get('name') else ''
     stream = sys.stderr if event.get('stream') == 'stderr' else sys.stdout
     for line in text.splitlines() or ['']:
         print(f'{name}{line}', file=stream, flush=True)

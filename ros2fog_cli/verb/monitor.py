@@ -23,12 +23,12 @@ class MonitorVerb(VerbExtension):
         add_name(parser)
         add_region(parser)
         parser.add_argument('--port', type=int, default=0,
-                            help='of this computer; one that is free unless given')
+                            help='port of this computer (default: any free port)')
         parser.add_argument('--no-browser', action='store_true',
-                            help='only say where to look, for another computer or application')
+                            help='print the address, but start no browser')
         parser.add_argument('--share', action='store_true',
-                            help='say where those whom monitor_allow= lets in find it, with the '
-                                 'token, and end')
+                            help='print the address, with its token, for the networks in '
+                                 'monitor_allow=, and exit')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve the tunnel until Ctrl-C."""
@@ -44,8 +44,10 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     """Forward a port of this computer to the machine's bridge until Ctrl-C."""
     from fogros2 import monitor_addresses as addresses
     from fogros2.errors import ConfigurationError
+    from fogros2.model import host_port
     from fogros2_monitor.tunnel import Tunnel
     from ros2fog_cli.api import monitor, reach
+    from ros2fog_cli.api.browser import browser_at
     there = (entry.record.monitor if entry.record is not None else 0) or addresses.PORT
     with reach.session(entry) as shell:
         token = monitor.token_of(entry, shell, there)
@@ -58,9 +60,9 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         with monitor.carrying(tunnel) as ended:
             try:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
-                           addresses.place('localhost', tunnel.port), token,
+                           host_port('localhost', tunnel.port), token,
                            application=monitor.has_application(tunnel.port, token))
-                with monitor.browser_at(page, start=browser):
+                with browser_at(page, start=browser):
                     ended.wait()
             except KeyboardInterrupt:
                 print()
@@ -69,10 +71,10 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
 
 def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     """Print the address of this computer's own bridge with its token, and open a browser."""
-    from fogros2 import monitor_addresses as addresses
-    from ros2fog_cli.api import monitor
-    page = say(f'{name} is at {{}}; in a browser:', addresses.place('localhost', port), token)
-    with monitor.browser_at(page, start=browser) as came:
+    from fogros2.model import host_port
+    from ros2fog_cli.api.browser import browser_at
+    page = say(f'{name} is at {{}}; in a browser:', host_port('localhost', port), token)
+    with browser_at(page, start=browser) as came:
         came.wait(PATIENCE)
     return 0
 
@@ -95,7 +97,7 @@ def share(entry: Entry) -> int:
         where, token, fingerprint = monitor.credentials_of(entry, shell)
     address = urls.with_token(where, token, 'wss')
     print(f'{address}\n\n'
-          'A browser has to be shown the certificate once, here:\n'
+          'Open this page once, so that the browser accepts the certificate:\n'
           f'https://{address[len("wss://"):]}\n'
           f'its SHA-256 is {fingerprint}\n')
     for at in (urls.LICHTBLICK, urls.FOXGLOVE):

@@ -6,11 +6,17 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, complete_regions, VerbExtension, warn
+from ros2fog_cli.verb import (
+    add_json,
+    complete_providers,
+    complete_regions,
+    VerbExtension,
+    warn,
+)
 
 
 class PriceVerb(VerbExtension):
-    """List the matching EC2 instance types, cheapest first; 'cheapest' takes the first one."""
+    """List the matching machine types, cheapest first; 'cheapest' takes the first one."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -31,24 +37,27 @@ class PriceVerb(VerbExtension):
         parser.add_argument('--limit', type=int, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
         parser.add_argument('--refresh', action='store_true',
-                            help='ask AWS, also where it was asked within a day')
+                            help='do not use prices of the last 24 hours')
+        provider = parser.add_argument(
+            '--provider', metavar='PROVIDER',
+            help='whose prices (default: the first one that is set up)')
+        provider.completer = complete_providers  # type: ignore[attr-defined]
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; a launch would use the first row."""
-        from fogros2.provider.aws import choices
-        from fogros2.provider.aws.clients import usual
-        from fogros2.provider.aws.prices import Market
-        from ros2fog_cli.api import table
+        from fogros2.provider import offers
+        from ros2fog_cli.api import machines, table
         from ros2fog_cli.api.interrupts import interruptible
-        asked = choices.wants(
+        asked = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
             max_price=args.max_price, spot=args.spot)
         with interruptible() as cancel:
-            regions = choices.regions_named(args.region, usual().until(cancel))
-            choice = choices.choose(
-                regions, asked, Market(refresh=args.refresh, cancel=cancel), spot_too=True)
+            provider = machines.load(args.provider or machines.able('prices'))
+            provider.cancel = cancel
+            choice = provider.offers(asked, args.region or (), refresh=args.refresh)
+        regions = choice.regions
         for region, reason in choice.left_out:
             warn(f'{region}: {reason}')
         shown = choice.offers[:args.limit or None]

@@ -6,11 +6,11 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, complete_regions, VerbExtension
+from ros2fog_cli.verb import add_json, complete_providers, complete_regions, VerbExtension
 
 
 class RegionsVerb(VerbExtension):
-    """List the AWS regions by the time of a connection from here."""
+    """List a provider's regions by the time of a connection from here."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -18,18 +18,17 @@ class RegionsVerb(VerbExtension):
         region.completer = complete_regions  # type: ignore[attr-defined]
         parser.add_argument('--all', action='store_true',
                             help='also those that an account has to enable first')
+        provider = parser.add_argument(
+            '--provider', metavar='PROVIDER',
+            help='whose regions (default: the first one that is set up)')
+        provider.completer = complete_providers  # type: ignore[attr-defined]
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table."""
-        from fogros2.errors import ConfigurationError
-        from fogros2.provider.aws import regions
-        from ros2fog_cli.api import table
-        unknown = [name for name in args.region if name not in regions.REGIONS]
-        if unknown:
-            raise ConfigurationError(f"AWS has no region {', '.join(unknown)}",
-                                     'ros2 fog regions --all shows them')
-        found = regions.table(args.region or (regions.REGIONS if args.all else regions.ENABLED))
+        from ros2fog_cli.api import machines, table
+        provider = machines.load(args.provider or machines.able('regions'))
+        found = provider.regions(args.region, every=args.all)
         if args.json:
             print(json.dumps([{'region': one.region, 'place': one.place,
                                'median_ms': one.milliseconds, 'distance_km': one.distance_km}

@@ -15,7 +15,7 @@ class ShellVerb(VerbExtension):
         """Add the verb's arguments."""
         add_name(parser)
         parser.add_argument('command', nargs=argparse.REMAINDER,
-                            help='-- and a command, instead of a shell')
+                            help='-- and a command to run instead of a shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Run the shell, and return its exit status."""

@@ -21,12 +21,12 @@ class StatusVerb(VerbExtension):
         add_region(parser)
         add_json(parser)
         parser.add_argument('--watch', '-w', action='store_true',
-                            help='go on until Ctrl-C; also before the machine is there')
+                            help='continue until Ctrl-C; also before the machine exists')
         parser.add_argument('--topics', action='store_true',
-                            help='with --watch: rates of topics across the VPN, too, by a node '
-                                 'that joins the launch')
+                            help='with --watch: a node joins the launch and measures the rates '
+                                 'of topics across the VPN')
         parser.add_argument('--interval', type=float, default=1.0, metavar='SECONDS',
-                            help='of --watch, from one look to the next (1)')
+                            help='poll interval of --watch (default: 1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
@@ -63,7 +63,7 @@ class StatusVerb(VerbExtension):
                 with reach.session(entry) as shell:
                     client = reach.agent(entry, shell)
                     try:
-                        reply = client.request('status', timeout=15.0)
+                        reply = client.status(timeout=15.0)
                         status['agent'] = {
                             key: value for key, value in reply.items() if key not in ('id', 'ok')}
                     finally:

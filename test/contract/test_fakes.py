@@ -29,8 +29,7 @@ class TestFakeProvider(ProviderContract):
 class CloudLike(FakeProvider):
     """One with a firewall, and with host keys that are handed over."""
 
-    firewall = True
-    one_time_host_key = True
+    capabilities = FakeProvider.can(firewall=True, one_time_host_key=True)
 
 
 class TestFakeCloud(ProviderContract):

@@ -22,7 +22,7 @@ class TestLocalShell(ShellContract):
         return LocalShell(Endpoint('local'), name='here'), str(there)
 
 
-def test_a_missing_program_is_named():
+def test_missing_program_is_named():
     shell = LocalShell(Endpoint('local'), name='here')
     with pytest.raises(RuntimeError, match='fogros2-nothing not found'):
         shell.open(Command(('fogros2-nothing',)))

@@ -18,11 +18,12 @@ import uuid
 
 import pytest
 
-from fogros2.agent_client import agent_source
+from fogros2.agent_client import joined
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
-from fogros2.provider import container_root, debian_root
+from fogros2.provider.container import debian_root
+from fogros2.provider.container import root as container_root
 from rigs.cluster import images as cluster_images
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
@@ -45,11 +46,18 @@ LEFT_OUT = ('./var', './usr/share', './usr/sbin', './usr/lib/apt', './usr/lib/sy
             './usr/lib/*/perl*', './usr/lib/*/gconv')
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give tests with a Debian system time for debootstrap, which the first one waits for."""
+    for item in items:
+        if {'images', 'isolated_root'} & set(getattr(item, 'fixturenames', ())):
+            item.add_marker(pytest.mark.timeout(900), append=False)
+
+
 @pytest.fixture
 def slow_agent(tmp_path: Path) -> Path:
     """Return the agent's file for a machine whose clock is 1.5 s behind this computer's."""
     clock = 'import time\n_now = time.time\ntime.time = lambda: _now() - 1.5\n'
-    source = agent_source().read_text()
+    source = joined()
     assert source.count('import time\n') == 1
     path = tmp_path / 'agent.py'
     path.write_text(source.replace('import time\n', clock))

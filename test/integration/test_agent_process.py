@@ -22,7 +22,8 @@ from typing import Any, Optional
 
 import pytest
 
-from fogros2.agent_client import agent_source, AgentClient, cloud_launch_source, Heartbeat
+import fogros2
+from fogros2.agent_client import AgentClient, Heartbeat, joined
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, NodeSpec
 from fogros2.waiting import wait_until
@@ -32,7 +33,7 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 ME = pwd.getpwuid(os.getuid()).pw_name
 #: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.
 ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
-LAUNCH = [sys.executable, str(cloud_launch_source())]
+LAUNCH = [sys.executable, str(Path(fogros2.__file__).with_name('cloud_launch.py'))]
 
 
 class PipeStream:
@@ -91,11 +92,19 @@ class PipeShell:
             stream._lines.close()
 
 
+def program(folder: Path) -> Path:
+    """Write the agent's program into a folder."""
+    path = folder / 'joined-agent.py'
+    path.write_text(joined())
+    return path
+
+
 class Rig:
     """An agent in a folder of its own, a client of it, and the events that came."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.program = program(folder)
         self.directory = folder / 'agent'
         self.home = folder
         self.shell = PipeShell()
@@ -118,7 +127,7 @@ class Rig:
         self, program: Optional[Path] = None, **config: Any,
     ) -> subprocess.Popen[bytes]:
         agent = subprocess.Popen(
-            [sys.executable, '-IS', str(program or agent_source()), 'serve', '--config',
+            [sys.executable, '-IS', str(program or self.program), 'serve', '--config',
              str(self.config(**config))], stderr=subprocess.PIPE)
         self.agents.append(agent)
         wait_until(lambda: self.can_connect() or agent.poll() is not None, timeout=10,
@@ -134,7 +143,7 @@ class Rig:
     def client(self, *, follow: bool = True, **more: Any) -> AgentClient:
         client = AgentClient(
             self.shell, str(self.directory),  # type: ignore[arg-type]
-            python=sys.executable, agent_path=str(agent_source()), **more)
+            python=sys.executable, agent_path=str(self.program), **more)
         self.clients.append(client)
         if follow:
             client.subscribe(self.events.append, since=1)
@@ -193,7 +202,7 @@ def gone(pid: int) -> Callable[[], bool]:
 SLEEP = 'import time\nprint("up")\ntime.sleep(600)\n'
 
 
-def test_a_node_runs_and_its_output_and_exit_status_arrive(rig):
+def test_output_and_exit_status_of_a_node_arrive(rig):
     rig.serve()
     client = rig.client()
     client.request('launch')
@@ -236,7 +245,7 @@ def test_signals_and_negative_exit_statuses(rig):
         client.request('signal', node='killed', signal='SIGNONSENSE')
 
 
-def test_a_signal_that_comes_before_the_process_reaches_it(rig):
+def test_signal_before_the_start_reaches_the_process(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node('n', SLEEP)])
@@ -269,7 +278,7 @@ def test_stop_goes_from_sigint_to_sigkill(rig):
     assert rig.wait('exited', node='polite')['returncode'] == -2
 
 
-def test_respawn_is_launchs(rig):
+def test_launch_respawns_a_node(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node(
@@ -279,7 +288,7 @@ def test_respawn_is_launchs(rig):
     assert client.request('status')['nodes'][0]['restarts'] == 2
 
 
-def test_what_the_machine_does_not_have_is_refused_by_name(rig):
+def test_missing_programs_are_refused_by_name(rig):
     rig.serve()
     client = rig.client()
     (rig.folder / 'plain').write_text('no program')
@@ -313,7 +322,7 @@ def test_what_the_machine_does_not_have_is_refused_by_name(rig):
     assert states.pop('good') == 'exited' and set(states.values()) == {'refused'}
 
 
-def test_files_travel_and_markers_become_paths_of_the_machine(rig):
+def test_files_arrive_and_markers_become_paths(rig):
     agent = rig.serve()
     client = rig.client()
     script = rig.node('k', (
@@ -363,7 +372,7 @@ def test_binary_output_and_lines_without_an_end(rig):
         'time.sleep(0.1)\n'  # splits a character in two
         'os.write(1, b"\\xa9 no newline \\xe2\\x82")\n'))])
     rig.wait('exited', node='n')
-    assert rig.text('n') == '\ufffd\ufffd\0ok \u00e9 no newline \ufffd'
+    assert rig.text('n') == '\ufffd\ufffd\ufffdok \u00e9 no newline \ufffd'
 
 
 def test_much_output_fills_neither_memory_nor_disk(rig):
@@ -390,7 +399,7 @@ def test_much_output_fills_neither_memory_nor_disk(rig):
     assert agent.poll() is None
 
 
-def test_a_lost_connection_comes_back_with_nothing_missing_and_nothing_twice(rig):
+def test_lost_connection_loses_and_repeats_no_event(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node('n', (
@@ -425,7 +434,7 @@ def test_requests_outlive_a_lost_connection(rig):
     assert answers and answers[0]['machine'] == 'planner'
 
 
-def test_an_agent_that_has_gone_is_told_from_a_lost_connection(rig):
+def test_ended_agent_is_reported_as_absent(rig):
     agent = rig.serve()
     client = rig.client(restart=0.3)
     client.request('status')
@@ -481,7 +490,7 @@ BAD_REQUESTS = [
 ]
 
 
-def test_bad_requests_get_one_clear_answer_and_the_connection_stays(rig):
+def test_invalid_requests_are_refused_and_connection_stays(rig):
     agent = rig.serve()
     raw = Raw(rig)
     for line, answer in BAD_REQUESTS:
@@ -492,7 +501,7 @@ def test_bad_requests_get_one_clear_answer_and_the_connection_stays(rig):
     assert agent.poll() is None
 
 
-def test_clients_that_vanish_or_never_read_harm_nobody(rig):
+def test_lost_and_silent_clients_harm_no_other(rig):
     rig.serve(log_bytes=1 << 20)
     silent = Raw(rig)
     silent.ask(b'{"id": 1, "command": "log", "follow": true}\n')
@@ -511,7 +520,7 @@ def test_clients_that_vanish_or_never_read_harm_nobody(rig):
     silent.close()
 
 
-def test_a_request_too_long_is_refused(rig):
+def test_request_too_long_is_refused(rig):
     rig.serve()
     raw = Raw(rig)
     block = b'x' * (1 << 20)
@@ -527,10 +536,10 @@ def test_a_request_too_long_is_refused(rig):
     raw.close()
 
 
-def test_what_is_asked_on_a_pipe_that_ends_is_answered(rig):
+def test_requests_are_answered_after_the_end_of_input(rig):
     rig.serve()
     done = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'connect', '--directory',
+        [sys.executable, '-IS', str(rig.program), 'connect', '--directory',
          str(rig.directory)],
         input=b'{"id": 9, "command": "log", "from": 1}\n{"id": 8, "command": "status"}\n',
         capture_output=True, timeout=10)
@@ -538,15 +547,15 @@ def test_what_is_asked_on_a_pipe_that_ends_is_answered(rig):
     assert done.returncode == 0
 
 
-def test_connecting_where_no_agent_is(tmp_path):
+def test_connect_without_an_agent_reports_absent(tmp_path):
     done = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'connect', '--directory', str(tmp_path)],
+        [sys.executable, '-IS', str(program(tmp_path)), 'connect', '--directory', str(tmp_path)],
         capture_output=True, timeout=10)
     assert done.returncode == 3
     assert json.loads(done.stdout)['kind'] == 'absent'
 
 
-def test_a_second_agent_is_refused_and_a_stale_socket_replaced(rig):
+def test_second_agent_is_refused_and_stale_socket_replaced(rig):
     first = rig.serve()
     second = rig.serve()
     assert second.wait(10) == 1
@@ -567,33 +576,33 @@ def test_a_second_agent_is_refused_and_a_stale_socket_replaced(rig):
     ({'user': 'nobody-of-that-name'}, "no user 'nobody-of-that-name'"),
     ({'lifetime': 0}, "'lifetime' has to be above 0"),
 ])
-def test_what_an_agent_can_not_start_with_is_one_line(rig, config, reason):
+def test_invalid_configuration_is_reported_in_one_line(rig, config, reason):
     path = rig.config(**config)
     done = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'serve', '--config', str(path)],
+        [sys.executable, '-IS', str(rig.program), 'serve', '--config', str(path)],
         capture_output=True, timeout=10, cwd=rig.folder)
     assert done.returncode == 1
     assert reason in done.stderr.decode() and done.stderr.count(b'\n') == 1
     detached = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'serve', '--detach', '--config', str(path)],
+        [sys.executable, '-IS', str(rig.program), 'serve', '--detach', '--config', str(path)],
         capture_output=True, timeout=10, cwd=rig.folder)
     assert detached.returncode == 1
     assert reason in json.loads(detached.stdout)['error']
 
 
-def test_a_damaged_configuration_is_one_line(rig):
+def test_damaged_configuration_is_reported_in_one_line(rig):
     path = rig.config()
     path.write_text('{')
     done = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'serve', '--config', str(path)],
+        [sys.executable, '-IS', str(rig.program), 'serve', '--config', str(path)],
         capture_output=True, timeout=10)
     assert done.returncode == 1 and b"can't be read" in done.stderr
     assert done.stderr.count(b'\n') == 1
 
 
-def test_detached_it_answers_when_it_serves(rig):
+def test_detached_agent_reports_when_it_is_ready(rig):
     done = subprocess.run(
-        [sys.executable, '-IS', str(agent_source()), 'serve', '--detach', '--config',
+        [sys.executable, '-IS', str(rig.program), 'serve', '--detach', '--config',
          str(rig.config())], capture_output=True, timeout=10)
     ready = json.loads(done.stdout)
     assert ready['ready'] is True and ready['socket'] == str(rig.directory / 'agent.sock')
@@ -604,7 +613,7 @@ def test_detached_it_answers_when_it_serves(rig):
     assert not rig.directory.exists()
 
 
-def test_a_launch_process_that_dies_takes_its_nodes_along_and_comes_back(rig):
+def test_killed_launch_process_ends_its_nodes_and_restarts(rig):
     rig.serve()
     client = rig.client()
     pid = client.request('launch')['pid']
@@ -624,7 +633,7 @@ def test_a_launch_process_that_dies_takes_its_nodes_along_and_comes_back(rig):
     assert rig.wait('exited', node='again')['returncode'] == 0
 
 
-def test_why_a_launch_process_could_not_begin_is_told(rig):
+def test_failed_launch_process_reports_its_log(rig):
     rig.serve(ros_command=['sh', '-c', 'echo before >&2; echo no such library >&2; exit 3'])
     client = rig.client()
     client.request('launch')
@@ -643,17 +652,19 @@ def test_starting_twice_runs_once(rig):
     assert [e['event'] for e in rig.events].count('started') == 1
 
 
-def test_variables_that_come_after_the_launch_process_reach_the_nodes(rig):
+def test_variables_configured_later_reach_the_nodes(rig):
     rig.serve()
     client = rig.client()
     client.request('launch')
-    client.request('configure', environment={'LATE': 'yes'})
+    client.request('configure', environment={
+        'LATE': 'yes', 'ROS_LOG_DIR': str(rig.folder),
+        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
     client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LATE"])\n')])
     rig.wait('exited', node='n')
     assert rig.text('n') == 'yes\n'
 
 
-def test_what_setup_files_add_to_a_variable_reaches_the_nodes(rig):
+def test_variables_of_setup_files_reach_the_nodes(rig):
     setup = rig.folder / 'setup.bash'
     setup.write_text('export LISTED="sourced:$LISTED"\n')
     rig.serve(setup=[str(setup)], environment={
@@ -678,7 +689,7 @@ def test_setup_files_are_sourced(rig):
         client.request('launch')
 
 
-def test_a_ros_command_that_is_not_there_is_refused(rig):
+def test_missing_ros_command_is_refused(rig):
     rig.serve(ros_command=['/no/such/ros2'])
     client = rig.client()
     with pytest.raises(AgentError, match="/no/such/ros2 can't be started"):
@@ -694,7 +705,7 @@ def ends(rig: Rig) -> list[str]:
     return ['touch', str(rig.folder / 'ended')]
 
 
-def test_a_robot_that_has_gone_ends_the_machine(rig, free_udp_port):
+def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
     rig.serve(robot_timeout=1.0, end_command=ends(rig))
     client = rig.client()
     client.request('start', nodes=[rig.node('n', SLEEP)])
@@ -731,7 +742,7 @@ def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
 
 
 @pytest.mark.parametrize('wrong', ['launch', 'peer', 'nonsense'])
-def test_only_the_launchs_own_heartbeats_count(rig, free_udp_port, wrong):
+def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
     rig.serve(robot_timeout=0.8, end_command=ends(rig), heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port,
         'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1'})
@@ -751,7 +762,7 @@ def test_only_the_launchs_own_heartbeats_count(rig, free_udp_port, wrong):
         assert heartbeat is None or heartbeat.round_trip is None
 
 
-def test_a_kept_machine_lets_go_of_the_nodes_and_stays_until_its_lifetime(rig, free_udp_port):
+def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, free_udp_port):
     rig.serve(robot_timeout=0.5, lifetime=3.0, on_exit='keep', end_command=ends(rig))
     client = rig.client()
     client.request('start', nodes=[rig.node('n', SLEEP)])
@@ -769,14 +780,14 @@ def test_a_kept_machine_lets_go_of_the_nodes_and_stays_until_its_lifetime(rig, f
     wait_until((rig.folder / 'ended').exists, timeout=10, what='the end of the machine')
 
 
-def test_a_machine_that_no_launch_came_to_ends(rig):
+def test_machine_that_no_launch_configures_ends(rig):
     rig.serve(boot_timeout=0.5, end_command=ends(rig))
     rig.client()
     assert rig.wait('watchdog')['reason'] == 'no launch came'
     wait_until((rig.folder / 'ended').exists, timeout=10, what='the end of the machine')
 
 
-def test_a_computer_that_is_not_ours_stays_on_and_gets_clean(rig):
+def test_computer_without_end_command_is_cleaned_up(rig):
     mark = rig.folder / 'down'
     agent = rig.serve(boot_timeout=2.0)
     (rig.directory / 'agent.py').write_text('put there by the robot')
@@ -789,7 +800,7 @@ def test_a_computer_that_is_not_ours_stays_on_and_gets_clean(rig):
     assert mark.exists() and not rig.directory.exists()
 
 
-def test_a_kept_machine_outlives_a_launch_that_dies_while_it_sets_it_up(rig):
+def test_kept_machine_outlives_a_launch_that_dies_in_setup(rig):
     rig.serve(launch='first', on_exit='keep', boot_timeout=60.0, end_command=ends(rig))
     client = rig.client()
     client.request('release', on_exit='keep')
@@ -799,7 +810,7 @@ def test_a_kept_machine_outlives_a_launch_that_dies_while_it_sets_it_up(rig):
     assert not (rig.folder / 'ended').exists()
 
 
-def test_a_kept_machine_that_nobody_has_outlives_its_agent(rig):
+def test_kept_machine_without_launch_outlives_its_agent(rig):
     agent = rig.serve(on_exit='keep', lifetime=2.0, end_command=ends(rig))
     rig.client().request('release', on_exit='keep')
     agent.kill()
@@ -808,7 +819,7 @@ def test_a_kept_machine_that_nobody_has_outlives_its_agent(rig):
     assert rig.wait('watchdog')['reason'] == 'lifetime'
 
 
-def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
+def test_machine_that_a_launch_sets_up_is_not_taken_over(rig):
     rig.serve(boot_timeout=60.0)
     client = rig.client()
     with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
@@ -817,7 +828,7 @@ def test_a_machine_that_a_launch_sets_up_is_not_robbed_either(rig):
     client.request('configure', launch='def456')
 
 
-def test_a_machine_that_booted_again_is_whose_launch_comes_first(rig):
+def test_rebooted_machine_goes_to_the_first_launch(rig):
     rig.serve(launch='', boot_timeout=60.0)
     client = rig.client()
     client.request('configure', launch='abc123', force='')
@@ -825,7 +836,7 @@ def test_a_machine_that_booted_again_is_whose_launch_comes_first(rig):
         client.request('configure', launch='def456')
 
 
-def test_what_comes_after_a_release_does_not_claim_the_machine_again(rig):
+def test_late_request_does_not_claim_a_released_machine(rig):
     """Such as a sign of life that was under way when the connection broke."""
     rig.serve(launch='first', on_exit='keep', boot_timeout=60.0)
     client = rig.client()
@@ -840,7 +851,7 @@ def test_what_comes_after_a_release_does_not_claim_the_machine_again(rig):
     assert client.request('status')['launch'] == 'second'
 
 
-def test_a_machine_that_is_released_before_it_was_quite_taken_stays_free(rig):
+def test_release_during_a_takeover_leaves_the_machine_free(rig):
     rig.serve(launch='first', on_exit='keep')
     client = rig.client()
     client.request('start', nodes=[rig.node('n', STUBBORN)])
@@ -869,7 +880,7 @@ def test_a_machine_that_is_released_before_it_was_quite_taken_stays_free(rig):
 @pytest.mark.parametrize('how', [
     {'command': 'release', 'on_exit': 'keep'},
     {'command': 'configure', 'launch': 'another', 'force': 'abc123'}])
-def test_what_was_kept_goes_with_the_launch_that_asked_for_it(rig, how):
+def test_health_check_ends_with_its_launch(rig, how):
     thing = rig.folder / 'thing'
     rig.serve(on_exit='keep')
     client = rig.client()
@@ -881,7 +892,7 @@ def test_what_was_kept_goes_with_the_launch_that_asked_for_it(rig, how):
     assert client.request('status')['kept'] == []
 
 
-def test_a_watch_tells_once_what_its_command_found(rig):
+def test_watch_reports_its_command_once(rig):
     rig.serve()
     client = rig.client()
     notice = rig.folder / 'notice'
@@ -903,7 +914,7 @@ def test_a_watch_tells_once_what_its_command_found(rig):
             client.request('watch', **wrong)
 
 
-def test_a_watch_goes_with_its_launch(rig):
+def test_watch_ends_with_its_launch(rig):
     rig.serve(on_exit='keep')
     client = rig.client()
     notice = rig.folder / 'notice'
@@ -915,7 +926,7 @@ def test_a_watch_goes_with_its_launch(rig):
     assert rig.wait('notice')['reason'] == 'ours'
 
 
-def test_an_agent_says_that_a_signal_ends_it_before_its_nodes_end(rig):
+def test_signalled_agent_reports_before_its_nodes_end(rig):
     agent = rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node('n', SLEEP)])
@@ -928,7 +939,7 @@ def test_an_agent_says_that_a_signal_ends_it_before_its_nodes_end(rig):
 
 
 @pytest.mark.parametrize('known', ['abc123', 'xyz789'])
-def test_a_launch_takes_a_machine_from_the_one_alone_that_it_knows_to_be_dead(rig, known):
+def test_takeover_needs_the_id_of_the_dead_launch(rig, known):
     rig.serve(boot_timeout=60.0)
     client = rig.client()
     if known == 'abc123':
@@ -938,13 +949,13 @@ def test_a_launch_takes_a_machine_from_the_one_alone_that_it_knows_to_be_dead(ri
             client.request('configure', launch='def456', force=known)
 
 
-def test_an_end_command_that_fails_is_told(rig):
+def test_failed_end_command_is_reported(rig):
     rig.serve(boot_timeout=0.2, end_command=['false'])
     rig.client()
     assert rig.wait('end_failed')['returncode'] == 1
 
 
-def test_a_launch_with_a_heartbeat_is_not_robbed_of_its_machine(rig, free_udp_port):
+def test_machine_with_heartbeats_is_not_taken_over(rig, free_udp_port):
     rig.serve()
     client = rig.client()
     client.request('configure', heartbeat={
@@ -961,7 +972,7 @@ def test_a_launch_with_a_heartbeat_is_not_robbed_of_its_machine(rig, free_udp_po
     wait_until(lambda: 'mine' in rig.text('n'), timeout=10, what='the new node')
 
 
-def test_a_busy_heartbeat_port_is_refused(rig):
+def test_busy_heartbeat_port_is_refused(rig):
     rig.serve()
     client = rig.client()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -971,7 +982,7 @@ def test_a_busy_heartbeat_port_is_refused(rig):
                 'bind': '127.0.0.1', 'port': other.getsockname()[1], 'peer': '127.0.0.1'})
 
 
-def test_what_is_kept_is_repaired_and_taken_down(rig):
+def test_health_check_repairs_and_takes_down(rig):
     thing = rig.folder / 'thing'
     agent = rig.serve()
     client = rig.client()
@@ -993,7 +1004,7 @@ def test_what_is_kept_is_repaired_and_taken_down(rig):
     assert not thing.exists()
 
 
-def test_a_repair_that_fails_is_tried_again_with_growing_pauses(rig):
+def test_failed_repair_is_tried_again(rig):
     rig.serve()
     client = rig.client()
     client.request('keep', what='vpn', interval=0.05, alive=['false'],
@@ -1035,7 +1046,7 @@ STUBBORN = (
     'time.sleep(600)\n')
 
 
-def test_told_to_end_it_is_gone_within_two_seconds_with_all_it_started(rig):
+def test_signalled_agent_ends_all_processes_within_two_seconds(rig):
     agent = rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node('n', STUBBORN)])
@@ -1057,7 +1068,7 @@ def test_nodes_do_not_outlive_a_killed_agent(rig):
     wait_until(gone(node), timeout=10, what='the node to end')
 
 
-def test_an_agent_that_died_is_replaced_with_its_watch_and_its_log(rig, free_udp_port):
+def test_restarted_agent_keeps_watchdog_and_journal(rig, free_udp_port):
     first = rig.serve(robot_timeout=3.0, end_command=ends(rig))
     client = rig.client()
     client.request('configure', launch='def456', force='abc123', heartbeat={
@@ -1079,6 +1090,36 @@ def test_an_agent_that_died_is_replaced_with_its_watch_and_its_log(rig, free_udp
 
 
 @pytest.fixture
+def first_agent(tmp_path: Path) -> Path:
+    """Return the agent of commit 326363e, which still runs on a machine that it kept."""
+    done = subprocess.run(['git', 'show', '326363e:fogros2/agent.py'], capture_output=True,
+                          cwd=Path(__file__).parents[2])
+    if done.returncode != 0:
+        pytest.skip('needs the history of the repository')
+    path = tmp_path / 'first-agent.py'
+    path.write_bytes(done.stdout)
+    return path
+
+
+def test_agent_of_the_first_commit_serves_a_new_robot(rig, first_agent):
+    rig.program = first_agent
+    agent = rig.serve(on_exit='keep')
+    client = rig.client()
+    assert client.request('configure', launch='next', force='abc123')['machine'] == 'planner'
+    client.request('launch')
+    client.request('configure', environment={
+        'LATE': 'yes', 'ROS_LOG_DIR': str(rig.folder),
+        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
+    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LATE"])\n')])
+    assert rig.wait('exited', node='n')['returncode'] == 0
+    assert rig.text('n') == 'yes\n'
+    status = client.status()
+    assert (status['launch'], status['nodes'][0]['state']) == ('next', 'exited')
+    client.request('release', exit=True)
+    assert rig.ended(agent) == 0 and not rig.directory.exists()
+
+
+@pytest.fixture
 def login(root: None) -> Iterator[Path]:
     """Give a folder that the user nobody can reach, and skip where we can't become that user."""
     if os.geteuid() != 0:
@@ -1089,7 +1130,7 @@ def login(root: None) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def test_as_root_it_runs_nodes_as_the_login_user_and_commands_as_root(login, tmp_path):
+def test_root_agent_runs_nodes_as_the_login_user(login, tmp_path):
     rig = Rig(tmp_path)
     rig.directory = login / 'agent'
     record = login / 'record'
@@ -1128,7 +1169,7 @@ def test_as_root_it_runs_nodes_as_the_login_user_and_commands_as_root(login, tmp
     rig.close()
 
 
-def test_as_root_it_takes_no_directory_that_belongs_to_somebody_else(login, tmp_path):
+def test_root_agent_refuses_a_foreign_directory(login, tmp_path):
     rig = Rig(tmp_path)
     rig.directory = login / 'agent'
     rig.directory.mkdir()
@@ -1142,7 +1183,7 @@ def test_as_root_it_takes_no_directory_that_belongs_to_somebody_else(login, tmp_
     rig.close()
 
 
-def test_as_process_1_it_reaps_orphans_and_ends_when_told(root, tmp_path):
+def test_agent_as_process_1_reaps_orphans_and_ends(root, tmp_path):
     if os.geteuid() != 0:
         pytest.skip('needs to run as root')
     if subprocess.run(['unshare', '--pid', '--fork', '--mount-proc', 'true'],
@@ -1151,7 +1192,7 @@ def test_as_process_1_it_reaps_orphans_and_ends_when_told(root, tmp_path):
     rig = Rig(tmp_path)
     agent = subprocess.Popen(
         ['unshare', '--pid', '--fork', '--kill-child', '--mount-proc', sys.executable, '-IS',
-         str(agent_source()), 'serve', '--config', str(rig.config())], stderr=subprocess.PIPE)
+         str(rig.program), 'serve', '--config', str(rig.config())], stderr=subprocess.PIPE)
     rig.agents.append(agent)
     wait_until(rig.can_connect, timeout=10, what='the agent')
     client = rig.client()
@@ -1173,7 +1214,7 @@ def test_as_process_1_it_reaps_orphans_and_ends_when_told(root, tmp_path):
     rig.close()
 
 
-def test_shell_commands_and_terminals_are_launchs(rig):
+def test_launch_runs_shell_commands_and_terminals(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[
@@ -1186,7 +1227,7 @@ def test_shell_commands_and_terminals_are_launchs(rig):
     assert (rig.text('shell'), rig.text('prefix')) == ('ONE TWO\n', 'hi\n')
 
 
-def test_the_installed_launch_file_runs_below_ros2_launch(rig):
+def test_installed_launch_file_runs_under_ros2_launch(rig):
     share = Path(__file__).parents[2] / 'launch' / 'cloud.launch.py'
     ros2 = shutil.which('ros2', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
     if ros2 is None:

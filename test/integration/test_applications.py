@@ -87,7 +87,7 @@ def twin(source):
 
 
 @pytest.mark.parametrize('name', ['grasp', 'planning', 'slam'])
-def test_a_launch_file_is_ten_lines_longer_than_its_twin_at_most(name, launch, tmp_path):
+def test_cloud_launch_file_has_at_most_ten_more_lines(name, launch, tmp_path):
     source = launch_file(name).read_text()
     here = twin(source)
     assert 'fogros2 ' not in here.replace('fogros2_examples', '') and 'Cloud' not in here
@@ -124,7 +124,7 @@ def test_grasp_planning(launch, tmp_path):
     assert drawn.read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_planner_of_grasps_outlives_bad_images(launch):
+def test_grasp_planner_survives_bad_images(launch):
     """Images that are none, then one that is."""
     from geometry_msgs.msg import PoseArray
     import numpy
@@ -182,7 +182,7 @@ def test_a_planner_of_grasps_outlives_bad_images(launch):
         assert words in said, said
 
 
-def test_a_planner_of_motions_outlives_bad_questions(launch):
+def test_motion_planner_survives_bad_requests(launch):
     """A scene that is none, poses that are none or touch, a goal out of reach; then a good one."""
     from diagnostic_msgs.msg import DiagnosticStatus
     from geometry_msgs.msg import PoseStamped
@@ -255,7 +255,7 @@ def test_a_planner_of_motions_outlives_bad_questions(launch):
     ('planning', 'time:=soon', "could not convert string to float: 'soon'"),
     ('slam', 'rate:=0', "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000"),
     ('grasp', 'picture:={}/no/x.png', 'there is no folder {}/no')])
-def test_a_launch_says_what_can_not_be_done_and_fails(name, asked, said, launch, tmp_path):
+def test_impossible_request_fails_the_launch(name, asked, said, launch, tmp_path):
     (tmp_path / 'room.cfg').write_text('three\nlines\nof it\n')
     run = launch('fogros2_examples', f'{name}.launch.py', 'machine:=robot',
                  asked.format(tmp_path))
@@ -276,7 +276,7 @@ def test_a_launch_says_what_can_not_be_done_and_fails(name, asked, said, launch,
     ('grasp.grasp_camera.GraspCamera', 'encoding:=rgb8', "'encoding' is 'rgb8': it has to be 16"),
     ('planning.planning_client.PlanningClient', 'picture:=/no/x.png', 'there is no folder /no'),
     ('planning.motion_planner.MotionPlanner', 'time:=0.0', "'time' is 0: it has to be 0.1 at le")])
-def test_a_node_looks_at_its_parameters_first(node, asked, said):
+def test_node_checks_its_parameters_first(node, asked, said):
     import rclpy
 
     from fogros2_examples.parameters import BadParameter
@@ -294,7 +294,7 @@ def test_a_node_looks_at_its_parameters_first(node, asked, said):
 @pytest.mark.parametrize(('package', 'executable'), [
     (path.parts[-3], path.name) for path in sorted(ROOT.glob('*/scripts/*'))
     if path.is_file() and path.parts[-3] != 'fogros2_monitor'])
-def test_a_node_is_interrupted_while_it_starts(package, executable, tmp_path):
+def test_starting_node_can_be_interrupted(package, executable, tmp_path):
     """As by another one's end: it has nothing to say, and nobody looks for a fault of its."""
     (tmp_path / 'rclpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
     done = subprocess.run(
@@ -304,7 +304,7 @@ def test_a_node_is_interrupted_while_it_starts(package, executable, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
-def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
+def test_impossible_request_deletes_the_machine(launch, engine):
     """Of the machine it says the rest: what was asked for wrongly is the robot's."""
     run = launch('fogros2_examples', 'planning.launch.py', 'environment:=attic')
     assert run.ended() == 1, run.text
@@ -312,7 +312,7 @@ def test_what_can_not_be_done_takes_the_machine_away(launch, engine):
     assert 'planner: delete' in run.text
 
 
-def test_a_plan_is_waited_for_as_long_as_it_may_take():
+def test_wait_for_a_plan_lasts_for_its_time_out():
     """Not for as long as the planner may take to come up."""
     from nav_msgs.srv import GetPlan
     import numpy
@@ -348,7 +348,7 @@ def test_a_plan_is_waited_for_as_long_as_it_may_take():
     assert len(path) == 2
 
 
-def test_a_camera_has_so_many_frames_under_way(tmp_path):
+def test_camera_limits_its_frames_in_flight(tmp_path):
     """Two leave before the first is answered, and not a third."""
     import cv2
     from geometry_msgs.msg import PoseStamped

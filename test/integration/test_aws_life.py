@@ -32,9 +32,10 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
-from fogros2.provider.aws import AWSProvider, images, instances, user_data
+from fogros2.provider.aws import AWSProvider, images, instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.vm import user_data
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
 from rigs.ec2 import iam
@@ -172,7 +173,7 @@ def test_a_launch_takes_few_calls_and_leaves_nothing(aws):
     spec = provider.resolve(spec)
     machine_id = provider.create(spec, request)
     machine = provider.reachable(
-        machine_id, name='planner', timeout=20.0, cancel=threading.Event())
+        machine_id, name='planner', timeout=20.0)
     provider.pin(machine_id, f'{KEY} root@planner')
     provider.allow(machine_id, 22, [])
     started = sum(aws.count().values())
@@ -231,7 +232,7 @@ def test_the_host_key_is_told_on_every_computer_and_pinned_anew(aws):
     assert found.shell.host_key == KEY
 
 
-def test_who_may_log_in_changes_and_ends(aws):
+def test_ssh_rule_changes_and_ends(aws):
     first, request = ask()
     second, other = ask('mapper')
     planner = aws.provider.create(first, request)
@@ -279,7 +280,7 @@ def test_a_spot_machine_can_not_be_stopped(aws):
         aws.provider.stop(machine_id)
 
 
-def test_what_a_machine_had_besides_goes_with_it(aws):
+def test_resources_of_a_machine_are_deleted_with_it(aws):
     spec, request = ask()
     machine_id = aws.provider.create(spec, request)
     attempt = machine_id.rsplit('/', 1)[1]
@@ -302,7 +303,7 @@ def test_an_instance_that_is_not_ours_is_never_ended(aws):
     assert not list(aws.provider.find({}))
 
 
-def test_what_ended_by_itself_is_tidied_up_but_not_what_is_being_made(aws, monkeypatch):
+def test_tidy_deletes_leftovers_but_no_machine_in_creation(aws, monkeypatch):
     spec, request = ask()
     gone = aws.provider.create(spec, request)
     ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
@@ -314,7 +315,7 @@ def test_what_ended_by_itself_is_tidied_up_but_not_what_is_being_made(aws, monke
     assert len(left()['groups']) == 1
 
 
-def test_machines_of_all_regions_are_found_with_two_calls_each_at_most(aws, monkeypatch):
+def test_find_takes_at_most_two_calls_per_region(aws, monkeypatch):
     here = aws.provider.create(*ask('planner', region=HOME))
     there = aws.provider.create(*ask('mapper', region=AWAY))
     assert here.startswith('aws:eu-central-1/') and there.startswith('aws:us-east-1/')
@@ -324,7 +325,7 @@ def test_machines_of_all_regions_are_found_with_two_calls_each_at_most(aws, monk
     enabled = len(ec2().describe_regions()['Regions'])
     assert enabled >= 17
     assert aws.count() == {'ec2:DescribeRegions': 1, 'ec2:DescribeInstances': enabled}
-    aws.provider.set_regions([AWAY])
+    aws.provider.search_in([AWAY])
     assert [m.id for m in aws.provider.find({})] == [there]
 
 
@@ -334,7 +335,7 @@ def test_a_region_that_is_closed_to_us_hides_no_other(aws, monkeypatch):
     aws.refuse('DescribeInstances', 'UnauthorizedOperation')
     found = [m.id for m in aws.provider.find({})]
     assert found in ([machine_id], [])  # it may be its own region that said no
-    aws.provider.set_regions([HOME])
+    aws.provider.search_in([HOME])
     aws.refuse('DescribeInstances', 'UnauthorizedOperation')
     with pytest.raises(AwsError, match='ec2:DescribeInstances'):
         list(aws.provider.find({}))
@@ -352,7 +353,7 @@ def test_eight_machines_at_once_are_eight(aws):
 # -- images -------------------------------------------------------------------------------------
 
 
-def test_an_image_is_baked_found_by_the_next_launch_and_goes_with_its_snapshots(aws):
+def test_image_is_baked_reused_and_deleted_with_snapshots(aws):
     spec, request = ask()
     machine_id = aws.provider.create(spec, request)
     first = aws.provider.bake(machine_id, 'planner', 'abcd')
@@ -363,7 +364,7 @@ def test_an_image_is_baked_found_by_the_next_launch_and_goes_with_its_snapshots(
     assert found[first].name == 'planner'
     assert found[first].dependencies == 'abcd'
     assert found[first].state == 'available'
-    assert found[first].place == HOME
+    assert found[first].region == HOME
     ours = {snapshot['SnapshotId'] for snapshot in ec2().describe_snapshots(
         OwnerIds=['self'])['Snapshots'] if 'fogros2-baked' in instances.tags_of(snapshot)} or {
             mapping['Ebs']['SnapshotId'] for image in ec2().describe_images(
@@ -392,7 +393,7 @@ def test_an_image_of_somebody_else_is_not_deleted(aws):
         aws.provider.delete_image('planner')
 
 
-def test_a_gpu_type_gets_the_image_with_the_driver_and_arm_its_own(aws):
+def test_gpu_and_arm_types_get_their_own_images(aws):
     parameters = {'g5.xlarge': images.DEEP_LEARNING['x86_64'],
                   'm6g.large': images.UBUNTU['arm64']}
     for number, (kind, parameter) in enumerate(parameters.items()):
@@ -409,7 +410,7 @@ def test_a_gpu_type_gets_the_image_with_the_driver_and_arm_its_own(aws):
     ({'ami_image': 'ami-00000000'}, 'an AMI belongs to one region'),
     ({'subnet': 'subnet-00000000'}, 'check subnet='),
 ])
-def test_what_does_not_exist_is_named_before_anything_is_made(aws, options, words):
+def test_missing_resource_is_named_before_creation(aws, options, words):
     with pytest.raises(ConfigurationError, match=re.escape(words)):
         aws.provider.create(*ask(**options))
     assert left() == NOTHING
@@ -490,7 +491,7 @@ def test_a_refusal_is_one_line_with_a_hint_and_leaves_nothing(aws, operation, co
     assert left() == NOTHING
 
 
-def test_what_could_not_be_told_apart_is_undone_as_far_as_it_goes(aws):
+def test_failed_undo_does_not_stop_the_other_undos(aws):
     aws.refuse('RunInstances', 'InvalidParameterValue')
     aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
     with pytest.raises(AwsError, match='as AWS said') as caught:
@@ -515,12 +516,12 @@ def test_an_instance_that_may_be_left_is_looked_for_again(aws):
     assert left() == NOTHING
 
 
-def test_what_is_left_in_a_region_without_room_is_said_when_the_machine_is_up(aws):
+def test_leftovers_of_a_full_region_are_reported(aws):
     aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
     aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
     machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
     machine = aws.provider.reachable(
-        machine_id, name='planner', timeout=20.0, cancel=threading.Event())
+        machine_id, name='planner', timeout=20.0)
     assert machine.note.startswith("the login key of 'planner' in eu-central-1 may be left")
 
 
@@ -563,8 +564,9 @@ THROTTLED = ['RequestLimitExceeded'] * 40
 def test_the_end_of_a_launch_gets_through_a_throttled_call(aws, pauses, operation):
     aws.refuse(operation, *THROTTLED)
     spec, request = ask()
+    aws.provider.cancel = pauses.cancel()
     with pytest.raises(Cancelled) as caught:
-        aws.provider.create(spec, dataclasses.replace(request, cancel=pauses.cancel()))
+        aws.provider.create(spec, request)
     assert not pauses.ended
     assert caught.value.refused and not caught.value.undo_failures
     assert left() == NOTHING
@@ -582,9 +584,9 @@ def test_the_end_of_a_launch_gets_through_a_throttled_call(aws, pauses, operatio
 def test_the_end_of_a_launch_gets_through_choices_and_looks(aws, pauses):
     machine_id = aws.provider.create(*ask())
     aws.refuse('DescribeInstances', *THROTTLED)
+    aws.provider.cancel = pauses.cancel()
     with pytest.raises(Cancelled):
-        aws.provider.reachable(
-            machine_id, name='planner', timeout=60.0, cancel=pauses.cancel())
+        aws.provider.reachable(machine_id, name='planner', timeout=60.0)
     aws.refuse('DescribeInstanceTypes', *THROTTLED)
     aws.provider.cancel = pauses.cancel()
     with pytest.raises(Cancelled):
@@ -599,7 +601,7 @@ def test_the_end_of_a_launch_gets_through_choices_and_looks(aws, pauses):
     assert left() == NOTHING
 
 
-def test_who_gives_up_looking_for_machines_waits_for_no_region(aws, pauses):
+def test_cancelled_search_waits_for_no_region(aws, pauses):
     aws.refuse('DescribeInstances', *THROTTLED)
     aws.provider.cancel = pauses.cancel()
     with pytest.raises(Cancelled):
@@ -607,7 +609,7 @@ def test_who_gives_up_looking_for_machines_waits_for_no_region(aws, pauses):
     assert not pauses.ended
 
 
-def test_an_instance_that_is_being_made_when_the_launch_ends_is_known(aws):
+def test_instance_in_creation_is_known_at_the_launchs_end(aws):
     """Its request was on its way; an answer that comes soon is the better one."""
     spec, request = ask()
     cancel = threading.Event()
@@ -618,14 +620,15 @@ def test_an_instance_that_is_being_made_when_the_launch_ends_is_known(aws):
 
     # after what looks whether the launch has ended
     aws.account.client('ec2', HOME).meta.events.register_last('before-send', sent)
-    machine_id = aws.provider.create(spec, dataclasses.replace(request, cancel=cancel))
+    aws.provider.cancel = cancel
+    machine_id = aws.provider.create(spec, request)
     assert left()['instances'] == [machine_id.split('/')[1]]
 
 
 # -- taken over ---------------------------------------------------------------------------------
 
 
-def test_a_kept_machine_lives_and_ends_as_the_launch_that_has_it_says(aws):
+def test_reused_machine_follows_the_settings_of_its_launch(aws):
     spec, request = ask(on_exit='stop')
     machine_id = aws.provider.create(spec, request)
     instance = machine_id.split('/')[1]
@@ -648,8 +651,8 @@ def test_a_kept_machine_lives_and_ends_as_the_launch_that_has_it_says(aws):
 def test_only_a_spot_machine_is_asked_for_its_notice(aws):
     plain = aws.provider.describe(aws.provider.create(*ask()))
     spot = aws.provider.describe(aws.provider.create(*ask('spot', spot=True)))
-    assert aws.provider.notice_for(plain) == ()
-    assert aws.provider.notice_for(spot) == AWSProvider.notice
+    assert not aws.provider.capabilities_of(plain).preemption_notice
+    assert aws.provider.capabilities_of(spot).preemption_notice
 
 
 def test_requests_that_aws_throttles_are_made_again(aws):
@@ -669,7 +672,7 @@ def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
     assert aws.count()['ec2:DeleteSecurityGroup'] == 3
 
 
-def test_a_machine_that_ends_before_ec2_knows_it_ends_all_the_same(aws):
+def test_machine_unknown_to_ec2_yet_is_deleted(aws):
     machine_id = aws.provider.create(*ask())
     aws.refuse('TerminateInstances', 'InvalidInstanceID.NotFound')
     aws.provider.destroy(machine_id)
@@ -701,7 +704,7 @@ def test_a_quota_leads_to_the_next_type_at_once(aws):
     assert aws.provider.describe(machine_id).kind == 't3.large'
 
 
-def test_a_type_to_go_on_with_keeps_to_the_cap_and_has_its_own_price(aws, monkeypatch):
+def test_next_type_keeps_to_the_price_cap(aws, monkeypatch):
     prices = {'t3.medium': Decimal('0.04'), 't3.xlarge': Decimal('0.17')}
     monkeypatch.setattr(aws.provider, '_price', lambda region, kind, *more: prices.get(kind))
     aws.refuse('RunInstances', 'VcpuLimitExceeded', 'VcpuLimitExceeded')
@@ -716,7 +719,7 @@ def test_a_type_to_go_on_with_keeps_to_the_cap_and_has_its_own_price(aws, monkey
     assert (found.kind, found.cost_per_hour) == ('t3.large', None)
 
 
-def test_no_room_in_a_region_leads_to_the_next_and_leaves_nothing_there(aws):
+def test_full_region_leads_to_the_next_and_keeps_nothing(aws):
     aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
     machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
     assert machine_id.startswith(f'aws:{AWAY}/')
@@ -734,7 +737,7 @@ def test_no_room_anywhere_is_the_error_and_nothing_is_left(aws):
 def test_a_launch_that_ends_meanwhile_tries_no_further_place(aws):
     spec, request = ask()
     cancel = threading.Event()
-    request = dataclasses.replace(request, cancel=cancel)
+    aws.provider.cancel = cancel
     cancel.set()
     with pytest.raises(Cancelled):
         aws.provider.create(spec, request)
@@ -749,7 +752,7 @@ def test_a_region_to_go_on_in_that_lacks_the_type_is_passed_over(aws):
     assert left(HOME) == left(AWAY) == NOTHING
 
 
-def test_of_several_types_those_that_a_region_lacks_are_passed_over(aws):
+def test_types_that_a_region_lacks_are_skipped(aws):
     machine_id = aws.provider.create(*ask(
         ec2_instance_type='t9.medium', instance_types=['t3.large', 't9.large']))
     assert aws.provider.describe(machine_id).kind == 't3.large'
@@ -784,7 +787,7 @@ def test_a_fault_of_aws_leaves_open_whether_there_is_a_machine(aws, monkeypatch)
 
 
 def test_the_nearest_region_has_neighbours_to_go_on_in(aws, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region', lambda among: HOME)
+    monkeypatch.setattr(AWSProvider, 'nearest', lambda self, among=(): HOME)
     spec, _ = ask(region='nearest')
     assert aws.provider.resolve(spec).options == {
         **spec.options, 'region': HOME, 'regions': ['eu-west-3', 'eu-west-2']}
@@ -794,8 +797,8 @@ def test_the_nearest_region_has_neighbours_to_go_on_in(aws, monkeypatch):
 
 def test_the_nearest_region_is_one_that_has_a_value(aws, monkeypatch):
     asked = []
-    monkeypatch.setattr('fogros2.provider.aws.choices.nearest_region',
-                        lambda among: asked.append(among) or HOME)
+    monkeypatch.setattr(AWSProvider, 'nearest',
+                        lambda self, among=(): asked.append(among) or HOME)
     images = {HOME: 'ami-1', 'eu-west-2': 'ami-2', AWAY: 'ami-3'}
     spec, _ = ask(region='nearest', ami_image=images)
     found = aws.provider.resolve(spec).options
@@ -832,9 +835,9 @@ def test_each_region_gets_its_own_image_and_type(aws):
 
 def test_all_providers_of_a_process_share_what_is_slow_to_make(monkeypatch):
     one, other = AWSProvider(), AWSProvider()
-    assert one._account.client('ec2', HOME) is other._account.client('ec2', HOME)
+    assert one._cloud._account.client('ec2', HOME) is other._cloud._account.client('ec2', HOME)
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'another')
-    assert AWSProvider()._account is not one._account
+    assert AWSProvider()._cloud._account is not one._cloud._account
 
 
 def test_the_same_request_is_the_same_to_the_byte(aws):
@@ -877,13 +880,13 @@ def test_a_machine_that_ends_while_it_comes_up_says_why(aws):
     machine_id = aws.provider.create(*ask())
     ec2().terminate_instances(InstanceIds=[machine_id.split('/')[1]])
     with pytest.raises(ProviderError, match='ended while it was coming up: Client.User'):
-        aws.provider.reachable(machine_id, name='planner', timeout=20, cancel=threading.Event())
+        aws.provider.reachable(machine_id, name='planner', timeout=20)
 
 
 # -- rights -------------------------------------------------------------------------------------
 
 
-def test_the_policy_has_every_call_and_every_action_of_it_is_used(aws):
+def test_policy_has_exactly_the_calls_that_are_made(aws):
     provider = aws.provider
     provider.answers()
     machine_id = provider.create(*ask(on_exit='stop'))
@@ -905,7 +908,7 @@ def test_the_policy_has_every_call_and_every_action_of_it_is_used(aws):
     provider.destroy(machine_id)
     aws.refuse('RunInstances', 'InsufficientInstanceCapacity')
     provider.destroy(provider.create(*ask()))
-    provider.set_regions(['all'])
+    provider.search_in(['all'])
     list(provider.find({}))
     aws.refuse('RunInstances', 'UnauthorizedOperation',
                said='Encoded authorization failure message: abc')

@@ -20,7 +20,7 @@ import uuid
 import pytest
 
 from fogros2 import process
-from fogros2.provider import container_root
+from fogros2.provider.container import root as container_root
 from fogros2.store import Store
 from rigs.bare_computer import bare_computer
 from rigs.launched import launching
@@ -130,34 +130,34 @@ def nothing_was_made(text):
 
 # -- what the launch file says ------------------------------------------------------------------
 
-def test_an_unknown_attribute(refused, cloud_network):
+def test_unknown_attribute_is_refused(refused, cloud_network):
     error, text = refused(container(cloud_network, lifetme='1h'))
     assert "ContainerInstance has no attribute 'lifetme'" in text
     assert "did you mean 'lifetime'?" in text
 
 
 @pytest.mark.parametrize('name', ['two words', '$(reboot)', '../../up', 'Ümlaut', 'x' * 41, ''])
-def test_a_name_that_is_none(refused, cloud_network, name):
+def test_invalid_name_is_refused(refused, cloud_network, name):
     error, text = refused(container(cloud_network, name=name))
     assert f'{name!r} is no name for a machine' in text
     assert 'such as slam-1' in text
 
 
-def test_an_unknown_package(refused, cloud_network):
+def test_unknown_package_is_refused(refused, cloud_network):
     error, text = refused(container(cloud_network), package='fogros2_exmples')
     assert "no package is called 'fogros2_exmples'" in error
     assert "did you mean 'fogros2_examples'?" in error
     assert nothing_was_made(text)
 
 
-def test_an_unknown_executable(refused, cloud_network):
+def test_unknown_executable_is_refused(refused, cloud_network):
     error, text = refused(container(cloud_network), executable='talkr')
     assert "package 'fogros2_examples' has no executable 'talkr'" in error
     assert "did you mean 'talker'?" in error
     assert nothing_was_made(text)
 
 
-def test_a_workspace_that_is_none(refused, cloud_network, tmp_path):
+def test_missing_workspace_is_refused(refused, cloud_network, tmp_path):
     error, text = refused(container(cloud_network, ros_workspace=str(tmp_path / 'nowhere')))
     assert f'{tmp_path}/nowhere is no folder' in error
     assert nothing_was_made(text)
@@ -168,7 +168,7 @@ def test_a_workspace_that_is_none(refused, cloud_network, tmp_path):
     assert nothing_was_made(text)
 
 
-def test_two_machines_of_one_name(refused, cloud_network, write):
+def test_two_machines_of_one_name_are_refused(refused, cloud_network, write):
     error, text = refused(
         f'{container(cloud_network)}\n'
         f'    other = {container(cloud_network, memory="2g")}\n'
@@ -179,7 +179,7 @@ def test_two_machines_of_one_name(refused, cloud_network, write):
     assert nothing_was_made(text)
 
 
-def test_a_computer_that_no_launch_switches_off(refused, computer):
+def test_ssh_computer_cannot_be_stopped(refused, computer):
     error, text = refused(ssh(computer, on_exit='stop'))
     assert f"'{NAME}' is a computer that exists already" in error and "'keep'" in error
     assert nothing_was_made(text)
@@ -188,13 +188,13 @@ def test_a_computer_that_no_launch_switches_off(refused, computer):
 # -- what the environment says ------------------------------------------------------------------
 
 @pytest.mark.parametrize('domain', ['300', 'seven'])
-def test_a_domain_that_does_not_exist(refused, cloud_network, domain):
+def test_invalid_domain_is_refused(refused, cloud_network, domain):
     error, text = refused(container(cloud_network), environment={'ROS_DOMAIN_ID': domain})
     assert 'ROS_DOMAIN_ID' in error and domain in error and 'use 0 to 101' in error
     assert nothing_was_made(text)
 
 
-def test_a_middleware_that_cannot_be_led(refused, cloud_network):
+def test_unknown_middleware_is_refused(refused, cloud_network):
     # set late: ROS 2 itself refuses one that isn't installed, before anything of ours runs
     error, text = refused(
         f'{container(cloud_network)}\n    import os\n'
@@ -218,7 +218,7 @@ needs_namespaces = pytest.mark.skipif(
 
 
 @needs_namespaces
-def test_no_tun(refused, cloud_network):
+def test_missing_tun_device_is_reported(refused, cloud_network):
     error, text = refused(container(cloud_network), wrap=without(
         '/dev/net', 'mount -t tmpfs none "$hidden"'))
     assert '/dev/net/tun is missing on this computer' in error and 'modprobe tun' in error
@@ -226,7 +226,7 @@ def test_no_tun(refused, cloud_network):
 
 
 @needs_namespaces
-def test_a_root_that_cannot_be_overlaid(refused, cloud_network):
+def test_root_without_overlay_is_reported(refused, cloud_network):
     # what decides is the file system on which the engine would keep the layers
     error, text = refused(container(cloud_network), wrap=without(
         '/var/lib/containers',
@@ -237,7 +237,7 @@ def test_a_root_that_cannot_be_overlaid(refused, cloud_network):
 
 
 @needs_namespaces
-def test_no_root_and_no_sudo(write, cloud_network):
+def test_missing_root_is_reported(write, cloud_network):
     # nobody has no home and no password, and may not use sudo
     nobody = ['setpriv', '--reuid=nobody', '--regid=nogroup', '--clear-groups']
     if subprocess.run([*nobody, 'ros2', '--help'], capture_output=True).returncode:
@@ -256,7 +256,7 @@ def test_no_root_and_no_sudo(write, cloud_network):
 
 @pytest.mark.parametrize('program', ['wg', 'rsync'])
 @needs_namespaces
-def test_a_missing_program(refused, cloud_network, program):
+def test_missing_program_is_reported(refused, cloud_network, program):
     error, text = refused(container(cloud_network), wrap=without(
         f'$(readlink -f $(command -v {program}))'))
     assert f'{program} not found on this computer' in error and 'apt-get install' in error
@@ -265,30 +265,30 @@ def test_a_missing_program(refused, cloud_network, program):
 
 # -- computers that exist already ---------------------------------------------------------------
 
-def test_an_unreachable_host(refused, computer, nobody):
+def test_unreachable_host_is_reported(refused, computer, nobody):
     error, text = refused(ssh(computer, host=nobody))
     assert f'{nobody} port 22 does not answer' in error and 'is it on' in error
 
 
-def test_a_host_that_nobody_knows(refused, computer):
+def test_unknown_host_name_is_reported(refused, computer):
     error, _ = refused(ssh(computer, host='planner.invalid'))
     assert "there is no host called 'planner.invalid'" in error and 'check host=' in error
 
 
 @pytest.mark.parametrize('host', ['', 'two words', 'planner..local', 'x' * 300, '-oPort=1'])
-def test_a_host_that_is_none(refused, computer, host):
+def test_invalid_host_is_refused(refused, computer, host):
     error, text = refused(ssh(computer, host=host))
     assert f"'{host}' can't be the host of an SSH machine" in error
     assert 'host= takes a name or an address' in error
     assert nothing_was_made(text)
 
 
-def test_a_port_without_an_ssh_server(refused, computer):
+def test_port_without_an_ssh_server_is_reported(refused, computer):
     error, _ = refused(ssh(computer, port=2222))
     assert 'refuses connections to port 2222' in error and 'does its SSH server run' in error
 
 
-def test_another_host_key(refused, computer):
+def test_changed_host_key_is_refused(refused, computer):
     other = (computer.key.parent / 'id.pub').read_text().split()[:2]
     error, text = refused(ssh(computer, host_key=' '.join(other)))
     assert 'another host key than the pinned one' in error
@@ -296,14 +296,14 @@ def test_another_host_key(refused, computer):
     assert f'{NAME}: guard' not in text
 
 
-def test_an_unknown_host_key(refused, computer):
+def test_unknown_host_key_is_refused(refused, computer):
     error, text = refused(ssh(computer, host_key=None))
     assert f"the host key of '{NAME}' ({computer.address}) is unknown" in error
     assert f'known_hosts: {computer.address} {computer.host_key}' in error
     assert f'{NAME}: guard' not in text
 
 
-def test_a_refused_key(refused, computer, tmp_path):
+def test_refused_login_key_is_reported(refused, computer, tmp_path):
     key = tmp_path / 'other'
     subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(key)], check=True)
     error, _ = refused(ssh(computer, key=str(key)))
@@ -312,7 +312,7 @@ def test_a_refused_key(refused, computer, tmp_path):
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_a_computer_that_is_the_robot(refused, root_at_login, tmp_path):
+def test_robot_is_refused_as_its_own_machine(refused, root_at_login, tmp_path):
     """Its two ends of the VPN would be in one network, where nothing goes through a VPN."""
     with private_sshd(tmp_path / 'sshd') as server:
         error, text = refused(
@@ -322,7 +322,7 @@ def test_a_computer_that_is_the_robot(refused, root_at_login, tmp_path):
     assert f'--machine {NAME}=robot' in error
 
 
-def test_a_computer_without_rsync(refused, computer):
+def test_missing_rsync_is_reported(refused, computer):
     # not by apt-get either: there is no way out of here
     computer.run('mv /usr/bin/rsync /usr/bin/rsync.away; mv /usr/bin/apt-get /usr/bin/apt.away')
     try:
@@ -334,7 +334,7 @@ def test_a_computer_without_rsync(refused, computer):
     assert 'apt-get install rsync' in error
 
 
-def test_a_full_disk_where_the_workspace_goes(refused, computer, small):
+def test_full_disk_is_reported(refused, computer, small):
     prefix = small / 'install' / 'large'
     index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
     index.mkdir(parents=True)
@@ -348,7 +348,7 @@ def test_a_full_disk_where_the_workspace_goes(refused, computer, small):
 
 
 @pytest.mark.skipif(not embedded(), reason='this robot has ROS 2, and no embedded default to send')
-def test_a_home_too_small_for_what_is_missing(refused, cloud_network, tmp_path):
+def test_small_home_is_reported(refused, cloud_network, tmp_path):
     with bare_computer(f'fogt-small-{NAME}', tmp_path / 'computer', cloud_network,
                        options=['--tmpfs', '/home/fog:size=1m,mode=1777']) as computer:
         # what is to be sent may have to be made first
@@ -370,13 +370,13 @@ def occupied(computer, port):
         computer.run('kill $(cat /tmp/pid)')
 
 
-def test_a_busy_heartbeat_port(refused, computer):
+def test_busy_heartbeat_port_is_reported(refused, computer):
     with occupied(computer, 7399):
         error, _ = refused(ssh(computer))
     assert 'UDP port 7399' in error and 'in use already' in error and 'ss -lunp' in error
 
 
-def test_a_busy_vpn_port(refused, computer):
+def test_busy_vpn_port_is_reported(refused, computer):
     with occupied(computer, 51999):
         error, _ = refused(
             f'{ssh(computer)}\n    plan.machine_port = lambda launch_id: 51999')
@@ -385,8 +385,8 @@ def test_a_busy_vpn_port(refused, computer):
 
 # -- what is there already ----------------------------------------------------------------------
 
-def test_a_damaged_record(refused, cloud_network):
-    folder = Store().machine(NAME).path
+def test_damaged_record_is_reported(refused, cloud_network):
+    folder = Store().machine(NAME)
     folder.mkdir(parents=True)
     (folder / 'record.json').write_text('{"name": ')
     try:
@@ -401,7 +401,7 @@ def test_a_damaged_record(refused, cloud_network):
             shutil.rmtree(folder)
 
 
-def test_a_name_that_another_launch_has(refused, cloud_network, write):
+def test_name_of_another_launch_is_refused(refused, cloud_network, write):
     with launching() as start:
         first = start(str(write(container(cloud_network))))
         first.wait_for('process started')
@@ -413,7 +413,7 @@ def test_a_name_that_another_launch_has(refused, cloud_network, write):
         assert first.ended() == 0, first.text
 
 
-def test_a_name_that_a_stranger_has(refused, cloud_network, tmp_path):
+def test_name_of_a_foreign_container_is_refused(refused, cloud_network, tmp_path):
     """Somebody else's container is in the way: neither taken over nor removed."""
     with bare_computer(f'fogros2-{NAME}', tmp_path / 'computer', cloud_network) as stranger:
         error, _ = refused(container(cloud_network))

@@ -11,18 +11,20 @@ import sys
 
 import pytest
 
-from fogros2 import bootstrap, host, process, wheels
-from fogros2.host import HostFacts, Python
+from fogros2 import process
+from fogros2.host import bootstrap, wheels
+from fogros2.host import inspection as host
+from fogros2.host.inspection import HostFacts, Python
+from fogros2.host.wheels import Wheels
 from fogros2.model import MachineSpec
 from fogros2.plan import Underlay
-from fogros2.wheels import Wheels
 
 TOOLS = frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 ROS = HostFacts(
-    system='ubuntu', release='24.04', codename='noble', architecture='x86_64', uid=1000,
+    system='ubuntu', release='24.04', architecture='x86_64', uid=1000,
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,
     pythons=(Python('/usr/bin/python3', (3, 12), True),), programs=TOOLS | {'colcon', 'rosdep'},
-    tun=True, free_bytes=50 << 30, ros={'jazzy': '/opt/ros/jazzy'},
+    free_bytes=50 << 30, ros={'jazzy': '/opt/ros/jazzy'},
     rmw={'jazzy': ('rmw_cyclonedds_cpp',)})
 UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
     'PATH': '/robot/.venv/bin:/usr/bin', 'AMENT_PREFIX_PATH': '/robot/.venv',

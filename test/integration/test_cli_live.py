@@ -66,7 +66,7 @@ def launched(
             child.wait(60)
 
 
-def test_beside_a_running_launch(
+def test_verbs_work_beside_a_running_launch(
     launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
 ) -> None:
     name, child, said = launched
@@ -125,7 +125,7 @@ def test_logs_follow_until_interrupted(
     assert len(enough.stdout.splitlines()) == 2 and enough.stderr == ''
 
 
-def test_another_terminal_joins(
+def test_another_terminal_joins_the_launch(
     launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
 ) -> None:
     name, _, _ = launched
@@ -139,7 +139,7 @@ def test_another_terminal_joins(
     assert f'Hello World from {name}' in heard.stdout + heard.stderr
 
 
-def test_after_a_launch_that_was_killed(
+def test_verbs_clean_up_after_a_killed_launch(
     launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
 ) -> None:
     name, child, _ = launched
@@ -150,10 +150,10 @@ def test_after_a_launch_that_was_killed(
     would = json.loads(fog('gc', '--dry-run', '--json').stdout)
     assert [w['reason'] for w in would if w['name'] == name] == ['its launch is gone']
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
-    assert not Store().machine(name).path.exists()
+    assert not Store().machine(name).exists()
 
 
-def test_gc_after_a_launch_that_was_killed_without_a_store(
+def test_gc_works_without_the_store_of_a_killed_launch(
     launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -171,7 +171,7 @@ def test_gc_after_a_launch_that_was_killed_without_a_store(
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_an_ssh_machine_whose_agent_left_is_deleted_at_once(
+def test_ssh_machine_without_an_agent_is_deleted_at_once(
     tmp_path: Path, root_at_login: None,
 ) -> None:
     """Its agent took its program along; what tried to run that took six seconds to give up."""
@@ -183,12 +183,12 @@ def test_an_ssh_machine_whose_agent_left_is_deleted_at_once(
         machine_id = SSHProvider().create(spec, CreateRequest('token', '', {}, 51820))
         gone, took = tmp_path / 'agent', []
         for program in ('', str(gone / 'agent.py')):
-            Store().machine('lab').save(Record(
+            Store().save(Record(
                 'lab', 'ssh', spec, machine_id=machine_id, created=time.time(), launch='abc123',
                 shell=endpoint, agent=program and str(gone), agent_program=program))
             begin = time.monotonic()
             assert 'deleted lab' in fog('delete', 'lab', '--yes').stdout
             took.append(time.monotonic() - begin)
-            assert not Store().machine('lab').exists()
+            assert not Store().exists('lab')
         # beside one that never had an agent
         assert took[1] - took[0] < 5.0

@@ -28,8 +28,9 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import container_machine, container_root
 from fogros2.provider.container import ContainerProvider
+from fogros2.provider.container import machine as container_machine
+from fogros2.provider.container import root as container_root
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ProviderContract
 from fogros2.waiting import wait_until
@@ -175,7 +176,7 @@ def test_nothing_of_this_computer_s_own_is_seen(cloud, tmp_path):
         assert os.uname().nodename not in said(shell, 'cat', '/etc/hosts').split()
 
 
-def test_system_folders_can_be_written_there_and_stay_as_they_are_here(cloud):
+def test_machine_writes_do_not_change_system_folders_here(cloud):
     mark = f'/usr/local/bin/fogros2-{uuid.uuid4().hex}'
     with cloud.machine() as (_, shell):
         said(shell, 'touch', mark, '/etc/fogros2-mark', sudo=True)
@@ -297,7 +298,7 @@ def test_a_machine_made_to_be_deleted_isn_t_stopped(cloud):
     assert cloud.provider.describe(machine_id).state is MachineState.RUNNING
 
 
-def test_what_can_t_be_created_leaves_nothing(cloud):
+def test_failed_creation_leaves_nothing(cloud):
     with pytest.raises(ProviderError, match='no-such-network'):
         cloud.create(cloud.spec(options={'network': 'no-such-network'}))
     with pytest.raises(ConfigurationError):
@@ -356,7 +357,8 @@ def test_a_launch_killed_while_it_creates_leaves_all_or_nothing(cloud, cloud_net
 
 def agent_config(*, robot_timeout, boot_timeout):
     return {
-        'machine': 'm', 'launch': 'abc', 'directory': ContainerProvider.agent_directory,
+        'machine': 'm', 'launch': 'abc',
+        'directory': ContainerProvider.capabilities.agent_directory,
         'on_exit': 'delete', 'lifetime': 600, 'robot_timeout': robot_timeout,
         'boot_timeout': boot_timeout, 'end_command': []}
 
@@ -438,7 +440,7 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
         assert said(shell, 'cat', 'file') == 'kept'
 
 
-def test_an_image_that_lacks_too_much_says_so(image, cloud):
+def test_incomplete_image_is_reported(image, cloud):
     mounts = [path for path in ('/usr/lib', '/usr/lib64', '/usr/lib32') if os.path.isdir(path)]
     machine_id = cloud.create(cloud.spec(on_exit='stop', options={
         'image': image, 'mounts': [f"{os.path.realpath('/bin/sh')}:/bin/sh", *mounts]}))
@@ -454,7 +456,7 @@ def test_an_image_that_lacks_too_much_says_so(image, cloud):
         lambda: fails() or None, timeout=20.0, what='the machine to complain')
 
 
-def test_a_full_disk_of_a_machine_is_said_to_be_full(cloud, tmp_path):
+def test_full_disk_of_a_machine_is_named(cloud, tmp_path):
     source = tmp_path / 'source'
     source.mkdir()
     with open(source / 'big', 'wb') as file:

@@ -18,13 +18,15 @@ import subprocess
 
 import pytest
 
-from fogros2 import container_scripts, containers, plan
-from fogros2.containers import Container
+from fogros2 import plan
 from fogros2.errors import CommandError, ConfigurationError, DdsError
+from fogros2.host import container_scripts, containers
+from fogros2.host.containers import Container
 from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
 from fogros2.process import run, which
-from fogros2.provider import container_engine, container_root
 from fogros2.provider.container import ContainerProvider
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.launched import launching, ros2
 
@@ -172,7 +174,7 @@ def test_what_nobody_follows_any_more_is_removed(image, launch, tmp_path):
     follower.stdout.close()
 
 
-def test_an_image_that_is_not_there_is_told(engine, launch):
+def test_missing_image_is_reported(engine, launch):
     with pytest.raises(CommandError, match='no/such'):
         at_machine(containers.fetch('oci-archive:/no/such'))
 
@@ -232,7 +234,7 @@ def test_container_with_own_network_is_left_alone(image, launch, tmp_path, optio
 
 # --- nodes in images -----------------------------------------------------------------------------
 
-def test_a_node_in_an_image_has_the_machine_s_variables_files_and_user(image, launch, tmp_path):
+def test_node_in_an_image_has_variables_files_and_user(image, launch, tmp_path):
     process = node(
         image, launch, tmp_path, 'sh', '-c',
         'echo $RMW_IMPLEMENTATION "$COLOUR" $HOME ${SECRET-none}; '
@@ -350,7 +352,6 @@ LINES = {
 }
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.usefixtures('nothing_left')
 @pytest.mark.skipif(which('ros2') is None, reason='needs ros2 on PATH')
 @pytest.mark.parametrize(('rmw', 'names'), [
@@ -385,7 +386,6 @@ def volumes() -> set[str]:
     return set(listed.split())
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.usefixtures('nothing_left')
 @pytest.mark.skipif(which('ros2') is None, reason='needs ros2 on PATH')
 def test_a_container_machine_runs_containers_and_nodes_in_images(

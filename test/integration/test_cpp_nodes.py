@@ -13,8 +13,9 @@ import uuid
 
 import pytest
 
-from fogros2 import process, workspace
-from fogros2.host import HostFacts
+from fogros2 import process
+from fogros2.host import workspace
+from fogros2.host.inspection import HostFacts
 from rigs.launched import launching
 
 pytestmark = [

@@ -102,7 +102,7 @@ def name(engine: str, nothing_left: None) -> Iterator[str]:
     """Return a machine's name; one that is left under it is ended."""
     made = f'dash-{secrets.token_hex(2)}'
     yield made
-    if Store().machine(made).exists():
+    if Store().exists(made):
         ros2('fog', 'delete', made, '--yes', '--force')
 
 
@@ -110,7 +110,7 @@ def article(name: str) -> str:
     return f'document.querySelector(\'article[data-key="{name}"]\')'
 
 
-def test_nothing_goes_on(dashboard: Dashboard, browser: Browser) -> None:
+def test_quiet_dashboard_shows_no_machines(dashboard: Dashboard, browser: Browser) -> None:
     browser.open(dashboard.url)
     browser.until('document.getElementById("link").textContent === "live"')
     def paint() -> float:
@@ -142,7 +142,7 @@ def test_nothing_goes_on(dashboard: Dashboard, browser: Browser) -> None:
     assert all(url.startswith(('http://127.0.0.1:', 'data:')) for url in browser.requested)
 
 
-def test_a_launch_from_its_begin_to_its_end(
+def test_dashboard_shows_a_launch_until_its_end(
     dashboard: Dashboard, browser: Browser, tmp_path: Path, name: str,
     watched: Callable[[str], Path],
 ) -> None:

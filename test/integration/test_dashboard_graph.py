@@ -105,7 +105,7 @@ def near(found: list[int], bgr: tuple[int, int, int]) -> bool:
     return all(abs(one - other) < 25 for one, other in zip(found, bgr))
 
 
-def test_pictures_of_streams_here_there_and_between(robot: Robot, graph: Graph) -> None:
+def test_dashboard_has_pictures_of_all_streams(robot: Robot, graph: Graph) -> None:
     red, blue = (40, 30, 220), (220, 60, 30)
     # from the robot to a machine, where one listens; and from one machine to another
     robot.publish('/camera', red)
@@ -119,7 +119,7 @@ def test_pictures_of_streams_here_there_and_between(robot: Robot, graph: Graph) 
     for topic in ('/fogros2/one/camera', '/fogros2/two/map'):
         robot.listen(topic)
     robot.thread.start()
-    graph.know({'one': (), 'two': ()})
+    graph.know({'one': (), 'two': ()}, pictures=True)
     wait_until(lambda: len(robot.heard) == 2, timeout=30.0, what='streams that flow')
     wait_until(lambda: {'/camera', '/map'} <= graph.pictures.keys(), timeout=20.0,
                what='a picture of each')

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import contextlib
 import threading
 import time
 from typing import Any, Optional
@@ -18,6 +19,7 @@ from fogros2.errors import NameTaken
 from fogros2.waiting import wait_until
 from fogros2_monitor.dashboard.server import Dashboard
 from rigs.browser import Browser, program
+from ros2fog_cli.api.browser import Ticket
 
 pytestmark = [
     pytest.mark.timeout(90),
@@ -108,7 +110,7 @@ def page(story: Story, browser: Browser) -> Iterator[Browser]:
     dashboard.close()
 
 
-def test_what_a_machine_has(story: Story, page: Browser) -> None:
+def test_card_shows_the_data_of_a_machine(story: Story, page: Browser) -> None:
     page.until('!document.getElementById("empty").hidden')
     assert 'No machine in the cloud' in page.text()
     story.tell(
@@ -154,7 +156,7 @@ def test_what_a_machine_has(story: Story, page: Browser) -> None:
     assert page.complaints == []
 
 
-def test_nothing_that_is_told_is_markup(story: Story, page: Browser) -> None:
+def test_data_never_become_markup(story: Story, page: Browser) -> None:
     story.line = BAD
     told = machine(
         BAD, provider=BAD, id=BAD, state=f'{BAD} (x)', launch=BAD, address=BAD, place=BAD,
@@ -180,7 +182,7 @@ def test_nothing_that_is_told_is_markup(story: Story, page: Browser) -> None:
     assert page.complaints == []
 
 
-def test_who_deletes_is_asked_and_told(story: Story, page: Browser) -> None:
+def test_deletion_asks_and_shows_its_result(story: Story, page: Browser) -> None:
     story.tell(machines=[machine('planner', launch_alive=False, launch_pid=0)])
     page.until('!!document.querySelector("article")')
     page.ask('document.querySelector("button.delete").focus()')
@@ -209,7 +211,7 @@ def test_who_deletes_is_asked_and_told(story: Story, page: Browser) -> None:
     page.complaints.clear()  # the browser counts the refusal as one
 
 
-def test_two_machines_of_one_name_are_two_cards(story: Story, page: Browser) -> None:
+def test_machines_of_one_name_have_separate_cards(story: Story, page: Browser) -> None:
     other = {'key': 'planner i-2', 'id': 'i-2', 'launch_alive': False}
     story.tell(machines=[machine('planner'), machine('planner', **other)])
     page.until('[...document.querySelectorAll("article h3")].map(e => e.textContent).join() '
@@ -225,7 +227,7 @@ def test_two_machines_of_one_name_are_two_cards(story: Story, page: Browser) -> 
     page.complaints.clear()  # the browser counts the refusal as one
 
 
-def test_what_the_reader_does_survives_news(story: Story, page: Browser) -> None:
+def test_selection_survives_an_update(story: Story, page: Browser) -> None:
     story.tell(machines=[machine('planner'), machine('mapper')])
     page.until('document.querySelectorAll("article details[open]").length === 2')
     page.until('document.querySelectorAll("option[value=slam-1]").length === 2')
@@ -241,7 +243,7 @@ def test_what_the_reader_does_survives_news(story: Story, page: Browser) -> None
     assert page.ask('document.activeElement.getAttribute("aria-label")') == 'Delete mapper'
 
 
-def test_light_dark_and_narrow(story: Story, page: Browser) -> None:
+def test_page_fits_dark_mode_and_narrow_screens(story: Story, page: Browser) -> None:
     story.tell(machines=[machine('planner')])
     page.until('!!document.querySelector("article")')
     grounds = []
@@ -256,12 +258,13 @@ def test_light_dark_and_narrow(story: Story, page: Browser) -> None:
     page.size(1300, 900)
 
 
-def test_a_dashboard_that_ends_and_another_at_its_place(story: Story, browser: Browser) -> None:
+def test_page_survives_a_reload_and_needs_its_own_token(story: Story, browser: Browser) -> None:
     dashboard = Dashboard(story)
     thread = threading.Thread(target=dashboard.serve, daemon=True)
     thread.start()
-    browser.open(dashboard.url_with_ticket())
-    browser.until('document.getElementById("link").textContent === "live"')
+    with contextlib.closing(Ticket(dashboard.url)) as ticket:
+        browser.open(ticket.url)
+        browser.until('document.getElementById("link").textContent === "live"')
     browser.reload()  # the ticket is used, the token kept
     browser.until('document.getElementById("link").textContent === "live"')
     # nobody but the page may ask, not even from the same browser

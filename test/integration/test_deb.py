@@ -25,7 +25,7 @@ import pytest
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, Result
 from fogros2.process import run, which
-from fogros2.provider import debian_root
+from fogros2.provider.container import debian_root
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'
@@ -306,7 +306,7 @@ def test_nodes_can_be_run(installed: System) -> None:
 
 def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
     names = installed.python(
-        'from pathlib import Path; import zipfile; from fogros2 import wheels\n'
+        'from pathlib import Path; import zipfile; from fogros2.host import wheels\n'
         'found = wheels.collect(Path("/tmp/wheels"))\n'
         'archive = zipfile.ZipFile(Path(found.folder, found.fogros2))\n'
         'print(*archive.namelist(), sep="\\n")').splitlines()
@@ -317,7 +317,7 @@ def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
             f'{data}/share/fogros2_examples/launch/talker.container.launch.py'} <= set(names)
 
 
-def test_who_is_in_a_group_may_make_vpn_interfaces(installed: System) -> None:
+def test_group_member_may_create_vpn_interfaces(installed: System) -> None:
     helper = '/usr/libexec/fogros2/vpn'
     assert 'fogros2:' in installed.run('getent', 'group', 'fogros2').stdout
     assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '1\n'

@@ -20,12 +20,12 @@ import zipfile
 
 import pytest
 
-from fogros2.bootstrap import apt_install
 from fogros2.deploy import Launch
 from fogros2.errors import CommandError
+from fogros2.host.bootstrap import apt_install
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.provider import debian_root
+from fogros2.provider.container import debian_root
 from fogros2.report import StepDone
 from fogros2.waiting import wait_until
 from rigs.cluster.images import RootShell

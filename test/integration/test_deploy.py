@@ -22,7 +22,7 @@ from fogros2.deploy import Launch
 from fogros2.errors import FogError, NameTaken, WorkspaceError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.provider import container_entry
+from fogros2.provider.container import entry as container_entry
 from fogros2.report import ClockMeasured, StepDone, StepFailed, StepStarted
 from fogros2.store import Store
 from fogros2.waiting import wait_until
@@ -115,7 +115,7 @@ def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
 def test_machine_with_a_slow_clock_is_warned_of_and_shown(
     spec, slow_agent, monkeypatch, capsys,
 ):
-    monkeypatch.setattr(container_entry, 'agent_file', lambda: slow_agent)
+    monkeypatch.setattr(container_entry, 'joined', slow_agent.read_text)
     events = []
     launch = Launch(report=events.append)
     name = spec().name
@@ -167,20 +167,20 @@ def test_a_cancel_in_any_step_leaves_nothing(spec, step):
 def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
     events = []
     launch = Launch(report=events.append)
-    machine = launch.up(spec())
-    undo = machine._launch.robot_vpn()._take_down
+    launch.up(spec())
+    undo = launch.robot_vpn()._take_down
 
     def failing():
         undo()
         raise Injected('the undo failed')
 
-    launch.undo.callback(launch.attempt, '', 'VPN interface', failing)
+    launch.undo.add('VPN interface', failing)
     failures = launch.down()
     assert [str(failure) for failure in failures] == ['the undo failed']
     assert any(isinstance(e, StepFailed) and e.reason == 'the undo failed' for e in events)
 
 
-def test_several_machines_come_up_in_parallel_and_reach_each_other(spec):
+def test_machines_come_up_in_parallel_and_reach_each_other(spec):
     launch = Launch()
     names = ['one', 'two', 'three']
     launch.expect(f'{name}-{RUN}' for name in names)
@@ -274,7 +274,7 @@ def wireguard_of(interface):
     return found
 
 
-def test_an_unknown_executable_is_found_before_anything_is_created(spec):
+def test_unknown_executable_is_reported_before_creation(spec):
     launch = Launch()
     with pytest.raises(WorkspaceError, match="did you mean 'talker'"):
         launch.prepare([spec()], {spec().name: [('fogros2_examples', 'talkr')]})

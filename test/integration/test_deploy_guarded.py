@@ -9,7 +9,6 @@ import ipaddress
 import json
 import shutil
 import socket
-import threading
 import time
 import uuid
 
@@ -19,8 +18,8 @@ from fogros2.deploy import Launch
 from fogros2.deploy import launch as launches
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.provider import container_machine
 from fogros2.provider.container import ContainerProvider
+from fogros2.provider.container import machine as container_machine
 from fogros2.report import StepDone
 from fogros2.store import Store
 from fogros2.waiting import wait_until
@@ -51,9 +50,9 @@ table inet cloud {
 class CloudLike(ContainerProvider):
     """Containers as a cloud has them: behind a firewall, and with host keys from outside."""
 
-    firewall = True
-    one_time_host_key = True
-    notice = ('cat', '/run/notice')
+    capabilities = dataclasses.replace(
+        ContainerProvider.capabilities, firewall=True, one_time_host_key=True,
+        preemption_notice=('cat', '/run/notice'))
     robot = ''
 
     def __init__(self):
@@ -107,7 +106,7 @@ def server_address(machine):
     return words[2]
 
 
-def test_a_machine_behind_a_firewall_is_reached_through_the_vpn_alone(cloud, spec):
+def test_firewalled_machine_is_reached_only_through_the_vpn(cloud, spec):
     store = Store()
     first = Launch(store=store)
     kept = spec(on_exit='keep')
@@ -124,7 +123,7 @@ def test_a_machine_behind_a_firewall_is_reached_through_the_vpn_alone(cloud, spe
     try:
         machine = first.up(kept)
         outside = machine.machine.shell.host
-        key = store.machine(kept.name).load().host_key
+        key = store.load(kept.name).host_key
         assert key and key not in handed_over
         assert cloud.pinned == {machine.machine.id: key}
         assert cloud.asked == [(22, [])]
@@ -146,7 +145,7 @@ def test_a_machine_behind_a_firewall_is_reached_through_the_vpn_alone(cloud, spe
     try:
         again = second.up(spec())
         assert again.machine.id == machine.machine.id
-        assert store.machine(kept.name).load().host_key == key
+        assert store.load(kept.name).host_key == key
         assert cloud.asked == [(22, [cloud.robot]), (22, [])]
         assert server_address(again) == again.vpn_address
     finally:
@@ -154,17 +153,17 @@ def test_a_machine_behind_a_firewall_is_reached_through_the_vpn_alone(cloud, spe
 
 
 def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypatch):
-    monkeypatch.setattr('fogros2.deploy.entering.ADDRESS_INTERVAL', 0.5)
+    monkeypatch.setattr('fogros2.deploy.steps.connecting.POLL_INTERVAL', 0.5)
     create = cloud.create
 
     def shut(spec, request):
         machine_id = create(spec, request)
-        cloud.reachable(machine_id, name=spec.name, timeout=30, cancel=threading.Event())
+        cloud.reachable(machine_id, name=spec.name, timeout=30)
         cloud.allow(machine_id, 22, ['192.0.2.7/32'])
         return machine_id
 
     monkeypatch.setattr(cloud, 'create', shut)
-    monkeypatch.setattr('fogros2.deploy.entering.LOGIN_ATTEMPT', 1.0)
+    monkeypatch.setattr('fogros2.deploy.steps.connecting.LOGIN_TIMEOUT', 1.0)
     launch = Launch()
     try:
         launch.up(spec())
@@ -173,9 +172,9 @@ def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypa
     assert cloud.asked == [(22, ['192.0.2.7/32']), (22, [cloud.robot]), (22, [])]
 
 
-def test_what_takes_a_machine_away_is_told(cloud, spec, monkeypatch):
-    monkeypatch.setattr('fogros2.deploy.guarding.NOTICE_INTERVAL', 0.5)
-    monkeypatch.setattr('fogros2.deploy.watching.SILENCE', 2.5)
+def test_end_of_a_machine_is_reported(cloud, spec, monkeypatch):
+    monkeypatch.setattr('fogros2.deploy.steps.arming.NOTICE_POLL_INTERVAL', 0.5)
+    monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
     launch = Launch()
     heard = []
     try:
@@ -201,20 +200,19 @@ def test_what_takes_a_machine_away_is_told(cloud, spec, monkeypatch):
 
 def hide(cloud, monkeypatch, robots):
     """Make machines those that nobody dials; they dial the robot at the last of ``robots``."""
-    for name in ('firewall', 'one_time_host_key', 'notice'):
-        monkeypatch.setattr(CloudLike, name, getattr(ContainerProvider, name))
+    monkeypatch.setattr(CloudLike, 'capabilities', ContainerProvider.capabilities)
     describe = cloud.describe
 
     def hidden(machine_id):
         machine = describe(machine_id)
         return dataclasses.replace(
-            machine, vpn_host='', robot_host=robots[-1], inner_network='pods',
-            inner_host=machine.vpn_host)
+            machine, vpn_host='', robot_host=robots[-1], private_network='pods',
+            private_ip=machine.vpn_host)
 
     monkeypatch.setattr(cloud, 'describe', hidden)
 
 
-def test_machines_that_nobody_can_dial_dial_the_robot_and_each_other(
+def test_unreachable_machines_dial_the_robot_and_each_other(
         cloud, spec, monkeypatch):
     robot = cloud.robot.partition('/')[0]
     hide(cloud, monkeypatch, [robot])
@@ -255,7 +253,7 @@ table inet moved {
 
 def test_a_machine_that_dials_a_robot_that_moves_dials_it_there(
         cloud, spec, monkeypatch, cloud_network):
-    monkeypatch.setattr('fogros2.deploy.watching.SILENCE', 2.5)
+    monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
     robots = [cloud.robot.partition('/')[0]]
     hide(cloud, monkeypatch, robots)
     network = json.loads(run(Command(

@@ -42,7 +42,7 @@ def test_the_next_launch_takes_the_kept_machine_of_a_killed_one(cloud_network):
     first.send_signal(signal.SIGKILL)
     first.communicate()
     store = Store()
-    before = store.machine(name).load()
+    before = store.load(name)
     assert interface and before.launch and not before.launch_alive
     launch = Launch(store=store)
     try:

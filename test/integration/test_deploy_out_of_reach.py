@@ -15,11 +15,11 @@ import pytest
 
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch
-from fogros2.deploy.guarding import Guard
-from fogros2.deploy.job import Job
+from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.steps.arming import Arming
 from fogros2.errors import AgentError, FogError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import container_machine
+from fogros2.provider.container import machine as container_machine
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 
@@ -40,7 +40,7 @@ table inet cut {
 """
 
 
-def test_the_end_does_not_wait_for_a_machine_that_is_out_of_reach(cloud_network):
+def test_end_does_not_wait_for_an_unreachable_machine(cloud_network):
     store = Store()
     spec = MachineSpec(f'away-{RUN}', 'container', {'network': cloud_network}, on_exit='keep')
     launch = Launch(store=store)
@@ -68,12 +68,14 @@ def test_the_end_does_not_wait_for_a_machine_that_is_out_of_reach(cloud_network)
     assert f'ros2 fog delete {spec.name}' in told.hint
 
 
-def arm(start, machine, job):
+def arm(start, machine, robot):
     """Return the machine's agent, or why it isn't to be had."""
-    shell = LocalShell(Endpoint('local'), name=job.name)
+    context, job = robot
+    job.machine, job.shell = machine, LocalShell(Endpoint('local'), name=job.name)
     start.wait(10)
     try:
-        return Guard(job).arm(machine, shell)
+        Arming(context, job).arm()
+        return job.agent
     except FogError as error:
         job.undo.close()
         return error
@@ -86,8 +88,10 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
     machine = Machine('ssh:', name, 'ssh', MachineState.RUNNING, owned=False,
                       shell=Endpoint('local', user='root'))
     for attempt in range(3):
-        robots = [Job(Launch(store=Store(tmp_path / f'{attempt}-{number}')),
-                      MachineSpec(name, 'ssh', {'host': 'localhost'})) for number in range(2)]
+        spec = MachineSpec(name, 'ssh', {'host': 'localhost'})
+        contexts = [Launch(store=Store(tmp_path / f'{attempt}-{number}')).context(spec)
+                    for number in range(2)]
+        robots = [(context, MachineJob(context, spec)) for context in contexts]
         won: dict[int, AgentClient] = {}
         refused: dict[int, FogError] = {}
 
@@ -103,6 +107,6 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
         (_, error), = refused.items()
         assert isinstance(error, AgentError), error
         assert error.hint and name in str(error) or 'belongs to launch' in str(error), error
-        assert agent.request('status')['launch'] == robots[winner].launch.id
-        robots[winner].undo.close()
+        assert agent.request('status')['launch'] == contexts[winner].launch
+        robots[winner][1].undo.close()
         assert not os.path.exists(f'/run/fogros2/{name}')

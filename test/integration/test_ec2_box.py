@@ -429,7 +429,7 @@ def traces_of(mark):
 
 
 @pytest.mark.parametrize('whose', ['test', 'box'])
-def test_a_box_leaves_nothing_whoever_dies(box, whose, tmp_path):
+def test_box_leaves_nothing_whichever_process_dies(box, whose, tmp_path):
     # its log's folder is what the one that is killed can't take away
     child = subprocess.Popen([sys.executable, '-c', STARTER, UBUNTU], stdout=subprocess.PIPE,
                              text=True, env={**os.environ, 'TMPDIR': str(tmp_path)})

@@ -46,14 +46,14 @@ def clean(launch):
     return launch.errors == [] and 'WARNING' not in launch.text and 'Traceback' not in launch.text
 
 
-def test_the_pair_here(launch):
+def test_talker_and_listener_run_on_the_robot(launch):
     run = launch('fogros2_examples', 'talker.local.launch.py', 'count:=2')
     assert run.ended() == 0, run.text
     assert run.text.count('I heard: [Hello World') >= 2
     assert clean(run), run.text
 
 
-def test_the_demo(launch, engine):
+def test_demo_talks_between_two_hosts(launch, engine):
     name = f'demo-{RUN}'
     run = launch('fogros2_examples', 'talker.container.launch.py', f'name:={name}', 'count:=2')
     assert run.ended() == 0, run.text
@@ -93,7 +93,7 @@ def test_machine_on_a_node_in_a_group_and_an_include(launch, engine, tmp_path):
     assert clean(run), run.text
 
 
-def test_three_hosts_hear_each_other(launch, cloud_network):
+def test_three_hosts_exchange_messages(launch, cloud_network):
     run = launch('fogros2_examples', 'two_clouds.launch.xml', f'name:=speaker-{RUN}',
                  f'second_name:=hearer-{RUN}', f'network:={cloud_network}')
     said = f'I heard: [Hello World from speaker-{RUN} '
@@ -111,7 +111,7 @@ def test_three_hosts_hear_each_other(launch, cloud_network):
     ('talker.aws.launch.py', '--machine', '*=robot'),
     ('two_clouds.launch.yaml', '--machine', 'speaker=robot', '--machine', 'hear*=robot'),
 ])
-def test_the_machine_is_chosen_at_launch_time(launch, words):
+def test_machine_is_chosen_by_a_launch_argument(launch, words):
     run = launch('fogros2_examples', words[0], 'count:=2', *words[1:])
     assert run.ended() == 0, run.text
     assert run.text.count('I heard: [Hello World') >= 2
@@ -124,7 +124,7 @@ def test_the_machine_is_chosen_at_launch_time(launch, words):
     'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.container.launch.py',
     'talker.container.launch.xml', 'talker.kube.launch.py', 'talker.ssh.launch.py',
     'two_clouds.launch.py', 'video.container.launch.yaml'])
-def test_looking_at_a_launch_file_makes_nothing(name, option, state_home):
+def test_showing_a_launch_file_creates_nothing(name, option, state_home):
     shown = ros2('launch', str(example(name)), option, timeout=20)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     if option == '-s':
@@ -224,7 +224,7 @@ def generate_launch_description():
 """
 
 
-def test_a_launch_with_everything_beside_another(launch, cloud_network, tmp_path):
+def test_two_full_launches_run_side_by_side(launch, cloud_network, tmp_path):
     package, name = f'fogt_{RUN}', f'all-{RUN}'
     root = tmp_path / 'workspace'
     variables = {**os.environ, **colcon_workspace(

@@ -58,12 +58,15 @@ def generate_launch_description():
 
 #: Its machines say beforehand that they will be taken away, as spot instances do.
 PROVIDER = """
+import dataclasses
+
 from fogros2.provider.container import ContainerProvider
 
 
 class WarningProvider(ContainerProvider):
     name = 'warning'
-    notice = ('cat', '/run/notice')
+    capabilities = dataclasses.replace(
+        ContainerProvider.capabilities, preemption_notice=('cat', '/run/notice'))
 """
 
 
@@ -88,7 +91,7 @@ def launched(cloud_network, tmp_path, monkeypatch):
 # at once, and with some seconds for the agent to end the nodes first
 @pytest.mark.parametrize('how', [('rm', '-f', '-t', '0'), ('stop', '-t', '5')],
                          ids=['killed', 'stopped'])
-def test_nodes_go_on_on_the_robot(launched, engine, how):
+def test_nodes_continue_on_the_robot(launched, engine, how):
     name = f'gone-{RUN}-{how[0]}'
     run = launched(name, 'robot')
     run.wait_for(f'I heard: [Hello World from {name} ')
@@ -105,7 +108,7 @@ def test_nodes_go_on_on_the_robot(launched, engine, how):
     assert run.ended() == 0, run.text
 
 
-def test_a_notice_moves_the_nodes_before_the_machine_goes(
+def test_preemption_notice_moves_the_nodes_in_time(
     launched, engine, tmp_path, monkeypatch,
 ):
     monkeypatch.setenv('PYTHONPATH', install(
@@ -117,7 +120,7 @@ def test_a_notice_moves_the_nodes_before_the_machine_goes(
                           'echo "terminate at 12:00" >/run/notice'), sudo=True))
     subprocess.run(words, check=True, capture_output=True, timeout=60)
     run.wait_for(f'noticed: {name} lost False', timeout=30)
-    run.wait_for(f"the machine '{name}' is being taken away: terminate at 12:00; its nodes go on")
+    run.wait_for(f"the machine '{name}' is being reclaimed: terminate at 12:00; its nodes")
     here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
     run.wait_for(f'I heard: [Hello World from {here} ')
     # the one there has ended: nobody says anything twice
@@ -130,7 +133,7 @@ def test_a_notice_moves_the_nodes_before_the_machine_goes(
     assert run.ended() == 0, run.text
 
 
-def test_the_launch_ends_with_the_machine(launched, engine):
+def test_launch_ends_with_a_lost_machine(launched, engine):
     name = f'gone-{RUN}'
     run = launched(name, 'shutdown')
     run.wait_for('I heard')

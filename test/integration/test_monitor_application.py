@@ -76,7 +76,7 @@ def program(module: str, *words: str) -> Iterator[queue.Queue[str]]:
         process.stdout.close()
 
 
-def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image, tmp_path):
+def test_application_is_served_until_the_bridge_ends(image, tmp_path):
     token = tmp_path / 'token'
     token.write_text('sesame\n')
     inside, outside = free_port(), free_port()
@@ -110,7 +110,7 @@ def test_it_is_served_at_the_bridge_s_port_and_ends_with_it(image, tmp_path):
             assert answer.getheader(page.MARK) and urls.LICHTBLICK.encode() in answer.read()
 
 
-def test_what_can_not_be_had_is_said(engine):
+def test_missing_image_is_reported(engine):
     port = free_port()
     with program('application', '--image', 'localhost/fogt-no-such-image:1', '--port', str(port),
                  '--name', 'x') as said:
@@ -120,9 +120,9 @@ def test_what_can_not_be_had_is_said(engine):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='sudo looks for podman in folders of its own')
-def test_an_image_that_comes_slowly_does_not_keep_the_bridge_from_its_end(tmp_path, monkeypatch):
+def test_slow_image_download_does_not_delay_the_bridges_end(tmp_path, monkeypatch):
     slow = tmp_path / 'podman'
-    slow.write_text('#!/bin/sh\n[ "$1" = pull ] && exec sleep 600\nexit 1\n')
+    slow.write_text('#!/bin/sh\ncase " $* " in *" pull "*) exec sleep 600; esac\nexit 1\n')
     slow.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
     with program('application', '--image', 'x', '--port', str(free_port()), '--name', 'x') as said:

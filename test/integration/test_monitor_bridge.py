@@ -169,7 +169,7 @@ def test_messages_arrive_as_they_were_published(bench):
     assert viewer.message('/image')['data'] == pixels.tolist()
 
 
-def test_a_topic_is_subscribed_to_while_somebody_looks(bench):
+def test_topic_is_subscribed_to_while_a_viewer_shows_it(bench):
     bench.node.create_publisher(String, '/words', 10)
     first, second = bench.viewer(), bench.viewer()
     first.until('channel', '/words')
@@ -190,7 +190,7 @@ def test_topics_come_and_go(bench):
     viewer.until('gone', '/late')
 
 
-def test_who_comes_late_sees_what_is_latched(bench):
+def test_late_viewer_gets_latched_messages(bench):
     maps = bench.node.create_publisher(String, '/map', LATCHED)
     maps.publish(String(data='here'))
     for _ in range(2):
@@ -199,7 +199,7 @@ def test_who_comes_late_sees_what_is_latched(bench):
         assert viewer.message('/map') == {'data': 'here'}
 
 
-def test_who_came_early_sees_what_is_latched_later(bench):
+def test_early_viewer_gets_later_latched_messages(bench):
     bench.node.create_subscription(String, '/map', lambda _: None, 10)
     viewer = bench.viewer()
     viewer.look('/map')
@@ -235,7 +235,7 @@ def test_viewers_publish(bench):
     assert (heard[0].linear.x, heard[0].angular.z) == (0.25, -1.0)
 
 
-def test_what_can_not_be_published_is_said(bench):
+def test_message_that_cannot_be_published_is_reported(bench):
     viewer = bench.viewer()
     viewer.wish(publish='/x', schemaName='no_such_msgs/msg/Thing', definition='string data',
                 message={'data': ''})
@@ -282,7 +282,7 @@ def memory(process: subprocess.Popen[str]) -> float:
 
 
 @pytest.mark.parametrize('seconds', [8.0, pytest.param(30.0, marks=pytest.mark.soak)])
-def test_twenty_viewers_of_which_one_reads_nothing_leave_the_robot_alone(
+def test_twenty_viewers_do_not_slow_down_the_robot(
         bench, seconds, tmp_path):
     token = tmp_path / 'token'
     token.write_text('sesame\n')
@@ -327,7 +327,7 @@ def protobuf(data: bytes) -> dict[int, bytes]:
     return fields
 
 
-def test_a_stream_goes_out_as_video(bench):
+def test_stream_is_sent_as_video(bench):
     av = pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
     images = bench.node.create_publisher(Image, '/camera', 2)
     shades = itertools.cycle(range(0, 250, 10))

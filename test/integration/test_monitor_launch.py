@@ -111,7 +111,7 @@ def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = Tru
     return b''
 
 
-def test_an_application_is_watched(nothing_left, engine):
+def test_topics_of_an_application_are_served(nothing_left, engine):
     """Its topics are there, the streamed image as the planner has it; nothing is complained of."""
     with launching() as launch:
         launched = launch('fogros2_examples', 'grasp.launch.py', 'machine:=container',
@@ -133,7 +133,7 @@ def test_an_application_is_watched(nothing_left, engine):
         assert '[WARNING] [fogros2]' not in launched.text
 
 
-def test_machine_that_is_the_robot_is_watched_with_its_token(nothing_left, tmp_path, state_home):
+def test_monitor_works_for_a_machine_on_the_robot(nothing_left, tmp_path, state_home):
     file = tmp_path / 'monitor.launch.py'
     file.write_text(ON_ROBOT)
     with launching() as launch:
@@ -151,7 +151,7 @@ def test_machine_that_is_the_robot_is_watched_with_its_token(nothing_left, tmp_p
     assert not list(state_home.rglob('token'))
 
 
-def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
+def test_viewers_need_the_token_and_an_allowed_network(
         nothing_left, engine, cloud_network, nobody, tmp_path):
     name = f'mon-{secrets.token_hex(2)}'
     gateway = json.loads(run(Command(
@@ -168,7 +168,7 @@ def test_the_robot_comes_in_and_others_from_their_networks_with_the_token_alone(
             r'Foxglove for (\S+) at wss://(\S+):(\d+); with its token: (.*)', launched.text)
         assert (told[1], told[4]) == (f'{gateway}/32', f'ros2 fog monitor {name} --share')
         at = told[2], int(told[3])
-        assert at == (Store().machine(name).load().shell.host, 8766)
+        assert at == (Store().load(name).shell.host, 8766)
 
         shared = ros2('fog', 'monitor', name, '--share').stdout.splitlines()
         url = shared[0]

@@ -23,10 +23,11 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, locked, modules, plan, process, wheels, workspace
+from fogros2 import plan, process
 from fogros2.errors import PrerequisiteError
+from fogros2.host import bootstrap, locked, modules, wheels, workspace
 from fogros2.model import Command, MachineSpec
-from fogros2.provider import debian_root
+from fogros2.provider.container import debian_root
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import Timeouts
 from rigs.bare_computer import bare_computer, BareComputer
@@ -192,7 +193,7 @@ def test_python_travels_as_it_is(
     program = install.command[-1]
     imported = Command((
         'env', f"PYTHONPATH={install.environment['PYTHONPATH']}", 'python3', '-c',
-        'import fogros2.agent, platform; print(fogros2.agent.__file__, platform.machine())'))
+        'import fogros2.events, platform; print(fogros2.events.__file__, platform.machine())'))
     path, machine = shell.run(imported, timeout=60.0).stdout.split()
     assert machine == ARCHITECTURE
     assert Path(path).parent == Path(program).parent
@@ -255,7 +256,9 @@ def test_modules_are_those_for_its_processor(
     assert told == f'cp311-cp311-manylinux_2_17_{ARCHITECTURE}\n'
 
 
-def test_what_cannot_be_installed_is_named_first(computer: BareComputer, tmp_path: Path) -> None:
+def test_package_that_cannot_be_installed_is_named_first(
+    computer: BareComputer, tmp_path: Path,
+) -> None:
     if not wheels.collect(tmp_path / 'wheels').embedded:
         pytest.skip('this robot has ROS 2 and no embedded default to send')
     path = tmp_path / 'arm.launch.py'

@@ -63,7 +63,7 @@ def runs(process_id: str) -> bool:
     return path.exists() and path.read_bytes() != b''
 
 
-def test_what_nodes_here_lack_is_refused_before_anything_is_made(
+def test_missing_module_of_the_robot_is_refused_first(
         tmp_path: Path, cloud_network: str) -> None:
     if has_middleware('rmw_fastrtps_cpp'):
         pytest.skip("this computer's ROS 2 has rmw_fastrtps_cpp")

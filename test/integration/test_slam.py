@@ -60,7 +60,7 @@ def launch():
 @pytest.mark.parametrize(('machine', 'stereo', 'grey'), [
     ('container', 'true', 'false'), ('robot', 'false', 'true')])
 @pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
-def test_the_launch_file(launch, engine, tmp_path, machine, stereo, grey):
+def test_slam_launch_file_runs_on_a_machine(launch, engine, tmp_path, machine, stereo, grey):
     """Every frame is answered, the way is found, the picture drawn."""
     run = launch('fogros2_examples', 'slam.launch.py', f'machine:={machine}', *SMALL,
                  f'stereo:={stereo}', f'grey:={grey}', f'picture:={tmp_path}/way.png',
@@ -75,7 +75,7 @@ def test_the_launch_file(launch, engine, tmp_path, machine, stereo, grey):
     assert cv2.imread(str(tmp_path / 'way.png')).shape[1] > 1000
 
 
-def test_a_folder_that_is_none(launch, tmp_path):
+def test_missing_dataset_fails_the_launch(launch, tmp_path):
     (tmp_path / 'rgb.txt').write_text('10.0\n')
     run = launch('fogros2_examples', 'slam.launch.py', 'machine:=robot', f'dataset:={tmp_path}')
     run.ended()
@@ -84,7 +84,7 @@ def test_a_folder_that_is_none(launch, tmp_path):
     assert not re.search(r'\[slam_camera-\d+\] Traceback', run.text), run.text
 
 
-def test_orb_slam_in_its_place(launch):
+def test_orb_slam_replaces_the_slam_node(launch):
     """What it runs is the user's: an image must be named. The rest is as it is for our own."""
     shown = launch('fogros2_examples', 'slam_orb.launch.py', '--show-args')
     assert shown.ended() == 0, shown.text
@@ -94,8 +94,7 @@ def test_orb_slam_in_its_place(launch):
     assert "missing required argument 'image'" in refused.text
 
 
-@pytest.mark.timeout(150)
-def test_another_slam_in_an_image(launch, images, crun, with_python, tmp_path):
+def test_slam_of_an_image_replaces_the_slam_node(launch, images, crun, with_python, tmp_path):
     """Our own stands for it: in an image of this computer's, under names that are its own."""
     run = launch(
         'fogros2_examples', 'slam_orb.launch.py', f'image:=oci-archive:{images}/system.tar',
@@ -112,7 +111,7 @@ def test_another_slam_in_an_image(launch, images, crun, with_python, tmp_path):
 
 
 @pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')
-def test_the_picture_of_a_slam_that_tells_no_path(tmp_path):
+def test_picture_works_without_a_path(tmp_path):
     """It is of the poses as they came."""
     picture = tmp_path / 'way.png'
     rclpy.init(args=['--ros-args', '-p', f'picture:={picture}', '-p', 'frames:=1',
@@ -177,7 +176,7 @@ class Side:
         rclpy.try_shutdown(context=self.context)
 
 
-def test_what_cameras_send_at_times():
+def test_slam_survives_bad_camera_messages():
     """Each fault is reported on slam_state, and the node goes on: poses, path, points, /tf."""
     made = room.Room(room.camera(320, 240))
     shots = [made.colour_and_depth(pose, number)

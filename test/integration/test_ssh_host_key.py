@@ -57,7 +57,7 @@ def test_a_server_gets_a_new_key_and_connections_go_on(root, tmp_path, others):
         shell.close()
 
 
-def test_a_server_without_such_a_key_says_so(root, tmp_path, monkeypatch):
+def test_server_without_the_key_type_is_reported(root, tmp_path, monkeypatch):
     if os.geteuid() != 0:
         pytest.skip("the server of this test is its user's, not root's")
     with private_sshd(tmp_path / 'sshd') as server:

@@ -14,7 +14,7 @@ import uuid
 
 import pytest
 
-from fogros2.provider import container_root
+from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
@@ -106,7 +106,7 @@ def sent_since(computer, marker):
     ).stdout.splitlines()
 
 
-def test_a_bare_computer_gets_what_it_lacks_once(computer, launch, home):
+def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     first = launch(*example(computer, host_key=computer.host_key))
     assert first.ended() == 0, first.text
     assert f'I heard: [Hello World from {computer.name}' in first.text
@@ -175,7 +175,7 @@ def listed():
     return [entry['name'] for entry in json.loads(ros2('fog', 'list', '--json').stdout)]
 
 
-def test_a_workspace_travels_and_a_kept_computer_gets_only_what_changed(
+def test_kept_computer_gets_only_changed_workspace_files(
         computer, launch, tmp_path):
     package, name = f'fogt_{RUN}', f'kept-{RUN}'
     root = tmp_path / 'a workspace'

@@ -92,7 +92,7 @@ def test_the_second_time_goes_over_the_open_connection(shell, source, tmp_path, 
     assert not compare(source, target)
 
 
-def test_another_key_in_known_hosts_doesn_t_matter_to_a_pinned_one(
+def test_pinned_key_wins_over_known_hosts(
     shell, source, tmp_path, monkeypatch,
 ):
     monkeypatch.setattr(sync, 'BULK', 1000)
@@ -149,7 +149,7 @@ def test_a_target_in_the_home_is_found(server, source, tmp_path):
             shutil.rmtree(Path(home, name))
 
 
-def test_a_machine_without_rsync_is_told_so(source, tmp_path):
+def test_machine_without_rsync_is_reported(source, tmp_path):
     programs = tmp_path / 'bin'
     programs.mkdir()
     for name in ('sh', 'bash', 'mkdir', 'ls', 'head', 'env'):
@@ -160,14 +160,14 @@ def test_a_machine_without_rsync_is_told_so(source, tmp_path):
             shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
 
 
-def test_this_computer_without_rsync_is_told_so(shell, source, tmp_path, monkeypatch):
+def test_robot_without_rsync_is_reported(shell, source, tmp_path, monkeypatch):
     real = process.which
     monkeypatch.setattr(process, 'which', lambda p: None if p == 'rsync' else real(p))
     with pytest.raises(PrerequisiteError, match='rsync not found on this computer'):
         shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
 
 
-def test_a_full_disk_is_said_to_be_full(shell, tmp_path, root):
+def test_full_disk_is_named(shell, tmp_path, root):
     """Tests that the machine's full disk has its own error."""
     disk = tmp_path / 'sync-target'
     disk.mkdir()

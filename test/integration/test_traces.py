@@ -79,7 +79,7 @@ def fake_agent(folder, launch_id, *, first=True):
     return str(program), 'serve', '--config', str(config)
 
 
-def test_a_file_of_ours_is_found(look, interface, state_home):
+def test_leftover_file_is_found(look, interface, state_home):
     assert look().left() == set(), 'it was there before'
     traces = look()
     (state_home / 'forgotten').write_text('')
@@ -91,7 +91,7 @@ def test_a_file_of_ours_is_found(look, interface, state_home):
         pass
 
 
-def test_an_interface_of_ours_is_found(look, tun, launch_id, state_home, request):
+def test_leftover_interface_is_found(look, tun, launch_id, state_home, request):
     """Though the launch's folder has gone."""
     traces = look()
     with pytest.raises(AssertionError, match=f'left behind.*interface fog{launch_id}'):
@@ -102,14 +102,14 @@ def test_an_interface_of_ours_is_found(look, tun, launch_id, state_home, request
             shutil.rmtree(state_home / 'launches')
 
 
-def test_what_another_launch_makes_is_its_own(look, tun, start, elsewhere, launch_id, request):
+def test_resources_of_another_launch_are_ignored(look, tun, start, elsewhere, launch_id, request):
     """Whether its owner is known or not: another user's is not."""
     with nothing_left(look(), timeout=0.1):
         request.getfixturevalue('interface')
         start(*fake_agent(elsewhere, launch_id), **{RUN: 'another'})
 
 
-def test_a_launch_of_ours_with_a_state_folder_of_its_own_is_ours(
+def test_launch_with_its_own_state_folder_is_found(
     look, tun, start, elsewhere, launch_id, request,
 ):
     traces = look()
@@ -122,7 +122,7 @@ def test_a_launch_of_ours_with_a_state_folder_of_its_own_is_ours(
 
 
 @pytest.mark.parametrize('of_ours', [True, False])
-def test_a_machine_is_found_and_its_owner(
+def test_leftover_machine_is_found_with_its_owner(
     look, engine, launch_id, state_home, tmp_path, of_ours,
 ):
     """A container without a launch's label comes from the test of a provider alone."""
@@ -141,7 +141,7 @@ def test_a_machine_is_found_and_its_owner(
 
 
 @pytest.mark.parametrize('by', ['place', 'run', 'launch', 'launch told later'])
-def test_an_agent_of_ours_is_found(look, start, tmp_path, elsewhere, state_home, launch_id, by):
+def test_leftover_agent_is_found(look, start, tmp_path, elsewhere, state_home, launch_id, by):
     traces = look()
     words = fake_agent(tmp_path if by == 'place' else elsewhere, launch_id,
                        first=by != 'launch told later')
@@ -152,7 +152,7 @@ def test_an_agent_of_ours_is_found(look, start, tmp_path, elsewhere, state_home,
     assert found.startswith(f'process {child.pid} ') and words[0] in found
 
 
-def test_a_file_that_a_strangers_program_uses_is_his(look, start, elsewhere):
+def test_file_of_a_foreign_program_is_ignored(look, start, elsewhere):
     traces = look()
     (elsewhere / 'waits.py').write_text(WAITS)
     with tempfile.NamedTemporaryFile(prefix='fogros2-', dir='/var/tmp') as file:

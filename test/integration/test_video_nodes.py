@@ -33,6 +33,7 @@ from std_msgs.msg import Empty, UInt64MultiArray
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.model import DdsInterface
 from image_transport_h264 import annexb, message
+from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.codec import Encoder, peek, Picture, Settings
 
 ROOT = Path(__file__).parents[2]
@@ -241,7 +242,7 @@ def test_no_subscriber_no_work(bench: Bench) -> None:
                 and node.count_subscribers('/camera/h264') == 0, 'the end of the work')
 
 
-def test_who_joins_late_gets_a_key(bench: Bench) -> None:
+def test_late_viewer_gets_a_keyframe(bench: Bench) -> None:
     """Hours of P-pictures away from the next key, a new reader gets one with the next image."""
     bench.pair('-p', 'gop:=1000000')
     publish = source(bench)
@@ -376,6 +377,32 @@ def test_parameters_change_while_it_runs(bench: Bench) -> None:
     assert bytes(seen[-1].data) == bytes(sent.data)
 
 
+def test_wait_for_acknowledgement_lets_threads_run(bench: Bench) -> None:
+    """ROS 2's own method holds the interpreter: one image per round trip would leave."""
+    bench.start('decoder', '-r', 'image:=/seen/camera', '-p', 'codec:=jpeg', '-p', 'stream:=/s')
+    bench.heard(Image, '/seen/camera')
+    publisher = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
+    bench.until(publisher.get_subscription_count, 'the decoder')
+    decoder, _, _ = bench.processes[0]
+    answers: list[bool] = []
+    waiting = threading.Thread(
+        target=lambda: answers.append(wait_for_all_acked(publisher, 2.0)))
+    decoder.send_signal(signal.SIGSTOP)
+    # the signal takes effect later: until then, the decoder acknowledges
+    os.waitpid(decoder.pid, os.WUNTRACED)
+    try:
+        publisher.publish(CompressedImage(format='jpeg'))
+        waiting.start()
+        # with the lock held, this thread continues after the answer only
+        waiting.join(0.1)
+        assert not answers
+        waiting.join()
+        assert answers == [False]
+    finally:
+        decoder.send_signal(signal.SIGCONT)
+    assert wait_for_all_acked(publisher, 20.0)
+
+
 def test_camera_info_goes_along(bench: Bench) -> None:
     bench.pair()
     infos, seen = bench.heard(CameraInfo, '/seen/camera_info'), bench.heard(Image, '/seen/camera')
@@ -443,7 +470,7 @@ def test_packets_that_are_none_cost_a_line(bench: Bench) -> None:
     assert sum('not shown' in line for line in lines) == 1
 
 
-def test_a_codec_that_does_not_exist_is_told(bench: Bench) -> None:
+def test_unknown_codec_is_reported(bench: Bench) -> None:
     lines = bench.start('encoder', '-p', 'codec:=vhs')
     process = bench.processes.pop()[0]
     assert process.wait(20) != 0

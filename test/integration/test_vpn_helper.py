@@ -242,7 +242,7 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
         {'name': NAME, 'pid': copy.launch('fogada')}).encode())
     assert made.returncode == 0 and len(made.stdout) == 45, made
     assert copy.run('root', 'stat', '-c%a', '/run/fogros2-vpn', f'/run/fogros2-vpn/{NAME}',
-                    f'/run/fogros2-vpn/{NAME}/key').stdout.split() == ['755', '700', '600']
+                    f'/run/fogros2-vpn/{NAME}/key').stdout.split() == ['711', '700', '600']
     said = copy.run('fogbob', 'sh', '-c', f'SUDO_UID=0 sudo -n {HELPER} down',
                     data=json.dumps({'name': NAME}).encode())
     assert 'another user' in said.stderr

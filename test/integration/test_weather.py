@@ -169,7 +169,7 @@ def flow(run: Launched, since: float, where: str, within: float) -> float:
 
 
 @pytest.mark.parametrize('cut', [7.0, pytest.param(30.0, marks=pytest.mark.soak)])
-def test_a_launch_in_bad_weather(weather, engine, cloud_network, tmp_path, cut):
+def test_launch_survives_a_bad_network(weather, engine, cloud_network, tmp_path, cut):
     path = tmp_path / 'weather.launch.py'
     path.write_text(LAUNCH.format(name=NAME, network=cloud_network, period=PERIOD))
     with launching() as launch:

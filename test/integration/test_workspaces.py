@@ -11,10 +11,10 @@ import uuid
 import pytest
 
 from fogros2.deploy import Launch
+from fogros2.host.workspace import find_workspaces, underlays
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.report import StepDone
 from fogros2.waiting import wait_until
-from fogros2.workspace import find_workspaces, underlays
 from rigs.colcon_workspace import colcon_workspace
 
 pytestmark = [

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from fogros2 import events
 from fogros2.errors import Cancelled
 from fogros2.report import step
 
@@ -62,6 +63,8 @@ class FakeMachine:
         event = {'event': name, **fields}
         if node is not None:
             event.update(node=node.id, name=node.name)
+        if name not in ('connection', 'gap', 'lost'):
+            assert events.event(event) is not None  # as the agent's connection checks it
         thread = threading.Thread(target=self.callback, args=(event,))
         thread.start()
         thread.join()
@@ -104,6 +107,9 @@ class FakeLaunch:
     def noted(self, what):
         with self.lock:
             return [note[1:] for note in self.notes if note[0] == what]
+
+    def provider(self, name):
+        return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options)
 
     def expect(self, names):
         self.note('expect', *names)
@@ -167,7 +173,7 @@ def run(fake, package, monkeypatch, tmp_path):
     from launch import LaunchService
     import launch.logging
 
-    from fogros2.actions.coordinator import Coordinator
+    from fogros2.runtime.coordinator import Coordinator
 
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     # launch leaves the parameter files it makes

@@ -138,7 +138,7 @@ def test_nested_machines_are_kept(run, fake, planner):
         ('other', 'b'), ('planner', 'a'), ('third', 'c')]
 
 
-def test_what_a_group_sets_reaches_its_nodes(run, fake, planner):
+def test_settings_of_a_group_reach_its_nodes(run, fake, planner):
     fake.on_start = ends
     assert run(LaunchDescription([
         CloudGroup(planner, [
@@ -201,7 +201,7 @@ def test_an_include_emitted_from_a_group(run, fake, planner, capfd):
 
 def test_describing_a_launch_asks_nobody(fake, planner, monkeypatch):
     """``ros2 launch -s`` and ``--print-description`` only look."""
-    from fogros2.actions.coordinator import Coordinator
+    from fogros2.runtime.coordinator import Coordinator
 
     def refuse(*args, **kwargs):
         raise AssertionError('nothing is to be executed')

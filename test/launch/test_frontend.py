@@ -23,16 +23,16 @@ from fogros2 import (
     SSHInstance,
     StreamTopic,
 )
-from fogros2.actions import keywords, words
-from fogros2.actions.coordinator import Coordinator
+from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.h264 import H264
+from fogros2.runtime.coordinator import Coordinator
 from fogros2.testing.plugins import instead
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-    from fogros2.actions.machines import Truth, Value
+    from fogros2.describe.machines import Bool, Value
 
 CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'kubernetes': KubeInstance,
            'ssh': SSHInstance}
@@ -167,7 +167,7 @@ def test_a_value_for_each_region_is_an_element_each(text):
 
 
 #: A text, and the Python value it stands for, of each kind.
-EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'truth': ('true', True),
+EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true', True),
             'scalar': ('true', True), 'list': ('a,b', ['a', 'b']),
             'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
@@ -178,7 +178,7 @@ LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
 
 
 @pytest.mark.parametrize('provider', sorted(CLASSES))
-def test_every_keyword_of_every_provider_is_an_attribute_plain_and_as_a_substitution(provider):
+def test_keywords_are_attributes_and_take_substitutions(provider):
     needed = {'name': 'planner', 'ros_workspace': '', **(
         {'host': 'here'} if provider == 'ssh' else {})}
     for keyword in keywords.keywords(CLASSES[provider]).values():
@@ -331,7 +331,7 @@ launch:
 
 
 @pytest.mark.parametrize('text', [XML_LAUNCH, YAML_LAUNCH])
-def test_nodes_groups_and_streams_become_processes_of_the_machine(
+def test_nodes_groups_and_streams_run_on_the_machine(
         text, run, fake, monkeypatch):
     instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'other': Other})
 
@@ -424,10 +424,10 @@ def test_docker_containers_of_a_machine(run, fake):
 class Mine(CloudInstance):
     provider = 'mine'
 
-    def __init__(self, size: Value, *, fast: Optional[Truth] = None,
+    def __init__(self, size: Value, *, fast: Optional[Bool] = None,
                  places: Optional[Sequence[SomeSubstitutionsType]] = None, **common: Any) -> None:
         super().__init__(options={
-            'size': size, 'fast': fast, 'places': words.items(places)}, **common)
+            'size': size, 'fast': fast, 'places': values.items(places)}, **common)
 
 
 class Unclear(Mine):
@@ -437,7 +437,7 @@ class Unclear(Mine):
         super().__init__(size, **common)
 
 
-def test_a_provider_of_another_package_has_its_keywords_as_attributes(monkeypatch):
+def test_provider_of_another_package_has_attributes(monkeypatch):
     instead(monkeypatch, 'fogros2.machine', {'mine': Mine, 'unclear': Unclear})
     found = machine(xml('<fog_machine name="p" provider="mine" size="3" fast="true" places="a,b" '
                         'ros_workspace=""/>'))
@@ -454,7 +454,7 @@ DOCUMENT = (Path(__file__).parents[2] / 'doc' / 'launch_xml_yaml.md').read_text(
 
 @pytest.mark.parametrize('text', re.findall(
     r'^```(?:xml|yaml)\n(.*?)^```', DOCUMENT, re.MULTILINE | re.DOTALL))
-def test_what_the_documentation_shows_is_read(text):
+def test_example_of_the_documentation_is_parsed(text):
     assert load(text).entities
 
 

@@ -9,7 +9,8 @@ from launch.substitutions import LaunchConfiguration
 import pytest
 
 from fogros2 import CloudNode, ContainerInstance, FogMachine, FogROSLaunchDescription
-from fogros2.actions.override import OverrideMachines, Overrides
+from fogros2.actions.override import OverrideMachines
+from fogros2.describe.overrides import Overrides
 
 
 def ends(machine, node):
@@ -69,7 +70,7 @@ def test_a_machine_s_folders_may_come_as_one_argument(provider, given, mounts):
     ([], {'shell': True}, 'in a shell of the machine'),
     ([], {'image_options': ['-v']}, "image_options=['-v']"),
 ])
-def test_what_an_image_can_not_be_is_said(run, fake, planner, caplog, overrides, more, why):
+def test_invalid_image_is_reported(run, fake, planner, caplog, overrides, more, why):
     node = CloudNode(
         machine=planner, package='demo', executable='talker', image='ros:jazzy', **more)
     assert run(LaunchDescription(

@@ -34,9 +34,9 @@ from fogros2 import (
     MachineInterrupted,
     StreamTopic,
 )
-from fogros2.actions import session
 from fogros2.errors import AgentError, ProviderError
 from fogros2.image_transport.h264 import H264
+from fogros2.runtime import session
 from fogros2.testing.plugins import instead
 
 REASON = 'spot instance, at 12:00'
@@ -123,7 +123,7 @@ def says(fake, kind, **fields):
     return do
 
 
-def test_nodes_go_on_on_the_robot(run, fake, package, planner, talker, watch, capfd):
+def test_nodes_continue_on_the_robot(run, fake, package, planner, talker, watch, capfd):
     """With their names, namespaces, remappings, parameters; and launch sees them start again."""
     node = talker(machine=planner, name='mapper', namespace='arm', parameters=[{'rate': 5}],
                   remappings=[('in', 'out')], exec_name='says')
@@ -144,8 +144,8 @@ def test_nodes_go_on_on_the_robot(run, fake, package, planner, talker, watch, ca
     assert '--params-file' in here
     assert watch.interrupted == [('planner', REASON, False)]
     said = capfd.readouterr().out
-    assert (f"the machine 'planner' is being taken away: {REASON}; "
-            'its nodes go on on the robot') in said
+    assert (f"the machine 'planner' is being reclaimed: {REASON}; "
+            'its nodes continue on the robot') in said
     assert re.search(r'\[says-\d+\] here: ', said), 'not as the output of a machine'
     assert said.index(REASON) < said.index('ERROR'), 'the end of the one here, by SIGINT'
 
@@ -155,11 +155,11 @@ def test_the_launch_ends_unless_told_otherwise(run, fake, talker, watch, capfd):
     watch.at_start = {1: says(fake, 'notice', reason=REASON)}
     assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
     (reason,) = watch.shutdowns
-    assert f"the machine 'planner' is being taken away: {REASON}" in reason
+    assert f"the machine 'planner' is being reclaimed: {REASON}" in reason
     assert watch.interrupted == [('planner', REASON, False)]
     assert len(watch.starts) == 1 and fake.noted('down')
     errors = [line for line in capfd.readouterr().out.splitlines() if 'ERROR' in line]
-    assert "on_interrupt='robot' would" in errors[0]
+    assert "on_interrupt='robot' continues" in errors[0]
     assert 'says-' in errors[1] and len(errors) == 2, 'the node was ended, by SIGINT'
 
 
@@ -201,7 +201,7 @@ def test_notice_then_gone_before_the_nodes_ended(run, fake, planner, talker, wat
 
 
 def test_a_machine_that_does_not_end_its_nodes(run, fake, planner, talker, watch, monkeypatch):
-    from fogros2.actions import remote_run
+    from fogros2.runtime import remote_run
     monkeypatch.setattr(remote_run, 'GRACE', 0.0)
 
     def on_start(machine, node):
@@ -298,7 +298,7 @@ def test_another_machine_is_left_alone(run, fake, planner, talker, watch):
     assert len(fake.machines['other'].stops) == 1, 'at the end'
 
 
-def test_a_program_that_the_robot_lacks_is_found_before_anything(run, fake, planner, capfd):
+def test_missing_program_of_the_robot_is_found_first(run, fake, planner, capfd):
     machine = ContainerInstance(
         name='planner', ros_workspace='', image='has-it', on_interrupt='robot')
     assert run(LaunchDescription([CloudNode(
@@ -311,7 +311,7 @@ def test_a_program_that_the_robot_lacks_is_found_before_anything(run, fake, plan
 # -- ends that come before the news ---------------------------------------------------------------
 
 def last_words(machine, node, event):
-    machine.say(event, reason='SIGTERM')
+    machine.say(event, reason='SIGTERM', action='leave')
     machine.say('exited', node, returncode=-15, respawns=False)
 
 
@@ -449,14 +449,14 @@ def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
 
 def test_choices_are_made_in_threads(run, fake, talker, monkeypatch):
     from fogros2 import AWSCloudInstance, find_nearest_aws_region
-    from fogros2.provider.aws import choices
+    from fogros2.provider.aws import AWSProvider
     where = []
 
-    def nearest(regions):
+    def nearest(self, regions=()):
         where.append(threading.current_thread())
         return 'eu-north-1'
 
-    monkeypatch.setattr(choices, 'nearest_region', nearest)
+    monkeypatch.setattr(AWSProvider, 'nearest', nearest)
     fake.on_start = lambda machine, node: machine.say(
         'exited', node, returncode=0, respawns=False)
     machine = AWSCloudInstance(region=find_nearest_aws_region(), name='cloud', ros_workspace='')
@@ -468,12 +468,12 @@ def test_choices_are_made_in_threads(run, fake, talker, monkeypatch):
 
 def test_a_choice_that_cannot_be_made(run, fake, talker, monkeypatch, capfd):
     from fogros2 import AWSCloudInstance, find_nearest_aws_region
-    from fogros2.provider.aws import choices
+    from fogros2.provider.aws import AWSProvider
 
-    def nearest(regions):
+    def nearest(self, regions=()):
         raise ProviderError('no region answers', 'is there a network?')
 
-    monkeypatch.setattr(choices, 'nearest_region', nearest)
+    monkeypatch.setattr(AWSProvider, 'nearest', nearest)
     machine = AWSCloudInstance(region=find_nearest_aws_region(), name='cloud', ros_workspace='')
     assert run(LaunchDescription([LogInfo(msg='begins'), talker(machine=machine)])) == 1
     assert 'no region answers (is there a network?)' in capfd.readouterr().out

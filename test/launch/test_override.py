@@ -29,7 +29,8 @@ from fogros2 import (
     FogROSLaunchDescription,
     StreamTopic,
 )
-from fogros2.actions.override import OverrideMachines, Overrides, parse
+from fogros2.actions.override import OverrideMachines
+from fogros2.describe.overrides import Overrides, parse
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.h264 import H264
 from fogros2.testing.plugins import instead
@@ -72,7 +73,7 @@ def test_another_provider_keeps_what_holds_for_any_machine():
         options={'memory': '2g', 'ports': ['1:2', '3:4']})
 
 
-def test_the_same_provider_keeps_its_own_settings_but_for_those_named():
+def test_same_provider_keeps_settings_that_are_not_named():
     found = spec('planner=aws,region=eu-west-1,tags={team: slam}', AWSCloudInstance(**AWS))
     assert found.options == {'region': 'eu-west-1', 'ec2_instance_type': 't3.large', 'spot': True,
                              'tags': {'team': 'slam'}}
@@ -117,7 +118,7 @@ def test_a_name_beats_a_pattern_and_the_last_one_counts():
     ('planner=aws,tags=team', ['tags:', '{name: value}']),
     ('planner=kubernetes,tolerations=[{kye: gpu}]', ["tolerations has no 'kye'"]),
 ])
-def test_a_wrong_argument_is_refused_with_a_word_on_what_is_right(text, words):
+def test_wrong_argument_is_refused_with_a_hint(text, words):
     with pytest.raises(ConfigurationError) as error:
         Overrides([text])
     for word in words:

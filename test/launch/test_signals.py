@@ -19,7 +19,7 @@ from conftest import FakeLaunch
 from launch import LaunchDescription, LaunchService
 from launch.actions import ExecuteProcess
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-from fogros2.actions.coordinator import Coordinator
+from fogros2.runtime.coordinator import Coordinator
 
 class Fake(FakeLaunch):
     def note(self, *what):

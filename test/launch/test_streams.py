@@ -39,7 +39,8 @@ from fogros2 import (
     FogROSLaunchDescription,
     StreamTopic,
 )
-from fogros2.actions.override import OverrideMachines, Overrides
+from fogros2.actions.override import OverrideMachines
+from fogros2.describe.overrides import Overrides
 from fogros2.image_transport.h264 import H264
 from fogros2.testing.plugins import instead
 
@@ -309,7 +310,7 @@ def test_a_source_that_is_no_machine_of_the_launch(run, fake, planner, capfd):
     assert not fake.noted('up')
 
 
-def test_what_the_robot_lacks_for_streams_is_said_before_anything(
+def test_missing_program_for_streams_is_reported_first(
         run, fake, planner, capfd, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, 'find_spec', lambda name, *rest: (
@@ -340,8 +341,8 @@ def test_a_program_that_takes_no_ros_arguments_is_named(run, fake, planner, capl
     said = [record.getMessage() for record in caplog.records
             if 'takes no ROS arguments' in record.getMessage()]
     assert len(said) == 1
-    assert re.match(r'planner: own_plain(-\d+)? takes .* that /camera, /camera_info is a stream',
-                    said[0])
+    assert re.match(
+        r'planner: own_plain(-\d+)? takes .* use the stream of /camera, /camera_info', said[0])
     assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_node')
 
 
@@ -371,7 +372,7 @@ def box(monkeypatch):
 
 
 @pytest.mark.parametrize('streams', ['group', 'launch'])
-def test_components_are_told(run, fake, planner, caplog, box, streams):
+def test_composable_nodes_get_their_streams(run, fake, planner, caplog, box, streams):
     """They are made by a service call, whose remappings are rewritten as a process's are."""
     ends_when_all_started(fake, 3)
     topics = [('/camera', 'h264')]
@@ -439,7 +440,7 @@ def test_components_that_came_before_a_stream_are_named(
     assert len(said) == (condition == 'true')
 
 
-def test_a_group_whose_processes_are_all_left_out_makes_no_machine(run, fake, planner):
+def test_group_without_processes_creates_no_machine(run, fake, planner):
     assert run(LaunchDescription([CloudGroup(planner, [
         Node(package='demo', executable='talker', condition=IfCondition('false'))])])) == 0
     assert fake.notes == [] and fake.report is None

@@ -12,8 +12,9 @@ from launch.launch_description_sources import AnyLaunchDescriptionSource
 import pytest
 import yaml
 
-from fogros2.actions import carriers, private
-from fogros2.actions.coordinator import Coordinator
+from fogros2.launch_internals import private
+from fogros2.runtime import republishers
+from fogros2.runtime.coordinator import Coordinator
 
 FOLDER = Path(__file__).parents[2] / 'fogros2_examples' / 'launch'
 EXAMPLES = {
@@ -41,7 +42,7 @@ def plan(run, fake, monkeypatch):
     waited = []
 
     async def stay(action, context):
-        if not isinstance(action, carriers.RobotCarrier):
+        if not isinstance(action, republishers.RobotRepublisher):
             found.robot.append((*words(action.process_details['cmd']), required(action)))
         private.completed(action).set_result(None)
 

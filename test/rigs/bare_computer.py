@@ -16,8 +16,10 @@ from pathlib import Path
 
 from fogros2 import process
 from fogros2.model import Command, Endpoint, Result
-from fogros2.provider import container_engine, container_entry, container_root
-from fogros2.provider.container_engine import Engine
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container import entry as container_entry
+from fogros2.provider.container import root as container_root
+from fogros2.provider.container.engine import Engine
 from fogros2.waiting import wait_until
 
 USER = 'fog'

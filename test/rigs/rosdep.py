@@ -8,7 +8,7 @@ from pathlib import Path
 import platform
 from typing import Optional
 
-from fogros2.host import DISTRO
+from fogros2.host.inspection import DISTRO
 
 _SYSTEMS = '{debian: [bookworm, trixie], ubuntu: [noble]}'
 #: One package of ROS 2 that rosdep knows by the distribution's index.

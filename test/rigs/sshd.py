@@ -132,10 +132,10 @@ def private_sshd(folder: Path, extra: str = '') -> Iterator[PrivateSshd]:
     (folder / 'authorized_keys').write_text((folder / 'id.pub').read_text())
     server = PrivateSshd(folder, free_port(), extra)
     with contextlib.ExitStack() as undo:
-        if os.geteuid() == 0 and not os.path.isdir('/run/sshd'):
-            # as root it insists on this folder, which its service would have made
-            os.mkdir('/run/sshd', 0o755)
-            undo.callback(os.rmdir, '/run/sshd')
+        if os.geteuid() == 0:
+            # as root it insists on this folder of its service, which stays: another test's server
+            # would refuse connections without it
+            os.makedirs('/run/sshd', 0o755, exist_ok=True)
         undo.callback(server.stop)
         server.start()
         yield server

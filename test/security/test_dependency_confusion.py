@@ -18,11 +18,13 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, host, locked, modules, process, wheels
-from fogros2.host import Python
+from fogros2 import process
+from fogros2.host import bootstrap, locked, modules, wheels
+from fogros2.host import inspection as host
+from fogros2.host.inspection import Python
+from fogros2.host.wheels import Wheels
 from fogros2.model import Command, MachineSpec
 from fogros2.plan import Underlay
-from fogros2.wheels import Wheels
 
 OURS = ('fogros2', 'ros2-embedded')
 #: What fogros2 requires on the robot alone.
@@ -247,7 +249,7 @@ def test_no_hint_names_our_distributions_to_an_index() -> None:
     assert found == []
 
 
-def test_what_the_robot_sends_compiled_is_pinned_for_others(packed: Wheels) -> None:
+def test_compiled_modules_are_pinned_for_other_machines(packed: Wheels) -> None:
     """The file that is shipped, for each kind of machine: not the test's."""
     names = [locked.name_of(file.partition('-')[0]) for file in packed.hashes
              if not file.endswith('-none-any.whl')]

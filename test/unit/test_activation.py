@@ -44,7 +44,7 @@ def environment(*command: str, **variables: str) -> dict[str, str]:
 
 @pytest.mark.parametrize('shell', ['bash', 'sh'])
 @pytest.mark.parametrize('sourced', [False, True], ids=['fresh', 'ros sourced'])
-def test_activation_sets_what_run_sets(
+def test_activation_sets_the_variables_of_run(
     ros: Path, venv: Path, shell: str, sourced: bool,
 ) -> None:
     before = f'. {ros}/setup.{shell}; ' if sourced else ''
@@ -57,7 +57,7 @@ def test_activation_sets_what_run_sets(
     assert found['PATH'].split(':')[0] == expected['PATH'].split(':')[0] == f'{venv}/bin'
 
 
-def test_deactivate_takes_it_back(ros: Path, venv: Path) -> None:
+def test_deactivate_restores_the_variables(ros: Path, venv: Path) -> None:
     script = f'. {ros}/setup.bash; . {venv}/bin/activate; deactivate; env -0'
     found = environment('bash', '-c', script)
     assert (found['AMENT_PREFIX_PATH'], found['PYTHONPATH']) == (str(ros), f'{ros}/lib')

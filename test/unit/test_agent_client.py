@@ -21,6 +21,7 @@ from fogros2.errors import (
     DeadlineExceeded,
 )
 from fogros2.waiting import wait_until
+from rigs import recorded_agent
 
 Answer = Callable[[dict[str, Any]], list[Any]]
 
@@ -73,9 +74,18 @@ class ScriptedShell:
         return stream
 
 
+def done(request: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """Return a valid answer to any request."""
+    return recorded_agent.answer('status', **{'lost': 0, 'id': request['id'], **changes})
+
+
+def ending(seq: int) -> dict[str, Any]:
+    return {'event': 'ending', 'reason': 'asked to', 'seq': seq}
+
+
 def agent(next_seq: int = 1, **status: Any) -> ScriptedStream:
     def answer(request: dict[str, Any]) -> list[Any]:
-        return [{'id': request['id'], 'ok': True, 'first': 1, 'next': next_seq, **status}]
+        return [done(request, next=next_seq, **status)]
     return ScriptedStream(answer)
 
 
@@ -96,21 +106,20 @@ def until(probe: Callable[[], Any]) -> None:
     wait_until(lambda: bool(probe()), timeout=10, what='it', longest=0.02)
 
 
-def test_a_reply_goes_to_its_request(make):
+def test_reply_goes_to_its_request(make):
     def answer(request):
         return [b'motd of a login script\n', b'[1]\n', b'[' * 100_000 + b'\n',
                 {'id': 999, 'ok': True},
-                {'id': request['id'], 'ok': True, 'echo': request}]
+                done(request, echo=request)]
     client = make(ScriptedStream(answer))
     assert client.request('status', x=1)['echo'] == {'id': 1, 'command': 'status', 'x': 1}
     assert client._shell.command.argv == (
         'python3', '-IS', '/run/x/agent.py', 'connect', '--directory', '/run/x')
 
 
-def test_a_silence_before_the_subscription_does_not_stand_for_it(make):
+def test_ping_before_the_subscription_does_not_replace_it(make):
     def answer(request):
-        said = {} if request['command'] == 'ping' else {'next': 1}
-        return [{'id': request['id'], 'ok': True, **said}]
+        return [done(request, next=1)]
     stream = ScriptedStream(answer)
     client = make(stream, silence=0.2)
     client.request('configure')
@@ -121,7 +130,7 @@ def test_a_silence_before_the_subscription_does_not_stand_for_it(make):
     assert any(request['command'] == 'log' for request in stream.asked)
 
 
-def test_a_refusal_carries_its_hint(make):
+def test_refusal_carries_its_hint(make):
     client = make(ScriptedStream(lambda request: [
         {'id': request['id'], 'ok': False, 'error': 'no', 'hint': 'do x'}]))
     with pytest.raises(AgentError) as caught:
@@ -135,64 +144,64 @@ def test_no_reply_in_time(make):
         client.request('status', timeout=0.05)
 
 
-def test_a_cancelled_launch_waits_for_nothing(make):
+def test_cancelled_launch_waits_for_no_reply(make):
     cancel = threading.Event()
     client = make(ScriptedStream(lambda request: [cancel.set()][1:]), cancel=cancel)
     with pytest.raises(Cancelled):
         client.request('status', timeout=60)
 
 
-def test_events_come_once_and_in_order_over_connections(make):
+def test_events_arrive_once_and_in_order_over_connections(make):
     first, second = agent(), agent(next_seq=6)
     client = make(first, ConnectError('not yet'), second)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
     for seq in (1, 2, 2, 3):
-        first.say({'event': 'x', 'seq': seq})
+        first.say(ending(seq))
     first.say(None)
     until(lambda: second.asked)
     assert second.asked[0]['from'] == 4
     for seq in (3, 4, 5):
-        second.say({'event': 'x', 'seq': seq})
+        second.say(ending(seq))
     until(lambda: len(seen) == 7)
     assert [e.get('seq', e.get('state')) for e in seen] == [1, 2, 3, 'lost', 'back', 4, 5]
 
 
-def test_subscribing_without_a_beginning_shows_what_is_new(make):
+def test_subscription_without_beginning_gets_new_events(make):
     stream = agent(next_seq=40)
     client = make(stream)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append)
     until(lambda: len(stream.asked) == 2)
     assert stream.asked[1]['from'] == 40
-    stream.say({'event': 'old', 'seq': 39})
-    stream.say({'event': 'new', 'seq': 40})
+    stream.say(ending(39))
+    stream.say(ending(40))
     until(lambda: seen)
     assert [e['seq'] for e in seen] == [40]
     later: list[dict[str, Any]] = []
     client.subscribe(later.append)
-    stream.say({'event': 'new', 'seq': 41})
+    stream.say(ending(41))
     until(lambda: later)
     assert [e['seq'] for e in later] == [41] and [e['seq'] for e in seen] == [40, 41]
 
 
-def test_an_agent_with_a_new_log_is_heard_from_its_beginning(make):
+def test_new_log_of_an_agent_is_read_from_its_beginning(make):
     first, second = agent(next_seq=60), agent(next_seq=3)
     client = make(first, second)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
-    first.say({'event': 'x', 'seq': 59})
+    first.say(ending(59))
     until(lambda: seen)
     first.say(None)
     def logs() -> list[Any]:
         return [request['from'] for request in second.asked if request['command'] == 'log']
     until(lambda: len(logs()) == 2)
     assert logs() == [60, 1]
-    second.say({'event': 'y', 'seq': 1})
-    until(lambda: seen[-1]['event'] == 'y')
+    second.say(ending(1))
+    until(lambda: seen[-1].get('seq') == 1)
 
 
-def test_what_rotation_took_away_is_said(make):
+def test_events_lost_by_rotation_are_reported(make):
     client = make(agent(next_seq=10, lost=4))
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
@@ -200,7 +209,7 @@ def test_what_rotation_took_away_is_said(make):
     assert seen == [{'event': 'gap', 'count': 4}]
 
 
-def test_requests_are_asked_again_on_the_next_connection_but_for_signals(make):
+def test_lost_requests_are_repeated_except_signals(make):
     mute = ScriptedStream(lambda request: [])
     client = make(mute, agent())
     results: dict[str, Any] = {}
@@ -221,7 +230,7 @@ def test_requests_are_asked_again_on_the_next_connection_but_for_signals(make):
     assert 'connection was lost' in str(results['signal'])
 
 
-def test_a_machine_without_an_agent_is_not_tried_for_ever(make):
+def test_machine_without_agent_is_given_up(make):
     client = make(ScriptedStream(lambda request: [
         {'error': 'no agent serves /run/x', 'kind': 'absent'}, None]), agent())
     with pytest.raises(AgentError, match='no agent serves /run/x'):
@@ -230,7 +239,7 @@ def test_a_machine_without_an_agent_is_not_tried_for_ever(make):
         client.request('status')
 
 
-def test_an_agent_that_is_being_restarted_is_waited_for(make):
+def test_client_waits_for_a_restarting_agent(make):
     def absent() -> ScriptedStream:
         stream = ScriptedStream(lambda request: [])
         stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
@@ -246,7 +255,7 @@ def test_an_agent_that_is_being_restarted_is_waited_for(make):
     assert [e['state'] for e in seen] == ['lost', 'back']
 
 
-def test_an_agent_that_has_gone_is_given_up(make):
+def test_agent_that_does_not_come_back_is_given_up(make):
     first = agent()
     streams = [ScriptedStream(lambda request: []) for _ in range(50)]
     for stream in streams:
@@ -261,18 +270,18 @@ def test_an_agent_that_has_gone_is_given_up(make):
     assert [e['state'] for e in seen] == ['lost', 'absent']
 
 
-def test_a_program_that_ends_without_a_word_is_given_up(make):
+def test_program_that_ends_without_output_is_given_up(make):
     streams = [ScriptedStream(lambda request: []) for _ in range(50)]
     for stream in streams:
         stream.say(b'python3: can not open file\n')
         stream.say(None)
     client = make(*streams, restart=0.3)
-    with pytest.raises(AgentError, match='without a word'):
+    with pytest.raises(AgentError, match='without an answer'):
         client.request('status')
     assert len(client._shell.opened) < 6
 
 
-def test_a_machine_that_no_longer_takes_our_key_is_not_tried_for_ever(make):
+def test_machine_that_refuses_the_key_is_given_up(make):
     first = agent()
     client = make(first, AuthenticationError('key refused'), agent())
     seen: list[dict[str, Any]] = []
@@ -284,12 +293,12 @@ def test_a_machine_that_no_longer_takes_our_key_is_not_tried_for_ever(make):
         client.request('status')
 
 
-def test_an_unreachable_machine_is_the_callers_to_handle(make):
+def test_unreachable_machine_raises_connect_error(make):
     with pytest.raises(ConnectError):
         make().request('status')
 
 
-def test_close_ends_the_thread_and_what_waits(make):
+def test_close_ends_the_thread_and_waiting_requests(make):
     stream = ScriptedStream(lambda request: [])
     client = make(stream)
     caught: list[Exception] = []
@@ -309,7 +318,7 @@ def test_close_ends_the_thread_and_what_waits(make):
         client.request('status')
 
 
-def test_a_subscriber_that_asks_is_stopped_before_it_hangs(make):
+def test_request_of_a_subscriber_raises(make):
     stream = agent()
     client = make(stream)
     caught: list[Exception] = []
@@ -320,14 +329,14 @@ def test_a_subscriber_that_asks_is_stopped_before_it_hangs(make):
         except RuntimeError as error:
             caught.append(error)
     client.subscribe(subscriber, since=1)
-    stream.say({'event': 'x', 'seq': 1})
+    stream.say(ending(1))
     until(lambda: caught)
     assert 'subscriber' in str(caught[0])
 
 
-def test_a_connection_that_falls_silent_is_given_up(make):
+def test_silent_connection_is_replaced(make):
     mute = ScriptedStream(lambda request: [
-        {'id': request['id'], 'ok': True, 'next': 1}] if request['command'] == 'log' else [])
+        done(request, next=1)] if request['command'] == 'log' else [])
     second = agent()
     # a busy computer may take a while over a thread's turn
     client = make(mute, second, silence=0.8)
@@ -341,7 +350,90 @@ def test_a_connection_that_falls_silent_is_given_up(make):
     assert len(seen) == 2
 
 
-def test_heartbeats_go_out_and_come_back():
+NUMBER = '9' * 400
+#: Messages of a hijacked machine, and the field of each that is wrong.
+INVALID = [
+    ('{"event": ["started"]}', 'event'), ('{"event": null}', 'event'),
+    ('{"event": "started", "node": ["n"], "name": "n", "pid": 1, "cmd": []}', 'node'),
+    ('{"event": "started", "node": "n", "name": "n", "cmd": []}', 'pid'),
+    ('{"event": "started", "node": "n", "name": "n", "pid": 1, "cmd": [1]}', 'cmd'),
+    ('{"event": "started", "node": "n", "name": "n", "pid": true, "cmd": []}', 'pid'),
+    ('{"event": "output", "node": "n", "name": "n", "stream": "stdout", "text": 5}', 'text'),
+    ('{"event": "exited", "node": "n", "name": "n", "returncode": "x", "respawns": false}',
+     'returncode'),
+    ('{"event": "exited", "node": "n", "name": "n", "returncode": 0, "respawns": 0}', 'respawns'),
+    ('{"event": "exited", "node": "n", "name": "n", "returncode": %s, "respawns": false}' % NUMBER,
+     'returncode'),
+    ('{"event": "vpn_repaired", "what": "vpn", "seconds": NaN}', 'seconds'),
+    ('{"event": "vpn_repaired", "what": "vpn", "seconds": 1e999}', 'seconds'),
+    ('{"event": "launch_exited", "returncode": [], "said": ""}', 'returncode'),
+    ('{"event": "unheard of", "seq": "x"}', 'seq'),
+    ('{"event": "ending", "reason": "x", "seq": %s}' % NUMBER, 'seq'),
+    ('{"event": "ending", "reason": {"a": 1}, "seq": 1}', 'reason'),
+    ('{"id": 2, "ok": true}', 'machine'),
+    ('{"id": 2, "ok": false, "error": []}', 'error'),
+    ('{"id": 1, "ok": true, "first": 1, "next": "x", "lost": 0}', 'next'),
+    ('{"id": 1, "ok": true, "first": 1, "next": 1, "lost": %s}' % NUMBER, 'lost'),
+    ('{"id": 1, "ok": false}', 'first'),
+    ('[' * 100_000, 'not an event or an answer'), ('%s0' % (NUMBER * 20), 'not an event'),
+    ('nonsense', 'not an event or an answer'), ('7', 'not an event or an answer'),
+]
+
+
+@pytest.mark.parametrize(('line', 'field'), INVALID, ids=lambda text: text[:40])
+def test_invalid_message_is_reported_once_and_fails_the_machine(make, line, field):
+    stream = ScriptedStream(lambda request: [])
+    client = make(stream, agent())
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    caught: list[Exception] = []
+
+    def ask() -> None:
+        try:
+            client.status()
+        except AgentError as error:
+            caught.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    until(lambda: len(stream.asked) == 2)
+    stream.say({'event': 'unheard of'})  # from a newer agent: ignored
+    stream.say(line.encode() + b'\n')
+    stream.say(ending(1))
+    asking.join(10)
+    assert 'sent an invalid message' in str(caught[0]) and field in str(caught[0])
+    until(lambda: not client._thread.is_alive())
+    assert [(e['event'], e.get('state')) for e in seen] == [('connection', 'absent')]
+    assert field in seen[0]['error'] and len(client._shell.opened) == 1
+    with pytest.raises(AgentError, match='sent an invalid message'):
+        client.status()
+
+
+@pytest.mark.parametrize('name', ['lost', 'connection', 'gap'])
+def test_agent_cannot_forge_events_of_the_robot(make, name):
+    stream = agent()
+    client = make(stream)
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    stream.say({'event': name, 'seq': 1, 'state': 'absent', 'reason': 'x', 'count': 1})
+    stream.say(ending(2))
+    until(lambda: seen)
+    assert [event['event'] for event in seen] == ['ending']
+
+
+def test_torn_line_at_the_end_of_a_connection_is_no_fault(make):
+    first = agent()
+    client = make(first, agent())
+    seen: list[dict[str, Any]] = []
+    client.subscribe(seen.append, since=1)
+    client.status()
+    first.say(b'{"event": "outp')
+    first.say(None)
+    until(lambda: len(seen) == 2)
+    assert [e['state'] for e in seen] == ['lost', 'back']
+
+
+def test_heartbeats_are_sent_and_answers_measured():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as machine:
         machine.bind(('127.0.0.1', 0))
         machine.settimeout(10)
@@ -351,7 +443,10 @@ def test_heartbeats_go_out_and_come_back():
             beat = json.loads(data)
             assert (beat['launch'], beat['n']) == ('abc', number)
         assert heartbeat.round_trip is None and heartbeat.age is None
-        for nonsense in (b'', b'x', b'[]', b'[' * 2000, b'{"launch": "other", "t": 0}'):
+        number = b'9' * 1900  # in the range of Python's integers, out of that of its floats
+        for nonsense in (b'', b'x', b'[]', b'[' * 2000, b'{"launch": "other", "t": 0}',
+                         b'{"launch": "abc", "t": %s}' % number, b'{"launch": "abc", "t": NaN}',
+                         b'{"launch": [], "t": 0}', b'{"launch": "abc", "t": 0, "clock": 1e999}'):
             machine.sendto(nonsense, robot)
         machine.sendto(data, robot)
         until(lambda: heartbeat.round_trip is not None)
@@ -361,7 +456,7 @@ def test_heartbeats_go_out_and_come_back():
 
 
 @pytest.mark.parametrize('address', ['127.0.0.1', '255.255.255.255'])
-def test_a_network_that_is_down_stops_no_heartbeat(address):
+def test_heartbeats_continue_while_the_network_is_down(address):
     # a port that answers 'refused', and an address that may not be sent to
     heartbeat = Heartbeat(address, 9, 'abc', interval=0.02)
     heartbeat._thread.join(0.2)

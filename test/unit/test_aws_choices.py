@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import datetime
 from decimal import Decimal
 import json
+import os
 from pathlib import Path
 import stat
 import threading
@@ -14,12 +15,17 @@ from typing import Any, Optional
 
 import boto3
 from botocore.stub import ANY, Stubber
+from launch import LaunchContext
 import pytest
 
-from fogros2.errors import ConfigurationError, FogError, ProviderError
-from fogros2.provider.aws import choices, prices
-from fogros2.provider.aws.choices import Wants
-from fogros2.provider.aws.prices import InstanceType, Market
+from fogros2.describe import choices
+from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
+from fogros2.provider.aws import AWSProvider, prices
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.offers import MachineType, Wants, wants
+from fogros2.provider.vm import market as markets
+from fogros2.provider.vm.market import Market
 from fogros2.testing.fakes import FakeClock
 from rigs.ec2 import iam
 
@@ -76,18 +82,19 @@ def product(name: str, price: str, unit: str = 'Hrs') -> str:
         'serviceCode': 'AmazonEC2'})
 
 
-class Recorded:
-    """Makes clients that answer one operation each, in pages, and check what they are asked."""
+class Recorded(Account):
+    """An account with clients that answer one operation each, in pages, and check requests."""
 
     def __init__(self) -> None:
+        super().__init__(boto3.Session())
         self.asked: list[tuple[str, str]] = []
         self.error = ''
         self.types: list[dict[str, Any]] = TYPES
         self.prices = PRICES
         self.spot = SPOT
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
-    def __call__(self, service: str, region: str) -> Any:
+    def client(self, service: str, region: str, *, hasty: bool = False) -> Any:
         client = boto3.client(service, region_name=region, aws_access_key_id='testing',
                               aws_secret_access_key='testing')
         recorded = self
@@ -147,7 +154,7 @@ def recorded() -> Recorded:
 
 @pytest.fixture
 def market(recorded: Recorded, tmp_path: Path) -> Market:
-    return Market(recorded, cache=tmp_path, clock=FakeClock(NOW))
+    return Market(Ec2(recorded), cache=tmp_path, clock=FakeClock(NOW))
 
 
 @pytest.mark.parametrize(('asked', 'name'), [
@@ -165,20 +172,20 @@ def market(recorded: Recorded, tmp_path: Path) -> Market:
     ({'spot': True}, 't3.medium'),
     ({'spot': True, 'min_cpu': 8, 'min_memory_gb': 16}, None),
 ])
-def test_the_cheapest_that_fits(
+def test_cheapest_fitting_type_is_chosen(
     market: Market, asked: dict[str, Any], name: Optional[str],
 ) -> None:
     given = {'arch': 'x86_64', **asked}
     if name is None:
         # its only spot price is for a zone that doesn't offer it
-        with pytest.raises(ConfigurationError, match='no EC2 type in eu-central-1 has 8 CPUs'):
-            choices.cheapest_type(REGION, market=market, **given)
+        with pytest.raises(ConfigurationError, match='no AWS type in eu-central-1 has 8 CPUs'):
+            market.choose([REGION], wants(**given))
     else:
-        assert choices.cheapest_type(REGION, market=market, **given) == name
+        assert market.choose([REGION], wants(**given)).chosen.type.name == name
 
 
 def test_prices_are_compared_as_numbers(market: Market) -> None:
-    found = choices.choose([REGION], choices.wants(arch='x86_64', gpu=1), market)
+    found = market.choose([REGION], wants(arch='x86_64', gpu=1))
     assert [(o.type.name, o.price) for o in found.offers] == [
         ('g6.2xlarge', Decimal('9.4000000000')), ('g4dn.2xlarge', Decimal('10.5000000000')),
         ('p4d.24xlarge', Decimal('40.1000000000'))]
@@ -186,18 +193,18 @@ def test_prices_are_compared_as_numbers(market: Market) -> None:
 
 
 def test_spot_takes_the_newest_price_of_the_cheapest_zone(market: Market) -> None:
-    found = choices.choose([REGION], choices.wants(arch='x86_64', spot=True), market)
+    found = market.choose([REGION], wants(arch='x86_64', spot=True))
     assert [(o.type.name, o.spot_price, o.price) for o in found.offers] == [
         ('t3.medium', Decimal('0.0151'), Decimal('0.0480000000')),
         ('t3a.medium', Decimal('0.0160'), Decimal('0.0432000000'))]
 
 
 def test_a_price_cap(market: Market) -> None:
-    asked = choices.wants(arch='x86_64', max_price='0.05')
-    found = choices.choose([REGION], asked, market)
+    asked = wants(arch='x86_64', max_price='0.05')
+    found = market.choose([REGION], asked)
     assert [o.type.name for o in found.offers] == ['t3a.medium', 't3.medium']
     with pytest.raises(ConfigurationError, match=r'at most \$0.01 .*t3a.medium.*\$0.0432'):
-        choices.cheapest_type(REGION, arch='x86_64', max_price=0.01, market=market)
+        market.choose([REGION], wants(arch='x86_64', max_price=0.01))
 
 
 @pytest.mark.parametrize('asked', [
@@ -205,36 +212,37 @@ def test_a_price_cap(market: Market) -> None:
     {'min_cpu': -1}, {'gpu': -1}, {'min_memory_gb': float('nan')}])
 def test_what_makes_no_sense_is_refused(asked: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError):
-        choices.wants(**asked)
+        wants(**asked)
 
 
 def test_the_architecture_is_this_computer_s(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('platform.machine', lambda: 'aarch64')
-    assert choices.wants().arch == 'arm64'
-    assert choices.wants(arch='x86_64').arch == 'x86_64'
+    assert wants().arch == 'arm64'
+    assert wants(arch='x86_64').arch == 'x86_64'
 
 
-def test_as_fogros2_asks(market: Market) -> None:
-    assert choices.find_cheapest_ec2_instance_type(REGION, market=market) == 't2.medium'
-    assert choices.find_cheapest_ec2_instance_type(
-        REGION, cpu_architecture='arm64', default_cores=2, default_threads_per_core=1,
-        gpu=False, market=market) == 't4g.medium'
-    assert choices.find_cheapest_ec2_instance_type(
-        REGION, default_cores=4, default_threads_per_core=2, gpu=True,
-        market=market) == 'g6.2xlarge'
+def test_as_fogros2_asks(market: Market, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AWSProvider, 'offers', lambda self, wanted, regions: market.choose(
+        regions, wanted))
+    context = LaunchContext()
+    find = choices.find_cheapest_ec2_instance_type
+    assert find(REGION).perform(context) == 't2.medium'
+    assert find(REGION, cpu_architecture='arm64', default_cores=2, default_threads_per_core=1,
+                gpu=False).perform(context) == 't4g.medium'
+    assert find(REGION, default_cores=4, default_threads_per_core=2,
+                gpu=True).perform(context) == 'g6.2xlarge'
 
 
 def test_several_regions(recorded: Recorded, market: Market) -> None:
-    found = choices.choose([REGION, 'us-west-1'], choices.wants(arch='x86_64'), market)
+    found = market.choose([REGION, 'us-west-1'], wants(arch='x86_64'))
     assert {offer.region for offer in found.offers} == {REGION, 'us-west-1'}
-    assert choices.cheapest([REGION, 'us-west-1'], arch='x86_64',
-                            market=market).type.name == 't3a.medium'
+    assert found.chosen.type.name == 't3a.medium'
     # each pricing API has the prices of all regions: the nearest is asked
     assert {region for region, what in recorded.asked if what == 'get_products'} == {
         'eu-central-1', 'us-east-1'}
 
 
-def test_a_region_that_can_not_be_asked_is_left_out(
+def test_region_without_an_answer_is_left_out(
     recorded: Recorded, market: Market, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ask = market.zones
@@ -245,35 +253,35 @@ def test_a_region_that_can_not_be_asked_is_left_out(
         return ask(region)
 
     monkeypatch.setattr(market, 'zones', zones)
-    found = choices.choose(['me-south-1', REGION], choices.wants(arch='x86_64'), market)
+    found = market.choose(['me-south-1', REGION], wants(arch='x86_64'))
     assert found.chosen.region == REGION and found.left_out == (('me-south-1', 'not enabled'),)
     with pytest.raises(ProviderError, match='not enabled'):
-        choices.choose(['me-south-1'], Wants(), market)
+        market.choose(['me-south-1'], Wants())
 
 
 def test_price_of_one_type(recorded: Recorded, market: Market) -> None:
     recorded.prices = {'t3.medium': '0.0480000000'}
-    assert choices.price_of(REGION, 't3.medium', market=market) == Decimal('0.048')
-    assert choices.price_of(REGION, 't3.medium', spot=True, market=market) == Decimal('0.0151')
+    assert market.price_of(REGION, 't3.medium') == Decimal('0.048')
+    assert market.price_of(REGION, 't3.medium', spot=True) == Decimal('0.0151')
     assert [what for _, what in recorded.asked] == ['get_products', 'describe_spot_price_history']
     with pytest.raises(ProviderError, match='no price of m9.huge in eu-central-1'):
-        choices.price_of(REGION, 'm9.huge', market=market)
+        market.price_of(REGION, 'm9.huge')
 
 
-def test_what_aws_said_is_kept_for_a_day(recorded: Recorded, tmp_path: Path) -> None:
+def test_answers_of_aws_are_cached_for_a_day(recorded: Recorded, tmp_path: Path) -> None:
     clock = FakeClock(NOW)
 
     def asks() -> int:
         recorded.asked.clear()
-        choices.cheapest_type(REGION, arch='x86_64', spot=True,
-                              market=Market(recorded, cache=tmp_path, clock=clock))
+        Market(Ec2(recorded), cache=tmp_path, clock=clock).choose(
+            [REGION], wants(arch='x86_64', spot=True))
         return len(recorded.asked)
 
     assert asks() == 4
     assert asks() == 0
     for path in tmp_path.iterdir():
         assert stat.S_IMODE(path.stat().st_mode) == 0o600 and path.suffix == '.json'
-    clock.advance(prices.CACHE_AGE - 1)
+    clock.advance(markets.CACHE_AGE - 1)
     assert asks() == 0
     clock.advance(2)
     assert asks() == 4
@@ -284,9 +292,9 @@ def test_what_aws_said_is_kept_for_a_day(recorded: Recorded, tmp_path: Path) -> 
 def test_another_endpoint_is_not_believed(
     recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    Market(recorded, cache=tmp_path).prices(REGION)
+    Market(Ec2(recorded), cache=tmp_path).prices(REGION)
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
-    Market(recorded, cache=tmp_path).prices(REGION)
+    Market(Ec2(recorded), cache=tmp_path).prices(REGION)
     assert len(recorded.asked) == 2
 
 
@@ -294,30 +302,30 @@ def test_another_endpoint_is_not_believed(
     lambda text: '', lambda text: text[:len(text) // 2], lambda text: '[]',
     lambda text: text.replace('0.0480000000', 'gratis'), lambda text: 'null',
     lambda text: text.replace('t3.medium', 't3.\\ud800'), lambda text: '{"source": 1}'])
-def test_a_damaged_cache_is_asked_for_anew(
+def test_damaged_cache_is_requested_again(
     recorded: Recorded, tmp_path: Path, damage: Callable[[str], str],
 ) -> None:
-    Market(recorded, cache=tmp_path, clock=FakeClock(NOW)).prices(REGION)
+    Market(Ec2(recorded), cache=tmp_path, clock=FakeClock(NOW)).prices(REGION)
     path = tmp_path / f'prices-{REGION}.json'
     path.write_text(damage(path.read_text()))
-    found = Market(recorded, cache=tmp_path, clock=FakeClock(NOW)).prices(REGION)
+    found = Market(Ec2(recorded), cache=tmp_path, clock=FakeClock(NOW)).prices(REGION)
     assert found['t3a.medium'] == Decimal('0.0432')
 
 
-def test_types_of_a_cache_from_another_version_are_asked_for_anew(
+def test_cache_of_another_version_is_not_used(
     recorded: Recorded, tmp_path: Path,
 ) -> None:
-    Market(recorded, cache=tmp_path, clock=FakeClock(NOW)).types(REGION)
+    Market(Ec2(recorded), cache=tmp_path, clock=FakeClock(NOW)).types(REGION)
     path = tmp_path / f'types-{REGION}.json'
     path.write_text(path.read_text().replace('"vcpus"', '"threads"'))
-    assert len(Market(recorded, cache=tmp_path, clock=FakeClock(NOW)).types(REGION)) == 11
+    assert len(Market(Ec2(recorded), cache=tmp_path, clock=FakeClock(NOW)).types(REGION)) == 11
 
 
 def test_a_folder_that_can_not_be_written_costs_time_alone(
     recorded: Recorded, tmp_path: Path,
 ) -> None:
     (tmp_path / 'file').write_text('')
-    market = Market(recorded, cache=tmp_path / 'file' / 'below')
+    market = Market(Ec2(recorded), cache=tmp_path / 'file' / 'below')
     assert market.prices(REGION)['t3.medium'] == Decimal('0.048')
 
 
@@ -337,7 +345,7 @@ def test_a_refusal_is_a_fog_error(recorded: Recorded, market: Market) -> None:
 
 
 def test_the_policy_allows_what_is_asked(recorded: Recorded, market: Market) -> None:
-    choices.choose([REGION], choices.wants(arch='x86_64'), market, spot_too=True)
+    market.choose([REGION], wants(arch='x86_64'), spot_too=True)
     asked = {f"{'pricing' if what == 'get_products' else 'ec2'}:{xform_back(what)}"
              for _, what in recorded.asked}
     assert len(asked) == 4 and asked <= set(iam.ACTIONS)
@@ -355,5 +363,25 @@ def test_a_list_of_prices_that_can_not_be_read() -> None:
 def test_types_are_read() -> None:
     kinds = [prices.instance_type(kind) for kind in TYPES]
     assert kinds[-1] is None
-    assert kinds[8] == InstanceType('g6.2xlarge', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4',
+    assert kinds[8] == MachineType('g6.2xlarge', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4',
                                     22.4, True)
+
+
+def test_prices_without_credentials_measure_no_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(*_: Any) -> str:
+        raise AssertionError('took seconds, for nothing')
+
+    for name in list(os.environ):
+        if name.startswith('AWS_'):
+            monkeypatch.delenv(name)
+    for name in ('AWS_CONFIG_FILE', 'AWS_SHARED_CREDENTIALS_FILE'):
+        monkeypatch.setenv(name, os.devnull)
+    monkeypatch.setenv('AWS_EC2_METADATA_DISABLED', 'true')
+    monkeypatch.setattr(AWSProvider, 'nearest', measured)
+    with pytest.raises(PrerequisiteError, match='there are no AWS credentials'):
+        AWSProvider().offers(wants())
+
+
+def test_an_unknown_region_of_aws_is_named() -> None:
+    with pytest.raises(ConfigurationError, match='AWS has no region mars-1'):
+        AWSProvider().regions(['mars-1'])

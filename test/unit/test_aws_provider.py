@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import datetime
 from decimal import Decimal
@@ -24,13 +23,15 @@ import time
 import pytest
 import yaml
 
+from fogros2.agent_client import joined
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider.aws import AWSProvider, clients, failures, instances, network
-from fogros2.provider.aws import user_data as boot
-from fogros2.provider.aws.host_key import one_time
-from fogros2.provider.aws.instances import MachineId, Place
-from fogros2.provider.aws.options import check_spec, Options
+from fogros2.provider.aws.options import Options
+from fogros2.provider.vm import address, cloud
+from fogros2.provider.vm import user_data as boot
+from fogros2.provider.vm.cloud import Order, Place
+from fogros2.provider.vm.host_key import one_time
 from fogros2.waiting import wait_until
 from rigs.ec2 import iam
 
@@ -51,7 +52,7 @@ def spec(**options):
 # -- options ----------------------------------------------------------------------------------
 
 
-def test_options_of_fogros2_are_taken_in_every_form_a_launch_file_has():
+def test_options_of_fogros2_are_accepted_in_every_form():
     options = Options.parse({
         'ami_image': None, 'region': 'us-west-1', 'ec2_instance_type': 't2.xlarge',
         'disk_size': '40', 'spot': 'True', 'arch': 'amd64', 'min_cpu': '8', 'gpu': True,
@@ -116,9 +117,9 @@ def test_options_by_region_are_those_of_the_region():
         options.in_region('us-east-1')
 
 
-def test_a_spot_instance_that_should_stop_is_refused_before_anything():
+def test_spot_with_stop_is_refused_before_creation():
     with pytest.raises(ConfigurationError, match="can't be stopped"):
-        check_spec(dataclasses.replace(spec(spot=True), on_exit='stop'))
+        Options.of(dataclasses.replace(spec(spot=True), on_exit='stop'))
 
 
 # -- requests to EC2 -----------------------------------------------------------------------------
@@ -128,21 +129,25 @@ def request(options=None, **changes):
     asked = spec(**(options or {}))
     parsed = Options.parse(asked.options)
     asked = dataclasses.replace(asked, **changes)
-    return instances.run_request(
-        asked, REQUEST, parsed, place=Place('eu-central-1', 't3.medium'), image=IMAGE,
-        group='sg-own', tags=instances.own_tags(asked, REQUEST, parsed), user_data=b'x')
+    tags = cloud.own_tags(asked, REQUEST, parsed)
+    order = Order(asked, REQUEST, parsed, tags, b'x', ())
+    return instances.run_request(Place('eu-central-1', 't3.medium'), order, IMAGE, 'sg-own', tags)
+
+
+def token(place):
+    return Order(SPEC, REQUEST, None, {}, b'', ()).token(place)
 
 
 def test_a_machine_is_asked_for_as_it_has_to_be():
     words = request({'security_groups': ['sg-2'], 'iam_instance_profile': 'robots'})
-    attempt = instances.attempt_of(TOKEN)
+    attempt = cloud.attempt_of(TOKEN)
     tags = {'Name': 'planner', 'fogros2-launch': 'l1', 'fogros2-name': 'planner',
             'fogros2-attempt': attempt, 'fogros2-user': 'ubuntu',
             'fogros2-dependencies': 'abcd', 'fogros2-disk-gb': '40'}
     listed = [{'Key': key, 'Value': value} for key, value in tags.items()]
     assert words == {
         'ImageId': 'ami-1', 'InstanceType': 't3.medium', 'MinCount': 1, 'MaxCount': 1,
-        'ClientToken': instances.client_token(TOKEN, Place('eu-central-1', 't3.medium')),
+        'ClientToken': token(Place('eu-central-1', 't3.medium')),
         'KeyName': f'fogros2-{attempt}', 'UserData': b'x',
         'InstanceInitiatedShutdownBehavior': 'terminate',
         'MetadataOptions': {'HttpTokens': 'required', 'HttpEndpoint': 'enabled',
@@ -174,11 +179,11 @@ def test_a_spot_machine_is_asked_for_once_and_with_its_cap():
 def test_tokens_differ_by_place_and_tell_nothing_of_the_request():
     places = [Place('eu-central-1', 't3.medium'), Place('eu-central-1', 't3.medium', 'subnet-1'),
               Place('us-east-1', 't3.medium'), Place('eu-central-1', 't3.large')]
-    tokens = [instances.client_token(TOKEN, place) for place in places]
+    tokens = [token(place) for place in places]
     assert len(set(tokens)) == 4
-    assert tokens == [instances.client_token(TOKEN, place) for place in places]
+    assert tokens == [token(place) for place in places]
     assert all(len(token) <= 64 and TOKEN not in token for token in tokens)
-    assert TOKEN not in instances.attempt_of(TOKEN)
+    assert TOKEN not in cloud.attempt_of(TOKEN)
 
 
 def test_a_filter_takes_a_tag_by_its_letters():
@@ -201,14 +206,18 @@ def instance(state='running', **more):
         'Tags': instances.tag_list(tags), **more}
 
 
+def machine_of(entry):
+    return AWSProvider().machine_of(instances.vm_of('eu-central-1', entry))
+
+
 def test_an_instance_becomes_a_machine():
-    machine = instances.machine_of('eu-central-1', instance())
+    machine = machine_of(instance())
     assert machine.id == 'aws:eu-central-1/i-0abc/0123456789abcdef'
-    assert (machine.name, machine.state, machine.place) == (
+    assert (machine.name, machine.state, machine.region) == (
         'planner', MachineState.RUNNING, 'eu-central-1')
     assert (machine.shell.host, machine.shell.user, machine.shell.host_key) == (
         '198.51.100.9', 'ubuntu', 'ssh-ed25519 AAAA')
-    assert (machine.vpn_host, machine.inner_network, machine.inner_host) == (
+    assert (machine.vpn_host, machine.private_network, machine.private_ip) == (
         '198.51.100.9', 'aws:vpc-1', '10.0.0.9')
     assert machine.cost_per_hour == Decimal('0.0416')
     assert machine.created == 1767225600.0
@@ -220,16 +229,16 @@ def test_an_instance_becomes_a_machine():
     ('pending', 'pending'), ('running', 'running'), ('stopping', 'stopping'),
     ('stopped', 'stopped'), ('shutting-down', 'deleted'), ('terminated', 'deleted')])
 def test_every_state_has_a_word(state, ours):
-    machine = instances.machine_of('eu-central-1', instance(state))
+    machine = machine_of(instance(state))
     assert str(machine.state) == ours
     assert (machine.shell is not None) == (state == 'running')
 
 
 def test_a_machine_says_since_when_it_is_stopped():
-    machine = instances.machine_of('eu-central-1', instance(
+    machine = machine_of(instance(
         'stopped', StateTransitionReason='User initiated (2026-01-01 00:00:00 GMT)'))
     assert machine.stopped == 1767225600.0
-    assert instances.machine_of('eu-central-1', instance('stopped')).stopped is None
+    assert machine_of(instance('stopped')).stopped is None
 
 
 def test_the_address_is_the_public_one_or_what_there_is():
@@ -245,7 +254,7 @@ def test_the_address_is_the_public_one_or_what_there_is():
     'aws:eu-central-1/i-0abc/0123456789abcdef/..'])
 def test_a_foreign_id_is_no_machine(text):
     with pytest.raises(MachineNotFound):
-        MachineId.parse(text)
+        AWSProvider().describe(text)
 
 
 # -- who comes in -------------------------------------------------------------------------------
@@ -279,75 +288,75 @@ def echo(monkeypatch):
     thread = threading.Thread(target=server.serve_forever, args=(0.02,))
     thread.start()
     url = f'http://127.0.0.1:{server.server_port}/'
-    monkeypatch.setenv(network.CHECKIP_VARIABLE, url)
-    monkeypatch.delenv(network.ADDRESS_VARIABLE, raising=False)
+    monkeypatch.setenv(address.CHECKIP_VARIABLE, url)
+    monkeypatch.delenv(address.ADDRESS_VARIABLE, raising=False)
     yield url, said
     server.shutdown()
     thread.join()
     server.server_close()
 
 
-def test_the_robots_address_is_what_aws_sees_and_asked_once_for_all_machines(echo):
+def test_robot_address_is_asked_once_for_all_machines(echo):
     _, said = echo
     said.append((200, '198.51.100.7\n'))
-    address = network.RobotAddress()
-    assert address() == address() == '198.51.100.7/32'
+    own = address.RobotAddress()
+    assert own() == own() == '198.51.100.7/32'
     assert not said
 
 
 def test_a_robot_with_ipv6_is_let_in_by_that_too(echo, monkeypatch):
     _, said = echo
-    monkeypatch.setattr(network, 'own_ipv6', lambda: '2001:db8::7/128')
+    monkeypatch.setattr(address, 'own_ipv6', lambda: '2001:db8::7/128')
     said += [(200, '198.51.100.7\n'), (503, '')]
-    address = network.RobotAddress()
-    assert address.with_ipv6([address()]) == ['198.51.100.7/32', '2001:db8::7/128']
+    own = address.RobotAddress()
+    assert own.with_ipv6([own()]) == ['198.51.100.7/32', '2001:db8::7/128']
     # what somebody has named is that alone, and nobody is nobody
-    assert address.with_ipv6(['198.51.100.0/24']) == ['198.51.100.0/24']
-    assert address.with_ipv6([]) == []
+    assert own.with_ipv6(['198.51.100.0/24']) == ['198.51.100.0/24']
+    assert own.with_ipv6([]) == []
     # and one that has nothing else is known by that
-    assert network.RobotAddress()() == '2001:db8::7/128'
+    assert address.RobotAddress()() == '2001:db8::7/128'
 
 
-@pytest.mark.parametrize('address, known', [
+@pytest.mark.parametrize('own, known', [
     ('2606:4700::1', '2606:4700::1/128'), ('fd00::1', ''), ('2001:db8::1', '')])
-def test_only_an_ipv6_address_that_others_see_is_one(monkeypatch, address, known):
+def test_only_an_ipv6_address_that_others_see_is_one(monkeypatch, own, known):
     class Probe(socket.socket):
         def connect(self, far):
             assert ipaddress.ip_address(far[0]).is_global
 
         def getsockname(self):
-            return address, 40000, 0, 0
+            return own, 40000, 0, 0
 
-    monkeypatch.setattr(network.socket, 'socket', Probe)
-    assert network.own_ipv6() == known
+    monkeypatch.setattr(address.socket, 'socket', Probe)
+    assert address.own_ipv6() == known
 
 
 def test_what_was_chosen_is_said_in_words():
     asked = spec(region='nearest', ec2_instance_type='cheapest')
     chosen = spec(region='eu-central-1', ec2_instance_type='t3a.medium')
-    words = AWSProvider.choices
-    assert words(None, asked, chosen) == ['t3a.medium in eu-central-1']
+    words = AWSProvider().choices
+    assert words(asked, chosen) == ['t3a.medium in eu-central-1']
     chosen = spec(region='eu-central-1', ec2_instance_type='t3a.medium',
                   instance_types=['t3.medium', 'm7a.large'], regions=('eu-west-3', 'eu-west-2'))
-    assert ', '.join(words(None, asked, chosen)) == (
+    assert ', '.join(words(asked, chosen)) == (
         't3a.medium in eu-central-1, without room there t3.medium or m7a.large, '
         'in eu-west-3 or eu-west-2')
 
 
 @pytest.mark.parametrize('answer', [(200, '<html>log in to this hotel</html>'), (503, '')])
-def test_an_echo_that_tells_no_address_is_named_with_the_way_around_it(echo, answer):
+def test_bad_answer_with_the_robot_address_has_a_hint(echo, answer):
     _, said = echo
     said.append(answer)
-    with pytest.raises(ProviderError, match=network.ADDRESS_VARIABLE):
-        network.RobotAddress()()
+    with pytest.raises(ProviderError, match=address.ADDRESS_VARIABLE):
+        address.RobotAddress()()
 
 
 def test_the_robots_address_can_be_named(monkeypatch):
-    monkeypatch.setenv(network.ADDRESS_VARIABLE, '2001:db8::7')
-    assert network.RobotAddress()() == '2001:db8::7/128'
-    monkeypatch.setenv(network.ADDRESS_VARIABLE, 'home')
+    monkeypatch.setenv(address.ADDRESS_VARIABLE, '2001:db8::7')
+    assert address.RobotAddress()() == '2001:db8::7/128'
+    monkeypatch.setenv(address.ADDRESS_VARIABLE, 'home')
     with pytest.raises(ConfigurationError, match='home'):
-        network.RobotAddress()()
+        address.RobotAddress()()
 
 
 # -- boot ---------------------------------------------------------------------------------------
@@ -427,7 +436,7 @@ def booted(tmp_path):
             os.kill(int(found.parent.name), signal.SIGKILL)
 
 
-def test_an_instance_that_boots_is_guarded_by_the_agent_it_was_sent(booted):
+def test_booting_instance_starts_its_agent(booted):
     user = os.environ.get('USER') or subprocess.run(
         ['id', '-un'], capture_output=True, text=True).stdout.strip()
     told = boot.cloud_config(
@@ -444,7 +453,7 @@ def test_an_instance_that_boots_is_guarded_by_the_agent_it_was_sent(booted):
     status = json.loads(answer.stdout.splitlines()[0])
     assert status['ok'] and status['machine'] == 'planner', status
     assert oct((top / 'opt/fogros2/agent.json').stat().st_mode)[-3:] == '600'
-    assert program.read_text().rstrip() == boot.bare((ROOT / 'fogros2/agent.py').read_text())
+    assert program.read_text() == joined()
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
@@ -481,29 +490,6 @@ def test_a_machine_that_can_not_be_guarded_ends(booted, monkeypatch):
     assert (top / 'ended').read_text() == '-h now\n'
 
 
-def test_agent_travels_with_its_line_numbers():
-    """A traceback in the machine's log names the lines of agent.py."""
-    def code(text):
-        return [(type(node).__name__, node.lineno) for node in ast.walk(ast.parse(text))
-                if isinstance(node, ast.stmt)]
-
-    source = (ROOT / 'fogros2/agent.py').read_text()
-    assert code(boot.bare(source)) == code(source)
-
-
-def test_bare_program_runs_the_same_without_its_prose():
-    source = '"""Doc."""\nx = \'# no comment\'  # a comment\n\n\n' \
-        'class A:\n    """Doc\n    of A."""\n\n\n' \
-        'def f(a):\n    """Say."""\n    return f"""{a}\n\n  # b"""\n'
-    plain, short = {}, {}
-    exec(compile(source, 'plain', 'exec'), plain)  # noqa: S102 - it is written above
-    exec(compile(boot.bare(source), 'short', 'exec'), short)  # noqa: S102
-    assert (plain['x'], plain['f']('1')) == (short['x'], short['f']('1'))
-    assert not short['A'].__doc__
-    for word in ('Say', 'Doc', 'a comment'):
-        assert word not in boot.bare(source)
-
-
 @pytest.mark.parametrize(('answers', 'status'), [
     ([(200, 'token'), (404, '')], 1),
     ([(200, 'token'), (200, '{"action": "terminate", "time": "2026-01-01T00:02:00Z"}')], 0),
@@ -511,8 +497,9 @@ def test_bare_program_runs_the_same_without_its_prose():
 def test_the_notice_of_a_spot_instance_is_asked_for_with_a_token(echo, answers, status):
     url, said = echo
     said += answers
-    assert AWSProvider.notice[-2:] == ('169.254.169.254', '80')
-    argv = [*AWSProvider.notice[:-2], *url.strip('/').removeprefix('http://').split(':')]
+    notice = AWSProvider.capabilities.preemption_notice
+    assert notice[-2:] == ('169.254.169.254', '80')
+    argv = [*notice[:-2], *url.strip('/').removeprefix('http://').split(':')]
     result = subprocess.run(argv, capture_output=True, text=True, timeout=20)
     assert result.returncode == status, result.stderr
     assert ('terminate' in result.stdout) == (status == 0)
@@ -563,7 +550,7 @@ def test_a_page_of_a_proxy_is_told_without_its_markup():
     assert '502 Bad gateway' in told and '<' not in told and len(told) < 400
 
 
-def test_the_action_that_a_policy_lacks_is_named():
+def test_missing_action_of_a_policy_is_named():
     plain = ('You are not authorized to perform this operation. User: arn:aws:iam::1:user/x is '
              'not authorized to perform: ec2:CreateTags on resource: arn:aws:ec2:* because no '
              'identity-based policy allows the ec2:CreateTags action.')
@@ -606,7 +593,7 @@ def test_nothing_of_boto3_is_loaded_by_looking_at_the_provider():
 # -- rights -------------------------------------------------------------------------------------
 
 
-def test_the_policy_allows_each_action_once_and_the_documentation_has_it():
+def test_policy_names_each_action_once_as_documented():
     document = iam.policy()
     listed = [action for statement in document['Statement'] for action in statement['Action']]
     assert sorted(set(listed)) == sorted(set(iam.ACTIONS))
@@ -623,7 +610,7 @@ def free_port() -> int:
     return port
 
 
-def test_no_way_to_aws_is_said_in_one_line(monkeypatch):
+def test_unreachable_aws_is_one_line(monkeypatch):
     for name, value in {'AWS_ACCESS_KEY_ID': 'x', 'AWS_SECRET_ACCESS_KEY': 'x',
                         'FOGROS2_AWS_REGIONS': 'eu-central-1',
                         'AWS_ENDPOINT_URL': f'http://127.0.0.1:{free_port()}'}.items():

@@ -47,7 +47,7 @@ def test_child_without_result_shows_its_errors(streaming: Any, printed: str) -> 
         streaming.answer_of(process, 'the camera', 20)
 
 
-def test_child_that_is_late_is_ended_and_named(streaming: Any) -> None:
+def test_late_child_is_ended_and_named(streaming: Any) -> None:
     process = child('import time; print("{}", flush=True); time.sleep(60)')
     with pytest.raises(RuntimeError, match='the camera gave no result within 1 s'):
         streaming.answer_of(process, 'the camera', 1)

@@ -12,19 +12,21 @@ from typing import Any
 
 import pytest
 
-from fogros2 import bootstrap, host, process
+from fogros2 import process
 from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
-from fogros2.host import HostFacts, Python
+from fogros2.host import bootstrap
+from fogros2.host import inspection as host
+from fogros2.host.inspection import HostFacts, Python
+from fogros2.host.wheels import Wheels
 from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import Underlay
-from fogros2.wheels import Wheels
 
 TOOLS = frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 NOBLE = HostFacts(
-    system='ubuntu', release='24.04', codename='noble', architecture='x86_64', uid=1000,
+    system='ubuntu', release='24.04', architecture='x86_64', uid=1000,
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True, pythons=(PYTHON,),
-    programs=TOOLS, tun=True, free_bytes=50 << 30)
+    programs=TOOLS, free_bytes=50 << 30)
 ROS = dataclasses.replace(
     NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
     programs=TOOLS | {'colcon', 'rosdep'})
@@ -163,13 +165,13 @@ route 10.0.0.0/24
 installed 0123
 """)
     assert facts == HostFacts(
-        system='ubuntu', release='24.04', codename='noble', architecture='aarch64', uid=1000,
+        system='ubuntu', release='24.04', architecture='aarch64', uid=1000,
         user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,
         pythons=(PYTHON, Python('/usr/local/bin/python3.10', (3, 10), False)),
         programs=frozenset({'rsync', 'sudo'}), ros={'jazzy': '/opt/ros/jazzy'},
-        rmw={'jazzy': ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp')}, tun=True,
+        rmw={'jazzy': ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp')},
         free_bytes=1 << 20, routes=('10.0.0.0/24',), installed=frozenset({'0123'}))
-    assert facts.has_ros
+    assert facts.has_rmw(host.RMW)
 
 
 def test_facts_of_nothing_are_defaults() -> None:
@@ -195,19 +197,19 @@ def test_a_machine_like_the_robot_needs_nothing() -> None:
 
 def test_auto_takes_ros_where_it_is() -> None:
     todo = plan(ROS)
-    assert todo.mode == 'none' and todo.send_wheels
+    assert todo.mode == 'none' and todo.wheels_target
     assert todo.install.kind == 'ros'
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
     assert todo.install.environment['PYTHONPATH'] == '/home/ubuntu/.local/share/fogros2/k1/site'
     assert todo.install.environment['ROS_DOMAIN_ID'] == '7'
     assert 'ROS_DISTRO' not in todo.install.environment
     again = plan(dataclasses.replace(ROS, installed=frozenset({'k1'})))
-    assert (again.send_wheels, again.commands, again.note) == (False, (), 'there already')
+    assert (again.wheels_target, again.commands, again.note) == ('', (), 'there already')
 
 
 def test_auto_takes_the_embedded_default_elsewhere() -> None:
     todo = plan(NOBLE)
-    assert todo.mode == 'embedded' and todo.send_wheels
+    assert todo.mode == 'embedded' and todo.wheels_target
     assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1/wheels'
     script = scripts(todo.commands)
     assert '--no-index' in script and '--without-pip' in script
@@ -283,7 +285,7 @@ def test_same_packages_of_another_processor_are_not_alike() -> None:
     assert bootstrap.plan_alike(spec, arm, robot, UNDER, ()) is None
 
 
-def test_what_another_processor_lacks_is_named_before_creation(tmp_path: Path) -> None:
+def test_missing_build_for_another_processor_is_named(tmp_path: Path) -> None:
     def check(architecture: str, space: Any = None, **spec: Any) -> None:
         bootstrap.check_architecture(
             MachineSpec('m', 'aws', **spec), architecture, space, lambda: FULL)
@@ -310,7 +312,7 @@ def test_what_another_processor_lacks_is_named_before_creation(tmp_path: Path) -
             MachineSpec('m', 'aws', bootstrap='embedded'), 'aarch64', compiled, lambda: pure)
 
 
-def test_a_robots_wheel_of_which_no_other_build_is_pinned_is_named() -> None:
+def test_wheel_without_a_build_for_the_machine_is_named() -> None:
     odd = dataclasses.replace(WHEELS, hashes={
         **WHEELS.hashes, 'fast_odd-1-cp312-cp312-linux_x86_64.whl': 'o1'})
     assert plan(NOBLE, wheel=odd).mode == 'embedded'
@@ -354,7 +356,7 @@ def test_apt_installs_ros_on_noble_alone() -> None:
         plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'apt')
 
 
-def test_auto_installs_ros_where_the_embedded_default_is_not_enough() -> None:
+def test_auto_installs_ros_where_embedded_is_not_enough() -> None:
     assert plan(NOBLE, wheel=dataclasses.replace(WHEELS, embedded=False)).mode == 'apt'
     with pytest.raises(PrerequisiteError, match='embedded default to send.*Ubuntu 24.04'):
         plan(DEBIAN, wheel=dataclasses.replace(WHEELS, embedded=False))
@@ -406,7 +408,7 @@ def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -
     assert [way.commands for way in todo.install.workspaces] == [()]
 
 
-def test_an_unbuilt_workspace_says_so_where_nothing_builds_it(tmp_path: Path) -> None:
+def test_unbuilt_workspace_is_reported(tmp_path: Path) -> None:
     manifest = tmp_path / 'src/demo/package.xml'
     manifest.parent.mkdir(parents=True)
     manifest.write_text('<package><name>demo</name></package>')
@@ -439,7 +441,7 @@ def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:
     return [bootstrap.workspaces.inspect(tmp_path / name) for name in ('top', 'base')]
 
 
-def test_an_underlay_that_is_built_there_is_sourced_below_the_rest(tmp_path: Path) -> None:
+def test_underlay_built_on_the_machine_is_sourced_first(tmp_path: Path) -> None:
     chain = two_workspaces(tmp_path)
     there = dataclasses.replace(
         NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
@@ -452,7 +454,7 @@ def test_an_underlay_that_is_built_there_is_sourced_below_the_rest(tmp_path: Pat
                              f'{tmp_path}/top/install/local_setup.sh')
 
 
-def test_dependencies_of_underlays_and_of_the_launch_count_for_the_image(tmp_path: Path) -> None:
+def test_image_hash_covers_underlays_and_the_launch(tmp_path: Path) -> None:
     two_workspaces(tmp_path)
     top = MachineSpec('m', 'aws', workspace=f'{tmp_path}/top')
     both = dataclasses.replace(top, underlays=(f'{tmp_path}/base',))

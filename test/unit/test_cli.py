@@ -32,6 +32,7 @@ from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
 from fogros2.testing.plugins import instead, MemoryProvider
+from rigs import recorded_agent
 from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
 
@@ -43,15 +44,15 @@ class Memory(MemoryProvider):
 
     name = 'memory'
     machines: dict[str, Machine] = {}
-    regions: list[str] = []
+    searched: list[str] = []
 
     def destroy(self, machine_id: str) -> None:
         if machine_id == 'stuck':
             raise ProviderError('the cloud said no', 'ask again')
         super().destroy(machine_id)
 
-    def set_regions(self, regions: list[str]) -> None:
-        type(self).regions = regions
+    def search_in(self, regions: list[str]) -> None:
+        type(self).searched = regions
 
 
 class Untagged(Memory):
@@ -69,7 +70,7 @@ def providers(monkeypatch: pytest.MonkeyPatch) -> None:
     classes: dict[str, type[Memory]] = {'memory': Memory, 'untagged': Untagged}
     for provider in classes.values():
         provider.machines = {}
-        provider.regions = []
+        provider.searched = []
     instead(monkeypatch, 'fogros2.provider', {
         **classes,
         'nosdk': PrerequisiteError("the provider 'nosdk' can't be loaded", 'pip install nosdk')})
@@ -92,7 +93,7 @@ def record(name: str, machine_id: Optional[str] = '', provider: str = 'memory',
                   machine_id=f'id-{name}' if machine_id == '' else machine_id,
                   created=time.time() - 600, launch='abc123')
     made = dataclasses.replace(made, **changes)
-    return Store().machine(name).save(made)
+    return Store().save(made)
 
 
 def alive() -> dict[str, int]:
@@ -125,7 +126,7 @@ def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
 def test_list_shows_what_providers_and_the_store_know(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    machine('alive', cost_per_hour=Decimal('0.0416'), place='eu-west-1', kind='t3.medium')
+    machine('alive', cost_per_hour=Decimal('0.0416'), region='eu-west-1', kind='t3.medium')
     record('alive', **alive())
     machine('orphan', cost_per_hour=Decimal('1.2'))
     machine('other', robot='somebody-7')
@@ -174,15 +175,15 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert 595 < entry['age'] < 700 and 3500 < entry['time_left'] < 3600
 
 
-def test_region_reaches_providers_that_have_some(capsys: pytest.CaptureFixture[str]) -> None:
+def test_region_is_passed_to_providers_with_regions(capsys: pytest.CaptureFixture[str]) -> None:
     assert run('list', '--region', 'eu-central-1', 'us-west-1') == 0
-    assert Memory.regions == ['eu-central-1', 'us-west-1']
+    assert Memory.searched == ['eu-central-1', 'us-west-1']
     for word in ('all', '*'):
         assert run('list', '--region', word) == 0
-        assert Memory.regions == ['all']
+        assert Memory.searched == ['all']
 
 
-def test_another_robot_s_machine_is_not_ours_by_its_name() -> None:
+def test_machine_of_another_robot_does_not_get_our_record() -> None:
     machine('slam', 'theirs', robot='somebody-7')
     record('slam', 'ours')
     found = machines.survey(lambda text: None)
@@ -190,20 +191,20 @@ def test_another_robot_s_machine_is_not_ours_by_its_name() -> None:
         ('theirs', False, False), ('ours', True, True)]
 
 
-def test_delete_takes_the_machine_and_the_record(capsys: pytest.CaptureFixture[str]) -> None:
+def test_delete_removes_machine_and_record(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a')
     record('a', **dead())
     assert run('delete', 'a', '--dry-run') == 0
     assert 'would delete a' in capsys.readouterr().out
-    assert 'id-a' in Memory.machines and Store().machine('a').exists()
+    assert 'id-a' in Memory.machines and Store().exists('a')
     assert run('delete', 'a', '--yes') == 0
     assert 'deleted a' in capsys.readouterr().out
-    assert not Memory.machines and not Store().machine('a').path.exists()
+    assert not Memory.machines and not Store().machine('a').exists()
     assert run('delete', 'a', '--yes') == 1
     assert "no machine 'a'" in capsys.readouterr().err
 
 
-def test_delete_of_one_that_ended_by_itself_takes_what_it_left(
+def test_delete_clears_leftovers_of_an_ended_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     destroyed: list[str] = []
@@ -212,13 +213,26 @@ def test_delete_of_one_that_ended_by_itself_takes_what_it_left(
     record('b', machine_id=None, **dead())
     assert run('delete', 'a', '--yes') == 0 and run('delete', 'b', '--yes') == 0
     assert destroyed == ['id-a']
-    assert not Store().machine('a').exists()
+    assert not Store().exists('a')
 
 
-def test_delete_asks(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture[str]) -> None:
+    machine('a')
+    record('a', machine_id=None, **dead())
+    machine('b', 'id-of-a-neighbour')
+    record('b', machine_id=None, **{**dead(), 'launch': 'fedcba'})
+    assert entries()['a'].state == 'running (launch gone)'
+    assert run('gc') == 0
+    assert 'cleared machine a: its launch is gone' in capsys.readouterr().out
+    assert [*Memory.machines] == ['id-of-a-neighbour']
+
+
+def test_delete_asks_for_confirmation(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
     machine('a')
     assert run('delete', 'a') == 1
-    assert 'nobody is here to ask' in capsys.readouterr().err
+    assert 'no terminal to ask at' in capsys.readouterr().err
     for answer, status in (('n', 1), ('', 1), ('y', 0)):
         monkeypatch.setattr('sys.stdin.isatty', lambda: True, raising=False)
         monkeypatch.setattr('builtins.input', lambda text, answer=answer: answer)
@@ -235,18 +249,18 @@ def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str
     assert run('delete', 'a', '--yes', '--force') == 0
     assert not Memory.machines
     # its launch takes the record down itself
-    assert Store().machine('a').exists()
+    assert Store().exists('a')
 
 
-def test_delete_without_a_store(capsys: pytest.CaptureFixture[str]) -> None:
+def test_delete_works_without_a_record(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a')
     assert run('delete', 'a', '-y') == 0
     assert not Memory.machines
 
 
-def test_delete_with_a_damaged_record() -> None:
+def test_delete_works_with_a_damaged_record() -> None:
     machine('a')
-    folder = Store().machine('a').path
+    folder = Store().machine('a')
     folder.mkdir(parents=True)
     (folder / 'record.json').write_text('nonsense')
     assert run('delete', 'a', '-y') == 0
@@ -264,7 +278,7 @@ def test_delete_all_leaves_other_robots_alone(capsys: pytest.CaptureFixture[str]
     assert not Memory.machines
 
 
-def test_delete_by_name_takes_one_s_own_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_delete_by_name_prefers_own_machine(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a', 'ours')
     machine('a', 'theirs', robot='somebody-7')
     assert run('delete', 'a', '--yes') == 0
@@ -276,7 +290,7 @@ def test_delete_by_name_takes_one_s_own_first(capsys: pytest.CaptureFixture[str]
     assert 'of the robot somebody-7' in capsys.readouterr().out
 
 
-def test_one_failure_stops_nothing_and_keeps_the_record(
+def test_failed_deletion_keeps_record_and_stops_no_other(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     machine('a', 'stuck')
@@ -285,15 +299,15 @@ def test_one_failure_stops_nothing_and_keeps_the_record(
     assert run('delete', 'all', '-y') == 1
     out = capsys.readouterr()
     assert 'a: the cloud said no (ask again)' in out.err and 'deleted b' in out.out
-    assert Store().machine('a').exists()
+    assert Store().exists('a')
 
 
-def test_a_provider_that_can_not_be_asked_is_not_forgotten() -> None:
+def test_machine_of_a_silent_provider_is_not_forgotten() -> None:
     record('a', provider='nosdk', **dead())
     assert run('delete', 'a', '-y') == 1
-    assert Store().machine('a').exists()
+    assert Store().exists('a')
     assert run('delete', 'a', '-y', '--force') == 0
-    assert not Store().machine('a').exists()
+    assert not Store().exists('a')
 
 
 @pytest.mark.parametrize(('changes', 'record_changes', 'reason'), [
@@ -309,7 +323,9 @@ def test_a_provider_that_can_not_be_asked_is_not_forgotten() -> None:
     ({'state': MachineState.STOPPED, 'created': NOW - 3600}, {'launch': ''}, ''),
     ({'state': MachineState.DELETED}, {'launch': ''}, 'gone at its provider'),
 ])
-def test_what_gc_ends(changes: Any, record_changes: Any, reason: str) -> None:
+def test_gc_ends_machines_that_nobody_needs(
+    changes: Any, record_changes: Any, reason: str,
+) -> None:
     found = machine('a', **{'expires': NOW + 600, **changes})
     known = None
     if record_changes is not None:
@@ -319,7 +335,7 @@ def test_what_gc_ends(changes: Any, record_changes: Any, reason: str) -> None:
     assert said.startswith(reason) and bool(said) == bool(reason)
 
 
-def test_gc_clears_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_gc_clears_and_reports_leftovers(capsys: pytest.CaptureFixture[str]) -> None:
     assert run('gc') == 0
     assert capsys.readouterr().out == 'nothing to clear\n'
     machine('old', expires=time.time() - 600)
@@ -335,16 +351,16 @@ def test_gc_clears_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(Memory.machines) == 3
     assert run('gc') == 0
     assert sorted(Memory.machines) == ['id-busy', 'id-kept']
-    assert not Store().machine('gone').exists()
-    kept = Store().machine('kept').load()
+    assert not Store().exists('gone')
+    kept = Store().load('kept')
     assert kept.launch == '' and kept.machine_id == 'id-kept'
-    assert Store().machine('busy').load().launch == 'abc123'
+    assert Store().load('busy').launch == 'abc123'
     capsys.readouterr()
     assert run('gc') == 0
     assert capsys.readouterr().out == 'nothing to clear\n'
 
 
-def test_gc_is_not_done_where_a_provider_can_not_be_asked(
+def test_gc_fails_if_a_provider_does_not_answer(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     record('a', provider='nosdk', **dead())
@@ -352,18 +368,18 @@ def test_gc_is_not_done_where_a_provider_can_not_be_asked(
     assert run('gc') == 1
     assert capsys.readouterr().out == \
         "could not clear machine a: the provider 'nosdk' can't be asked\n"
-    assert Store().machine('a').exists()
+    assert Store().exists('a')
 
 
-def test_a_computer_that_another_robot_has_by_now_is_left_alone(
+def test_delete_leaves_a_computer_of_another_robot_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Agent(FakeStream):
         def write(self, data: bytes) -> None:
             for line in data.splitlines():
                 asked.append(json.loads(line)['command'])
-                self.say(json.dumps({'id': json.loads(line)['id'], 'ok': True,
-                                     'launch': 'theirs'}).encode() + b'\n')
+                self.say(json.dumps(recorded_agent.answer(
+                    'status', id=json.loads(line)['id'], launch='theirs')).encode() + b'\n')
 
     asked: list[str] = []
     shell = FakeShell(streams=[Agent()], handlers={'test': lambda c: Result(0, '', '')})
@@ -375,7 +391,7 @@ def test_a_computer_that_another_robot_has_by_now_is_left_alone(
     assert asked == ['status'] and [c.argv[0] for c in shell.commands] == ['test']
 
 
-def test_an_agent_that_has_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     """It took its program along: a client would try for seconds to run it."""
     ran: list[str] = []
 
@@ -392,7 +408,7 @@ def test_an_agent_that_has_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatc
     assert shell.opened == [] and shell.closed == 1
 
 
-def test_a_machine_that_was_reused_lives_from_then_on() -> None:
+def test_lifetime_of_a_reused_machine_starts_again() -> None:
     made = machine('a', expires=NOW - 3600)
     entry = Entry('a', 'memory', made, record('a', on_exit='keep', launch='', armed=NOW - 60))
     assert entry.expires == NOW - 60 + entry.record.spec.lifetime
@@ -406,13 +422,14 @@ def test_gc_stops_the_daemon_of_a_kept_machines_launch(
 ) -> None:
     done: list[str] = []
     monkeypatch.setattr(endings.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
-    monkeypatch.setattr(endings, '_take_down', lambda vpn, kind: done.append(vpn.name))
+    monkeypatch.setattr(endings.process, 'run',
+                        lambda command, **more: done.append(' '.join(command.argv)))
     interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
     kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
     endings.let_go(kept, Store())
     # the daemon is a node with the interface
-    assert done == ['abc123', 'fogabc123']
-    assert Store().machine('a').load().launch == ''
+    assert done[0] == 'abc123' and 'fogabc123' in done[-1]
+    assert Store().load('a').launch == ''
 
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
@@ -425,9 +442,9 @@ def test_leftover_launch_folders_are_found_by_their_process() -> None:
             (folder / 'process.json').write_text(json.dumps(about))
     record('a', launch='dddddd', **dead())
     store.launch('dddddd')
-    assert [left.launch for left in endings.leftovers(store)] == ['bbbbbb', 'eeeeee']
+    assert [left.name for left in endings.leftovers(store)] == ['bbbbbb', 'eeeeee']
     later = time.time() + endings.FOLDER_AGE + 60
-    assert [left.launch for left in endings.leftovers(store, later)] == [
+    assert [left.name for left in endings.leftovers(store, later)] == [
         'bbbbbb', 'cccccc', 'eeeeee']
 
 
@@ -517,7 +534,7 @@ def test_shell_ends_a_command_that_ignores_signals(
     assert not Path('/proc', (tmp_path / 'said').read_text().strip()).exists()
 
 
-def test_shell_is_the_users_own(
+def test_shell_starts_the_users_shell(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
 ) -> None:
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
@@ -547,7 +564,7 @@ def test_shell_is_the_users_own(
 
 
 @pytest.mark.parametrize('verb', ['status', 'logs', 'connect', 'env', 'delete'])
-def test_an_unknown_machine_is_one_line_and_a_status(
+def test_unknown_machine_is_one_line_and_a_status(
     verb: str, capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = [verb, 'nowhere'] + (['--yes'] if verb == 'delete' else [])
@@ -559,12 +576,12 @@ def test_an_unknown_machine_is_one_line_and_a_status(
 
 
 @pytest.mark.parametrize('name', ['a b', 'x;rm -rf', '../up', 'UPPER', ''])
-def test_a_name_that_can_not_be_one(name: str) -> None:
+def test_invalid_machine_name_is_refused(name: str) -> None:
     for verb in ('status', 'env', 'connect'):
         assert 'no name for a machine' in str(run(verb, name))
 
 
-def test_names_are_completed_without_asking_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_are_completed_without_asking_providers(monkeypatch: pytest.MonkeyPatch) -> None:
     from ros2fog_cli.verb import complete_names
     monkeypatch.setattr(Memory, 'find', lambda *a: 1 / 0)
     record('alpha')
@@ -576,11 +593,11 @@ def test_names_are_completed_without_asking_anybody(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(('seconds', 'text'), [
     (None, '-'), (-1, 'over'), (0, '0 s'), (119, '119 s'), (120, '2 min'), (7199, '2 h 00 min'),
     (3600 * 30 + 300, '30 h 05 min'), (86400 * 3 + 7200, '3 d 2 h')])
-def test_durations(seconds: Optional[float], text: str) -> None:
+def test_durations_have_at_most_two_units(seconds: Optional[float], text: str) -> None:
     assert table.duration(seconds) == text
 
 
-def test_sizes_and_costs() -> None:
+def test_sizes_and_costs_have_units() -> None:
     assert [table.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
         '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
     assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'

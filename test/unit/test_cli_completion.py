@@ -30,7 +30,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     """Return what completes a line, on a computer that has two machines and no network."""
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'state'))
     for name in ('planner', 'mapper'):
-        Store().machine(name).save(Record(name, 'container', MachineSpec(name, 'container')))
+        Store().save(Record(name, 'container', MachineSpec(name, 'container')))
 
     def complete(line: str) -> list[str]:
         answer = tmp_path / 'answer'
@@ -62,7 +62,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 launch --machine mapper=', [
         'mapper=aws', 'mapper=container', 'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
 ])
-def test_a_line_goes_on_as(complete: Complete, line: str, offered: list[str]) -> None:
+def test_command_line_is_completed(complete: Complete, line: str, offered: list[str]) -> None:
     begin = time.monotonic()
     words = [word for word in complete(line) if not word.startswith('-')]
     seconds = time.monotonic() - begin

@@ -19,7 +19,7 @@ from fogros2 import process
 from ros2fog_cli.api import doctor, lan
 
 
-def test_it_runs_here(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_passes_on_this_computer(capsys: pytest.CaptureFixture[str]) -> None:
     status = main(argv=['fog', 'doctor', '--json', '--lan-seconds', '0'])
     checks = json.loads(capsys.readouterr().out)
     assert len(checks) >= 15
@@ -32,7 +32,7 @@ def test_it_runs_here(capsys: pytest.CaptureFixture[str]) -> None:
             assert check['remedy']
 
 
-def test_people_get_a_line_and_a_remedy(
+def test_check_is_printed_with_its_remedy(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_nobody_cpp')
@@ -43,7 +43,7 @@ def test_people_get_a_line_and_a_remedy(
     assert 'unset it' in lines[at + 1]
 
 
-def test_a_missing_python_package_is_named() -> None:
+def test_missing_python_package_is_named() -> None:
     """In a process of its own: doctor itself runs without paramiko."""
     found = subprocess.run(
         [sys.executable, '-c', "import sys; sys.modules['paramiko'] = None\n"
@@ -56,7 +56,7 @@ def test_a_missing_python_package_is_named() -> None:
     assert 'python3-paramiko,' in check['remedy'] and 'Traceback' not in found.stderr
 
 
-def test_ros2_without_ros_says_so_in_a_line(tmp_path: Path) -> None:
+def test_ros2_without_rclpy_is_one_line(tmp_path: Path) -> None:
     program = Path(__file__).parents[2] / 'tools' / 'ros2.py'
     said = subprocess.run(
         [sys.executable, '-I', '-S', str(program), 'topic', 'list'], capture_output=True,
@@ -74,7 +74,7 @@ def test_missing_programs_are_named_with_their_packages(monkeypatch: pytest.Monk
     assert 'apt-get install rsync wireguard-tools' in check.remedy
 
 
-def test_no_wireguard_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_wireguard_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, '_succeeds', lambda *words: False)
     monkeypatch.setattr(Path, 'exists', lambda self: False)
     monkeypatch.setattr(process, 'which', lambda program: None)
@@ -85,14 +85,16 @@ def test_no_wireguard_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(('uri', 'verdict'), [
     ('', 'ok'), ('<CycloneDDS/>', 'ok'), ('<CycloneDDS>', 'failed'),
     ('file:///nowhere/x.xml', 'failed'), ('/nowhere/x.xml', 'failed')])
-def test_the_user_s_cyclone_configuration(
+def test_cyclone_configuration_of_the_user_is_checked(
     uri: str, verdict: str, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv('CYCLONEDDS_URI', uri)
     assert doctor.cyclone_uri().verdict == verdict
 
 
-def test_several_cyclone_configurations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_cyclone_configuration_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
     good, bad = tmp_path / 'good.xml', tmp_path / 'bad.xml'
     good.write_text('<CycloneDDS/>')
     bad.write_text('CycloneDDS')
@@ -103,7 +105,7 @@ def test_several_cyclone_configurations(tmp_path: Path, monkeypatch: pytest.Monk
     assert check.verdict == 'failed' and 'bad.xml' in check.detail
 
 
-def test_the_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_folder_must_be_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / 'state'
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(folder))
     assert 'will be made' in doctor.state().detail
@@ -114,7 +116,7 @@ def test_the_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert doctor.state().verdict == 'ok'
 
 
-def test_a_firewall_that_drops_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dropping_firewall_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = ('table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; '
              'policy drop;\n\t\t%s\n\t}\n}\n')
 
@@ -130,7 +132,7 @@ def test_a_firewall_that_drops_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.firewall().verdict == 'ok'
 
 
-def test_the_announcement_is_what_the_specification_says() -> None:
+def test_announcement_follows_the_rtps_specification() -> None:
     message = lan.announcement(bytes(range(12)), '198.51.100.7', 5000, 3)
     assert message[:4] == b'RTPS' and message[8:20] == bytes(range(12))
     kind, flags, length = struct.unpack_from('<BBH', message, 20)
@@ -140,7 +142,7 @@ def test_the_announcement_is_what_the_specification_says() -> None:
     assert socket.inet_aton('198.51.100.7') in message
 
 
-def test_answers_of_others_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_participants_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in for another computer answers an announcement from an address of its own."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(('127.0.0.2', 0))
@@ -172,7 +174,7 @@ sys.stdin.read()
 """
 
 
-def test_a_real_participant_on_another_computer_is_found(tmp_path: Path) -> None:
+def test_participant_on_another_computer_is_found(tmp_path: Path) -> None:
     """Two network namespaces on one wire: Cyclone DDS as it is out of the box in one of them."""
     pytest.importorskip('cyclonedds', reason='this interpreter has no Cyclone DDS of its own')
     if os.geteuid() != 0:
@@ -208,7 +210,7 @@ read -r _ <{tmp_path}/up
     assert done.stdout.strip() == "{'198.51.100.2': 1}", done.stderr
 
 
-def test_a_second_thread_may_ask_meanwhile() -> None:
+def test_doctor_runs_in_any_thread() -> None:
     threads = [threading.Thread(target=doctor.examine, kwargs={'lan_seconds': 0})
                for _ in range(2)]
     for thread in threads:
@@ -216,3 +218,16 @@ def test_a_second_thread_may_ask_meanwhile() -> None:
     for thread in threads:
         thread.join(60)
         assert not thread.is_alive()
+
+
+@pytest.mark.parametrize('program', ['nft', 'sudo'])
+def test_firewall_check_names_the_missing_program(program, monkeypatch):
+    from fogros2.errors import PrerequisiteError
+
+    def run(*args, **more):
+        raise PrerequisiteError(f'{program} not found on this computer', 'install it')
+
+    monkeypatch.setattr(doctor.process, 'run', run)
+    check = doctor.firewall()
+    assert check.verdict == 'warning' and f'{program} not found' in check.detail
+    assert program == 'nft' or 'nft' not in check.detail

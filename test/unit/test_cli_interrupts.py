@@ -12,7 +12,7 @@ import pytest
 from ros2fog_cli.api.interrupts import interruptible
 
 
-def test_a_ctrl_c_ends_what_threads_wait_for():
+def test_ctrl_c_ends_waiting_threads():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), interruptible() as cancel, \
             ThreadPoolExecutor(1) as pool:
@@ -24,7 +24,7 @@ def test_a_ctrl_c_ends_what_threads_wait_for():
 
 
 @pytest.mark.parametrize('own', [signal.SIG_IGN, lambda number, frame: None])
-def test_who_takes_signals_otherwise_is_left_alone(own):
+def test_other_signal_handlers_are_kept(own):
     before = signal.signal(signal.SIGINT, own)
     try:
         with interruptible() as cancel:
@@ -35,7 +35,7 @@ def test_who_takes_signals_otherwise_is_left_alone(own):
         signal.signal(signal.SIGINT, before)
 
 
-def test_only_the_main_thread_takes_signals():
+def test_only_the_main_thread_handles_signals():
     def inside():
         with interruptible() as cancel:
             return cancel.is_set()

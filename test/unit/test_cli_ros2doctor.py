@@ -56,7 +56,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     del sys.modules['ros2fog_cli.ros2doctor']
 
 
-def test_it_counts_and_says_what_is_wrong(module: Any) -> None:
+def test_ros2_doctor_counts_failures_and_warnings(module: Any) -> None:
     check = module.FogCheck()
     with pytest.warns(UserWarning) as said:
         result = check.check()
@@ -66,7 +66,7 @@ def test_it_counts_and_says_what_is_wrong(module: Any) -> None:
     assert check.category() == module.FogReport().category() == 'fogros2'
 
 
-def test_its_report_has_everything(module: Any) -> None:
+def test_ros2_doctor_reports_every_check(module: Any) -> None:
     report = module.FogReport().report()
     assert report.name == 'FOGROS2'
     assert report.items == [
@@ -76,6 +76,6 @@ def test_its_report_has_everything(module: Any) -> None:
 
 @pytest.mark.parametrize('group, name', [
     ('ros2doctor.checks', 'FogCheck'), ('ros2doctor.report', 'FogReport')])
-def test_ros2doctor_finds_them(module: Any, group: str, name: str) -> None:
+def test_ros2_doctor_finds_check_and_report(module: Any, group: str, name: str) -> None:
     (point,) = [one for one in metadata.entry_points(group=group) if one.name == name]
     assert point.load() is getattr(module, name)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+import re
 import socket
 import subprocess
 import sys
@@ -18,7 +19,6 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 from launch import LaunchContext
 
 from fogros2 import cloud_launch
-from fogros2.agent_client import cloud_launch_source
 from fogros2.cloud_launch import RefusedNode, resolve
 
 
@@ -46,7 +46,7 @@ def obey(tmp_path: Path):
     theirs.close()
 
 
-def test_markers_become_this_machines_paths(prefix):
+def test_markers_become_paths_of_this_machine(prefix):
     assert resolve('plain', {}) == 'plain'
     assert resolve(['a ', {'share': 'pack'}, '/x'], {}) == f'a {prefix}/share/pack/x'
     assert resolve([{'prefix': 'pack'}], {}) == str(prefix)
@@ -55,12 +55,12 @@ def test_markers_become_this_machines_paths(prefix):
 
 
 @pytest.mark.parametrize('text', [[{'file': 'k'}], [{'new': 'x'}], [{}]])
-def test_markers_unknown_here_are_refused(prefix, text):
+def test_unknown_markers_are_refused(prefix, text):
     with pytest.raises(RefusedNode, match='means nothing'):
         resolve(text, {})
 
 
-def test_an_unknown_package_is_refused_with_the_nearest_name(prefix):
+def test_unknown_package_is_refused_with_the_nearest_name(prefix):
     with pytest.raises(RefusedNode) as caught:
         resolve([{'share': 'packk'}], {})
     assert "package 'packk' not found" in str(caught.value)
@@ -69,7 +69,7 @@ def test_an_unknown_package_is_refused_with_the_nearest_name(prefix):
         resolve([{'prefix': '../x'}], {})
 
 
-def test_executables_are_the_packages(prefix):
+def test_executable_is_found_in_its_package(prefix):
     assert cloud_launch.find_executable('pack', 'talker') == f'{prefix}/lib/pack/talker'
     for name in ('listener', 'notes', ''):
         with pytest.raises(RefusedNode) as caught:
@@ -77,7 +77,7 @@ def test_executables_are_the_packages(prefix):
         assert caught.value.hint == 'it has: notes, talker'
 
 
-def test_a_spec_becomes_launchs_own_process(prefix, obey):
+def test_spec_becomes_a_process_of_launch(prefix, obey):
     process = obey._process({
         'id': '1', 'name': 'talker-7', 'package': 'pack', 'executable': 'talker',
         'prefix': ['nice', '-n', '5'], 'environment': {'A': [{'share': 'pack'}]},
@@ -90,7 +90,7 @@ def test_a_spec_becomes_launchs_own_process(prefix, obey):
     assert process.output == {}
 
 
-def test_files_are_private_and_named_for_people(prefix, obey):
+def test_files_are_private_and_have_readable_names(prefix, obey):
     process = obey._process({
         'id': '1', 'name': 'n', 'arguments': ['true', [{'file': '/home/me/params.yaml'}],
                                               [{'file': '../../evil'}]],
@@ -114,24 +114,25 @@ def test_files_are_private_and_named_for_people(prefix, obey):
     ({'arguments': ['true'], 'environment': {'PATH': '/no/such'}}, "'true' not found"),
     ({'package': 'pack', 'executable': 'none'}, "'none' not found in package 'pack'"),
 ])
-def test_what_can_not_run_is_refused_before_launch_sees_it(prefix, obey, spec, reason):
+def test_missing_program_is_refused_before_launch_starts_it(prefix, obey, spec, reason):
     with pytest.raises(RefusedNode, match=reason):
         obey._process({'id': '1', 'name': 'n', **spec})
 
 
-def test_a_shell_command_is_left_to_the_shell(obey):
+def test_shell_command_is_not_checked(obey):
     assert obey._process({'id': '1', 'name': 'n', 'shell': True, 'arguments': ['a | b']}).shell
 
 
-def test_it_imports_nothing_of_fogros2():
-    text = cloud_launch_source().read_text()
-    assert not [line for line in text.splitlines()
-                if line.strip().startswith(('import fogros2', 'from fogros2'))]
+def test_launch_file_imports_nothing_of_fogros2():
+    text = Path(cloud_launch.__file__).read_text()
+    assert re.findall(r'^.*(?:import|from) fogros2.*', text, re.MULTILINE) == [
+        '    from fogros2.events import NodeEvent']
+    assert 'if TYPE_CHECKING:\n    from fogros2.events' in text
 
 
-def test_it_runs_as_a_launch_file_of_its_own_and_ends_with_its_agent(tmp_path):
+def test_launch_file_runs_alone_and_ends_with_its_agent(tmp_path):
     path = tmp_path / 'cloud.launch.py'
-    path.write_bytes(cloud_launch_source().read_bytes())
+    path.write_bytes(Path(cloud_launch.__file__).read_bytes())
     ours, theirs = socket.socketpair()
     ours.settimeout(30)
     child = subprocess.Popen(
@@ -155,19 +156,19 @@ def test_it_runs_as_a_launch_file_of_its_own_and_ends_with_its_agent(tmp_path):
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith('files-')] == []
 
 
-def test_a_full_disk_refuses_the_node_and_nothing_else(prefix, obey, monkeypatch):
+def test_full_disk_refuses_only_the_node(prefix, obey, monkeypatch):
     def full(key, text):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(obey, '_write', full)
     told = []
-    monkeypatch.setattr(obey, '_report', lambda event, node, **data: told.append((event, data)))
+    monkeypatch.setattr(obey, '_report', told.append)
     obey._start(None, {'id': '1', 'name': 'n', 'arguments': ['true'], 'files': {'k': 'text'}})
-    (event, data), = told
-    assert event == 'refused' and 'No space left' in data['error']
+    event, = told
+    assert event['event'] == 'refused' and 'No space left' in event['error']
 
 
-def test_start_by_hand_says_what_the_file_is_for():
+def test_start_by_hand_explains_the_launch_file():
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
     environment.pop('FOGROS2_AGENT_FD', None)
     done = subprocess.run(
@@ -188,7 +189,7 @@ def program(folder, first, text='import sys; print(sys.executable)'):
 
 
 @pytest.mark.parametrize('lost', ['/gone/.venv/bin/python', '/gone/bin/python3.12'])
-def test_a_python_program_of_a_lost_python_runs_with_this_one(tmp_path, obey, lost):
+def test_program_of_a_missing_python_runs_with_this_one(tmp_path, obey, lost):
     process = obey._process({
         'id': 'p', 'name': 'p', 'arguments': [program(tmp_path, lost)]})
     context = LaunchContext()
@@ -197,18 +198,18 @@ def test_a_python_program_of_a_lost_python_runs_with_this_one(tmp_path, obey, lo
     assert said.stdout.strip() == sys.executable, said.stderr
 
 
-def test_a_program_whose_interpreter_is_there_keeps_it(tmp_path):
+def test_program_keeps_an_existing_interpreter(tmp_path):
     assert cloud_launch.interpreter([program(tmp_path, '/bin/sh')]) == []
     assert cloud_launch.interpreter([program(tmp_path, '/usr/bin/env python3')]) == []
     assert cloud_launch.interpreter(['/bin/sh']) == cloud_launch.interpreter([]) == []
 
 
-def test_a_program_of_another_lost_interpreter_is_refused(tmp_path, obey):
+def test_program_of_another_missing_interpreter_is_refused(tmp_path, obey):
     with pytest.raises(RefusedNode, match="is for the interpreter '/gone/bin/ruby'"):
         obey._process({'id': 'p', 'name': 'p', 'arguments': [program(tmp_path, '/gone/bin/ruby')]})
 
 
-def test_a_package_that_is_a_lost_link_gets_no_guess(prefix, tmp_path):
+def test_package_with_a_broken_link_gets_no_suggestion(prefix, tmp_path):
     index = prefix / 'share/ament_index/resource_index/packages'
     (index / 'rob_tools').symlink_to(tmp_path / 'gone')
     with pytest.raises(RefusedNode) as error:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 Source = pytest.Config.ArgsSource
 
 
-def test_there_is_one_version() -> None:
+def test_all_files_have_the_same_version() -> None:
     version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
     assert version and re.fullmatch(r'\d+\.\d+\.\d+', version)
     for name in ('fogros2_examples', 'image_transport_h264'):
@@ -30,7 +30,7 @@ def test_there_is_one_version() -> None:
 @pytest.mark.parametrize(('prefix', 'source', 'quick'), [
     ('fogros2', Source.TESTPATHS, True), ('fogros2', Source.ARGS, False),
     (None, Source.TESTPATHS, False)])
-def test_the_quick_part_is_for_colcon_that_names_no_test(
+def test_colcon_without_arguments_runs_the_fast_tests(
     prefix: str | None, source: Source, quick: bool,
 ) -> None:
     spec = importlib.util.spec_from_file_location('quick', ROOT / 'test' / 'conftest.py')

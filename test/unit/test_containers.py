@@ -7,29 +7,29 @@ from collections.abc import Sequence
 import os
 from pathlib import Path
 import subprocess
-import threading
-from types import SimpleNamespace
+from typing import Optional
 
 from launch import LaunchContext, LaunchDescription
 from launch.launch_description_sources import get_launch_description_from_any_launch_file
 import pytest
 
-from fogros2 import container_scripts, containers
-from fogros2.actions import words
-from fogros2.actions.machines import ContainerInstance
 from fogros2.actions.nodes import CloudNode
-from fogros2.containers import Container, parse
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds
 from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch
-from fogros2.deploy.beside import Containers
+from fogros2.deploy.steps.containers import Containers
+from fogros2.describe import values
+from fogros2.describe.machines import ContainerInstance
 from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
+from fogros2.host import container_scripts, containers
+from fogros2.host.containers import Container, parse
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
+from fogros2.provider import Provider
 from fogros2.provider.container import ContainerProvider
-from fogros2.report import step
+from fogros2.shell import Shell
 from fogros2.testing.fakes import FakeProvider, FakeShell
-from fogros2.waiting import Timeouts
+from rigs import deploying
 
 
 @pytest.mark.parametrize(('line', 'meant'), [
@@ -77,7 +77,7 @@ def test_each_launch_has_names_of_its_own():
     assert (node.name, node.arguments[-2]) == ('b-1', 'fogros2-abcdef-1-b-1')
 
 
-def test_what_a_machine_is_given_is_checked_where_it_is_written():
+def test_arguments_of_a_machine_are_checked_at_once():
     machine = ContainerInstance(name='m')
     machine.add_docker_container('docker run image')
     machine.add_docker_container(image='image', ports=['80:80'])
@@ -88,7 +88,7 @@ def test_what_a_machine_is_given_is_checked_where_it_is_written():
     assert 'ports' in error.value.hint
 
 
-def test_a_machine_that_can_not_run_them_is_refused_before_it_is_made(monkeypatch):
+def test_machine_without_containers_is_refused_first(monkeypatch):
     monkeypatch.setattr(ContainerProvider, 'check_containers', lambda self, spec: (
         super(ContainerProvider, self).check_containers(spec)))
     # a computer without sudo makes no machine, and this test makes none
@@ -113,7 +113,7 @@ def test_short_names_are_docker_s(image, name):
     assert containers.qualified(image) == name
 
 
-def test_a_node_in_an_image_is_a_process_with_the_node_s_words_in_it():
+def test_node_in_an_image_has_the_arguments_of_the_node():
     node = NodeSpec(
         '1', 'eyes-1', 'demo', 'talker', ('--ros-args', '--params-file', ({'file': 'p'},)),
         prefix=('nice', '-n', '5'), files={'p': 'a: 1'},
@@ -143,7 +143,7 @@ def test_options_of_an_image_are_options_alone(wrong):
         containers.node_container('image', wrong)
 
 
-def test_a_container_machine_has_the_rights_when_they_are_asked_for():
+def test_container_machine_has_the_requested_rights():
     def options(machine):
         return machine.spec(LaunchContext()).options
 
@@ -181,7 +181,7 @@ def test_an_image_is_an_attribute_in_xml(tmp_path, options):
     assert node._image == 'ros:jazzy'
     context = LaunchContext()
     context.launch_configurations['options'] = '--gpus=all, --init'
-    assert words.resolve(context, node._image_options) == ['--gpus=all', '--init']
+    assert values.resolve(context, node._image_options) == ['--gpus=all', '--init']
 
 
 # --- DDS -----------------------------------------------------------------------------------------
@@ -275,12 +275,12 @@ def test_containers_start_once_their_configuration_is_there(engine, monkeypatch)
         return {'ROS_DOMAIN_ID': '7'}
 
     there.start(environment)
-    assert shell.files['/run/fogros2/container-variables'] == (
+    assert shell.files['/run/fogros2/m/container-variables'] == (
         b'ROS_DOMAIN_ID=7\n', 0o600)
     first, second = (line for line in notes() if ' run ' in line)
     assert first.endswith(
-        ' --label fogros2-launch=abc --env-file /run/fogros2/container-variables --network host'
-        ' --ipc host -v /run/fogros2/dds.xml:/run/fogros2/dds.xml:ro ros:jazzy')
+        ' --label fogros2-launch=abc --env-file /run/fogros2/m/container-variables --network host'
+        ' --ipc host -v /run/fogros2/m/dds.xml:/run/fogros2/m/dds.xml:ro ros:jazzy')
     assert second.endswith(' --label fogros2-launch=abc -p 80:80 web')
     # no middleware is brought to an image that has a network, or a middleware, of its own
     assert sum(' create ' in line for line in notes()) == 1
@@ -395,7 +395,7 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
     assert told[-1] == f'{engine} rm -f fogros2-abc-eyes'
 
 
-def test_gpus_are_told_in_the_engine_s_words(engine):
+def test_gpu_options_are_those_of_the_engine(engine):
     container = parse('docker run --gpus 1 -p 80:80 image run')
     told = done(containers.run(container, 0, 'abc', 'image', '/run/dds.xml', '/run/variables'))[1]
     gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
@@ -409,16 +409,14 @@ def here(command: Command) -> Result:
 
 
 def beside(
-        shell: object, *lines: str, images: Sequence[str] = (), provider: object = FakeProvider(),
+        shell: Shell, *lines: str, images: Sequence[str] = (),
+        provider: Optional[Provider] = None,
 ) -> Containers:
-    job = SimpleNamespace(
-        name='m', spec=MachineSpec('m', 'fake', containers=lines), timeouts=Timeouts(),
-        provider=provider,
-        cancel=threading.Event(), step=lambda name: step(lambda event: None, 'm', name),
-        undoing=lambda name, undo: None, survives=True, launch=SimpleNamespace(
-            id='abc', images=lambda name: images,
-            dds=lambda: SimpleNamespace(rmw='rmw_cyclonedds_cpp')))
-    return Containers(job, shell, '/run/fogros2', '/run/fogros2/dds.xml')
+    context, job = deploying.job(
+        Path('/nowhere'), MachineSpec('m', 'fake', containers=lines), provider=provider,
+        images=images, launch='abc')
+    job.shell = shell
+    return Containers(context, job)
 
 
 def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
@@ -431,7 +429,7 @@ def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
         'unknown (is its name right, and may anybody download it?)')
 
 
-def test_images_that_nodes_will_run_in_are_fetched_before_and_once(engine, monkeypatch):
+def test_images_of_nodes_are_fetched_once_in_advance(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'localhost/a:1')
     shell = FakeShell(handlers={'sh': here})
     containers_there = beside(shell, images=['localhost/a:1'])
@@ -451,7 +449,7 @@ def test_a_node_that_comes_late_has_to_fit_its_machine_too():
     assert shell.commands == []
 
 
-def test_a_machine_without_an_engine_and_without_apt_says_so():
+def test_machine_without_engine_and_apt_is_reported():
     shell = FakeShell(handlers={'sh': lambda command: Result(
         127 if 'apt-get' in command.argv[-1] else 0, '\n', 'sh: 2: apt-get: not found')})
     with pytest.raises(PrerequisiteError, match="'m' has neither podman nor docker.*apt-get"):
@@ -459,18 +457,16 @@ def test_a_machine_without_an_engine_and_without_apt_says_so():
 
 
 @pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])
-def test_a_computer_that_stays_keeps_no_container(survives, used):
+def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
     shell = FakeShell(handlers={'sh': lambda command: Result(0, 'podman\n', '')})
-    there, undos, tidied = beside(shell, provider=FakeProvider()), [], []
-    there._job.survives = survives
-    there._job.undoing = lambda name, undo: undos.append(undo)
-    there._job.tidy = lambda shell, commands: tidied.extend(commands)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=not survives))
+    there = beside(shell)
     there.start(dict)
     if used:
         there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
-    (undo,) = undos
-    undo()
-    assert tidied == ([containers.remove('abc')] if survives and used else [])
+    there._job.undo.close()
+    removed = containers.remove('abc') in shell.commands
+    assert removed == (survives and used)
 
 
 def test_scripts_are_shell():

@@ -14,38 +14,38 @@ from fogros2.model import Command, NodeSpec, Result
 from fogros2.waiting import wait_until
 
 
-def test_an_error_says_what_and_what_to_do():
+def test_error_has_message_and_hint():
     assert str(errors.FogError('x failed', 'do y')) == 'x failed (do y)'
     assert str(errors.FogError('x failed')) == 'x failed'
 
 
-def test_a_failed_command_shows_the_last_lines_of_its_errors():
+def test_failed_command_shows_its_last_error_lines():
     result = Result(3, 'out', '\n'.join(['one', 'two', 'three', 'four']))
     error = errors.CommandError(Command(('tool',), what='make it'), result, 'planner')
     assert str(error) == (
         'make it failed on planner with exit status 3: two / three / four')
 
 
-def test_waiting_returns_what_the_probe_found():
+def test_wait_returns_the_result_of_the_probe():
     answers = iter([None, False, 7])
     assert wait_until(lambda: next(answers), timeout=10, what='x', interval=0.001) == 7
 
 
-def test_waiting_ends_at_its_deadline():
+def test_wait_ends_at_its_deadline():
     begin = time.monotonic()
     with pytest.raises(errors.DeadlineExceeded, match=r'0\.05 s waiting for godot \(go home\)'):
         wait_until(lambda: None, timeout=0.05, what='godot', hint='go home')
     assert time.monotonic() - begin < 5
 
 
-def test_waiting_ends_when_cancelled():
+def test_wait_ends_when_cancelled():
     cancel = threading.Event()
     threading.Timer(0.05, cancel.set).start()
     with pytest.raises(errors.Cancelled):
         wait_until(lambda: None, timeout=60, what='x', cancel=cancel)
 
 
-def test_a_step_is_reported_with_its_detail_and_its_failure():
+def test_step_is_reported_with_detail_and_failure():
     events = []
     with report.step(events.append, 'm', 's') as detail:
         detail.append('fine')
@@ -58,7 +58,7 @@ def test_a_step_is_reported_with_its_detail_and_its_failure():
     assert events[3].reason == 'division by zero'
 
 
-def test_an_unknown_plugin_is_refused_with_the_nearest_name():
+def test_unknown_plugin_is_refused_with_a_suggestion():
     with pytest.raises(errors.ConfigurationError, match="did you mean 'container'"):
         plugin_system.load('fogros2.provider', 'conteiner')
 
@@ -75,7 +75,7 @@ def run(*words, **arguments):
     return process.run(Command(words), **{'timeout': 20, **arguments})
 
 
-def test_a_command_gives_back_its_streams_and_status():
+def test_command_returns_its_output_and_status():
     result = run('sh', '-c', 'cat; echo err >&2; exit 3', check=False)
     assert (result.returncode, result.stdout, result.stderr) == (3, '', 'err\n')
     result = process.run(Command(('cat',), input=b'x' * 200_000), timeout=20)
@@ -95,7 +95,7 @@ def test_lines_arrive_while_the_command_runs():
     assert lines == ['one']
 
 
-def test_a_command_out_of_time_goes_with_its_children(tmp_path):
+def test_timed_out_command_ends_with_its_children(tmp_path):
     script = f'tail -f /dev/null & echo $! > {tmp_path}/pid; wait'
     with pytest.raises(errors.DeadlineExceeded):
         run('sh', '-c', script, timeout=0.5)
@@ -111,19 +111,19 @@ def alive(pid):
         return False
 
 
-def test_an_interrupt_of_our_group_does_not_reach_the_command():
+def test_interrupt_does_not_reach_a_command():
     result = run('sh', '-c', 'ps -o pgid= -p $$ 2>/dev/null || cut -d" " -f5 /proc/$$/stat')
     assert int(result.stdout) != os.getpgid(0)
 
 
-def test_a_missing_program_is_named():
+def test_missing_program_is_named():
     with pytest.raises(errors.PrerequisiteError, match='no-such-tool not found'):
         run('no-such-tool')
     with pytest.raises(errors.PrerequisiteError, match='sudo apt-get install iproute2'):
         process.require(['no-such-tool', sys.executable], package_of={'no-such-tool': 'iproute2'})
 
 
-def test_a_command_finds_its_programs_while_launch_has_the_environment_empty(monkeypatch):
+def test_command_finds_programs_in_an_empty_environment(monkeypatch):
     for name in list(os.environ):
         monkeypatch.delenv(name)
     assert run('sh', '-c', 'ls / >/dev/null; echo fine').stdout == 'fine\n'

@@ -44,7 +44,7 @@ def node_names(*entries: StreamTopic, machine: str) -> list[str]:
             for word in spec.arguments if isinstance(word, str) and word.startswith('__node:=')]
 
 
-def test_streams_by_the_names_that_launches_give() -> None:
+def test_streams_are_found_by_node_names() -> None:
     names = node_names(
         StreamTopic('/camera/image_raw', 'h264'), StreamTopic('/annotated', 'h264', 'to_robot'),
         StreamTopic('/map', 'compressed', source='far-away'), machine='slam-1')
@@ -68,7 +68,7 @@ def test_streams_by_the_names_that_launches_give() -> None:
     assert crossing(graph, hosts, found) == []
 
 
-def test_topics_that_cross_by_where_their_nodes_are() -> None:
+def test_crossing_topics_are_found_by_the_hosts_of_nodes() -> None:
     hosts = Hosts({'planner': ['talker', 'slam']})
     graph = [
         topic('/chatter', 'talker', f'listener {OWN}'),
@@ -94,7 +94,7 @@ def test_topics_that_cross_by_where_their_nodes_are() -> None:
     ('camera_h264_encoder', ''), ('camera_h264_encoder_on_slam_1', 'slam-1'),
     ('a_h264_decoder_from_slam_1', ''), ('a_h264_decoder_from_far_away_on_slam_1', 'slam-1'),
     ('slam', 'slam-1'), ('unknown', ''), ('camera_h264_encoder_on_stranger', 'stranger')])
-def test_where_a_node_is(node: str, host: str) -> None:
+def test_host_of_a_node_is_found_by_its_name(node: str, host: str) -> None:
     assert Hosts({'slam-1': ['slam'], 'far-away': []}).of(node) == host
 
 
@@ -110,7 +110,7 @@ def listen(meter: Meter, begin: float, seconds: float, *, hertz: float, size: in
     return wanted
 
 
-def test_a_small_topic_is_listened_to_all_the_time() -> None:
+def test_small_topic_is_measured_all_the_time() -> None:
     meter = Meter(0.0)
     assert meter.rates() == (None, None)
     assert all(listen(meter, 0.0, 20.0, hertz=8, size=100))
@@ -121,7 +121,7 @@ def test_a_small_topic_is_listened_to_all_the_time() -> None:
     assert meter.rates() == (0, 0)
 
 
-def test_a_large_one_is_for_a_second_in_ten() -> None:
+def test_large_topic_is_measured_a_second_in_ten() -> None:
     meter = Meter(0.0)
     wanted = listen(meter, 0.0, 40.0, hertz=32, size=10_000)
     assert 0.08 < sum(wanted) / len(wanted) < 0.2
@@ -146,7 +146,7 @@ def shown(data: bytes) -> numpy.ndarray:
     ('mono8', b'\x80', (128, 128, 128)), ('uyvy', b'\x80\x80', (130, 130, 130)),
     ('yuyv', b'\x80\x80', (130, 130, 130))])
 @pytest.mark.parametrize('width', [64, 1920])
-def test_pictures_have_their_colours(
+def test_pictures_keep_their_colours(
     encoding: str, pixel: bytes, bgr: tuple[int, int, int], width: int,
 ) -> None:
     # rows with something behind them
@@ -157,7 +157,7 @@ def test_pictures_have_their_colours(
 
 
 @pytest.mark.parametrize(('encoding', 'code'), [('16UC1', 'H'), ('32FC1', 'f')])
-def test_depth_is_in_colours_and_black_where_there_is_none(encoding: str, code: str) -> None:
+def test_depth_is_coloured_and_black_where_unknown(encoding: str, code: str) -> None:
     data = io.BytesIO()
     for row in range(48):
         for column in range(64):
@@ -179,6 +179,6 @@ def test_depth_is_in_colours_and_black_where_there_is_none(encoding: str, code: 
     Picture(0, 0, 'rgb8', 0, b''), Picture(4, 4, 'bayer', 4, bytes(16)),
     Picture(4, 4, 'rgb8', 4, bytes(16)), Picture(4, 4, 'rgb8', 12, bytes(7)),
     Picture(1 << 20, 1 << 20, 'mono8', 1 << 20, b'')])
-def test_an_image_that_contradicts_itself(picture: Picture) -> None:
+def test_contradictory_image_is_refused(picture: Picture) -> None:
     with pytest.raises(BadPicture):
         shots.jpeg(picture)

@@ -36,7 +36,7 @@ for line in sys.stdin:
 
 @pytest.fixture
 def several() -> Iterator[Graphs]:
-    made = Graphs(Store())
+    made = Graphs(Store(), pictures=True)
     yield made
     made.close()
 
@@ -54,12 +54,14 @@ def instead(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.setattr(graphs, 'GRAPH', (sys.executable, '-c', program))
 
 
-def test_what_a_program_tells(several: Graphs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_of_a_graph_program_is_collected(
+    several: Graphs, monkeypatch: pytest.MonkeyPatch,
+) -> None:
     instead(monkeypatch, PROGRAM)
     record = launched()
 
     def told() -> Any:
-        state = several.update([record], {'a': ('talker',), 'elsewhere': ('x',)})
+        state = several.update([(record, ('talker',))])
         return state if state['topics'] else None
 
     state = wait_until(told, timeout=20.0, what='its word')
@@ -71,18 +73,18 @@ def test_what_a_program_tells(several: Graphs, monkeypatch: pytest.MonkeyPatch) 
     assert several.picture('') is None
     (graph,) = several._graphs.values()
     # nobody looks any more, or the launch is over
-    assert several.update([], {})['streams'] == []
+    assert several.update([])['streams'] == []
     assert not graph.alive and several.picture('abc123 /camera') is None
 
 
-def test_one_that_fails_is_told_and_tried_again_later(
+def test_failed_graph_program_is_reported_and_restarted(
     several: Graphs, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     instead(monkeypatch, 'import sys; sys.exit("no module named rclpy")')
     record = launched()
 
     def trouble() -> Any:
-        return several.update([record], {})['graph_trouble'] or None
+        return several.update([(record, ())])['graph_trouble'] or None
 
     assert wait_until(trouble, timeout=20.0, what='its failure') == [
         'topics are not looked at: no module named rclpy']
@@ -92,28 +94,28 @@ def test_one_that_fails_is_told_and_tried_again_later(
     assert not trouble() and several._graphs
 
 
-def test_no_program_where_this_terminal_cannot_join(
+def test_no_graph_program_for_another_middleware(
     several: Graphs, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     instead(monkeypatch, PROGRAM)
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_other_cpp')
-    (why,) = several.update([launched()], {})['graph_trouble']
+    (why,) = several.update([(launched(), ())])['graph_trouble']
     assert 'this terminal rmw_other_cpp' in why
     monkeypatch.delenv('RMW_IMPLEMENTATION')
     over = launched('def456', pid=0)
-    assert several.update([over], {}) == {'streams': [], 'topics': [], 'graph_trouble': []}
+    assert several.update([(over, ())]) == {'streams': [], 'topics': [], 'graph_trouble': []}
     assert not several._graphs
 
 
-def test_one_that_does_not_end_is_ended(several: Graphs, monkeypatch: pytest.MonkeyPatch,
+def test_graph_program_that_hangs_is_killed(several: Graphs, monkeypatch: pytest.MonkeyPatch,
                                         tmp_path: Path) -> None:
     begun = tmp_path / 'begun'
     instead(monkeypatch, f'import time; open({str(begun)!r}, "w"); time.sleep(60)')
     monkeypatch.setattr(graphs, 'PATIENCE', 0.2)
-    several.update([launched()], {})
+    several.update([(launched(), ())])
     wait_until(begun.exists, timeout=20.0, what='its begin')
     (graph,) = several._graphs.values()
     begin = time.monotonic()
     several.close()
     assert time.monotonic() - begin < 5 and not graph.alive
-    json.dumps(several.update([], {}))
+    json.dumps(several.update([]))

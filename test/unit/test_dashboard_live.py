@@ -21,7 +21,6 @@ from fogros2.report import silent, StepDone, StepStarted
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.plugins import instead, MemoryProvider
 from fogros2.waiting import wait_until
-from ros2fog_cli.api.board import Board
 from ros2fog_cli.api.live import Live
 
 
@@ -58,7 +57,7 @@ def machine(name: str, **changes: Any) -> Record:
         tags={TAG_NAME: name, TAG_ROBOT: robot_name()})
     made = Record(name, 'memory', MachineSpec(name, 'memory'), machine_id=f'id-{name}',
                   created=time.time() - 600, launch='abc123')
-    return Store().machine(name).save(dataclasses.replace(made, **changes))
+    return Store().save(dataclasses.replace(made, **changes))
 
 
 def alive() -> dict[str, Any]:
@@ -75,7 +74,7 @@ def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[
     return answer
 
 
-def test_a_machine_from_its_steps_to_its_end(live: Live) -> None:
+def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
     assert live.state(0, 5.0)['machines'] == []
     folder = Store().launch('abc123')
     (folder / 'process.json').write_text(json.dumps(alive()))
@@ -102,7 +101,7 @@ def test_a_machine_from_its_steps_to_its_end(live: Live) -> None:
     keep(StepStarted('a', 'delete'))
     when(live, 'a', lambda one: one['phase'] == 'ending')
     Memory.machines.clear()
-    Store().machine('a').delete()
+    Store().delete('a')
     shown = when(live, 'a', lambda one: one['phase'] == 'gone')
     assert shown['ended'] and not shown['launch_alive']
     assert [step['state'] for step in shown['steps']] == ['done', 'done']
@@ -110,7 +109,7 @@ def test_a_machine_from_its_steps_to_its_end(live: Live) -> None:
         live.delete('a')
 
 
-def test_an_end_is_refused_forced_and_told(live: Live) -> None:
+def test_deletion_is_refused_forced_and_reported(live: Live) -> None:
     machine('a', **alive())
     machine('stuck')
     when(live, 'a', lambda one: one['cost_per_hour'] is not None)
@@ -126,63 +125,63 @@ def test_an_end_is_refused_forced_and_told(live: Live) -> None:
         live.delete('nobody')
 
 
-def test_a_machine_that_no_record_names_is_shown_and_one_of_another_robot_is_not(
+def test_orphan_is_shown_and_another_robots_machine_is_not(
     live: Live,
 ) -> None:
     machine('orphan')
-    Store().machine('orphan').delete()
+    Store().delete('orphan')
     machine('others')
-    Store().machine('others').delete()
+    Store().delete('others')
     Memory.machines['id-others'] = dataclasses.replace(
         Memory.machines['id-others'], tags={TAG_NAME: 'others', TAG_ROBOT: 'another'})
     assert '(orphan)' in when(live, 'orphan', lambda one: True)['state']
     assert [one['name'] for one in live.state()['machines']] == ['orphan']
 
 
-def test_two_machines_of_one_name_are_two_that_end_by_themselves(live: Live) -> None:
+def test_machines_of_one_name_are_separate(live: Live) -> None:
     """As in two regions, of launches that this robot has forgotten; then a launch has a third."""
     for number in '12':
         machine('a')
         Memory.machines[f'id-{number}'] = dataclasses.replace(
-            Memory.machines.pop('id-a'), id=f'id-{number}', place=f'region-{number}')
-    Store().machine('a').delete()
+            Memory.machines.pop('id-a'), id=f'id-{number}', region=f'region-{number}')
+    Store().delete('a')
 
     def shown() -> dict[str, str]:
         return {one['key']: one['id'] for one in live.state()['machines'] if not one['ended']}
 
     wait_until(lambda: len(shown()) == 2, timeout=10.0, what='both')
     assert shown() == {'a': 'id-1', 'a id-2': 'id-2'}
-    Store().machine('a').save(Record('a', 'memory', MachineSpec('a', 'memory'), **alive()))
+    Store().save(Record('a', 'memory', MachineSpec('a', 'memory'), **alive()))
     wait_until(lambda: shown().get('a') is None, timeout=10.0, what='the third')
     machine('a', **alive())
     wait_until(lambda: shown() == {'a': 'id-a', 'a id-1': 'id-1', 'a id-2': 'id-2'},
                timeout=10.0, what='all three')
     live.delete('a id-2')
     wait_until(lambda: 'a id-2' not in shown(), timeout=10.0, what='its end')
-    assert set(Memory.machines) == {'id-a', 'id-1'} and live.names() == {}
+    assert set(Memory.machines) == {'id-a', 'id-1'}
     assert shown() == {'a': 'id-a', 'a id-1': 'id-1'}
 
 
-def test_a_launch_that_was_killed_and_a_record_that_is_damaged(live: Live) -> None:
+def test_dead_launch_and_damaged_record_are_shown(live: Live) -> None:
     machine('left', pid=1 << 22, pid_start=1)
-    (Store().machine('torn').path).mkdir(parents=True)
-    (Store().machine('torn').path / 'record.json').write_text('{')
+    Store().machine('torn').mkdir(parents=True)
+    (Store().machine('torn') / 'record.json').write_text('{')
     shown = when(live, 'left', lambda one: 'launch gone' in one['state'])
     assert not shown['launch_alive'] and shown['phase'] == 'running'
     assert 'record damaged' in when(live, 'torn', lambda one: True)['state']
 
 
-def test_nothing_is_asked_while_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_polled_while_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
     monkeypatch.setattr('ros2fog_cli.api.live.PRESENT', 0.5)
     monkeypatch.setattr(Store, 'machines', lambda store: asked.append(time.monotonic()) or [])
-    board = Board(topics=False)
-    board.start()
+    live = Live()
+    live.start()
     try:
         wait_until(lambda: asked and time.monotonic() - asked[-1] > 1.0, timeout=10.0,
                    what='quiet')
         before = len(asked)
-        board.state(-1, 0.0)
+        live.state(-1, 0.0)
         wait_until(lambda: len(asked) > before, timeout=5.0, what='a look')
     finally:
-        board.close()
+        live.close()

@@ -9,7 +9,6 @@ import json
 import re
 import socket
 import threading
-import time
 from typing import Any, Optional
 
 import pytest
@@ -75,7 +74,7 @@ def asked(dashboard: Dashboard) -> list[tuple[Any, ...]]:
     return source.asked
 
 
-def test_what_is_there(dashboard: Dashboard) -> None:
+def test_dashboard_serves_page_state_log_and_pictures(dashboard: Dashboard) -> None:
     assert json.loads(ask(dashboard, '/api/state?after=7')[1]) == {'version': 1, 'machines': []}
     assert json.loads(ask(dashboard, '/api/log?machine=a%20b&after=3')[1])[0]['number'] == 4
     assert asked(dashboard) == [('state', 7), ('log', 'a b', 3)]
@@ -90,9 +89,9 @@ def test_what_is_there(dashboard: Dashboard) -> None:
     assert "frame-ancestors 'none'" in headers['Content-Security-Policy']
 
 
-def test_a_machine_is_deleted(dashboard: Dashboard) -> None:
-    wish = json.dumps({'name': 'planner', 'force': True})
-    assert ask(dashboard, '/api/delete', method='POST', body=wish)[0] == 200
+def test_dashboard_deletes_a_machine(dashboard: Dashboard) -> None:
+    request = json.dumps({'name': 'planner', 'force': True})
+    assert ask(dashboard, '/api/delete', method='POST', body=request)[0] == 200
     status, data, _ = ask(dashboard, '/api/delete', method='POST', body='{"name": "taken"}')
     assert (status, json.loads(data)) == (409, {'error': 'a launch has it', 'hint': 'end that'})
     assert asked(dashboard) == [('delete', 'planner', True), ('delete', 'taken', False)]
@@ -118,27 +117,27 @@ def test_a_machine_is_deleted(dashboard: Dashboard) -> None:
     ({'Host': 'localhost:{port}', 'Origin': 'http://localhost:{port}'}, 200),
     ({'Origin': 'http://127.0.0.1:{port}', 'Sec-Fetch-Site': 'same-origin'}, 200),
 ])
-def test_who_gets_in(
+def test_requests_need_token_host_and_origin(
     dashboard: Dashboard, headers: dict[str, Optional[str]], status: int,
 ) -> None:
     told = {key: value and value.replace('{port}', str(dashboard.port))
             for key, value in headers.items()}
     assert ask(dashboard, '/api/state', **told)[0] == status
-    wish = json.dumps({'name': 'planner'})
-    assert ask(dashboard, '/api/delete', method='POST', body=wish, **told)[0] == status
+    request = json.dumps({'name': 'planner'})
+    assert ask(dashboard, '/api/delete', method='POST', body=request, **told)[0] == status
     assert len(asked(dashboard)) == (2 if status == 200 else 0)
 
 
 @pytest.mark.parametrize('body', [
     '', 'x', '[]', '"planner"', 'null', '{}', '{"name": 1}', '{"name": "a", "force": "yes"}',
     '[' * 9000, '{"name": "' + 'a' * 20_000 + '"}'], ids=lambda body: body[:12])
-def test_a_wish_that_is_none(dashboard: Dashboard, body: str) -> None:
+def test_invalid_delete_request_is_refused(dashboard: Dashboard, body: str) -> None:
     status, data, _ = ask(dashboard, '/api/delete', method='POST', body=body)
-    assert status == 400 and 'wish' in json.loads(data)['error']
+    assert status == 400 and 'request' in json.loads(data)['error']
     assert asked(dashboard) == []
 
 
-def test_a_wish_as_a_form_would_send_it(dashboard: Dashboard) -> None:
+def test_delete_request_of_a_form_is_refused(dashboard: Dashboard) -> None:
     for kind in ('text/plain', 'application/x-www-form-urlencoded', 'multipart/form-data'):
         assert ask(dashboard, '/api/delete', method='POST', body='{"name": "a"}',
                    Content_Type=kind)[0] == 415
@@ -150,38 +149,16 @@ def test_a_wish_as_a_form_would_send_it(dashboard: Dashboard) -> None:
 @pytest.mark.parametrize('path', [
     '/api/', '/api/states', '/etc/passwd', '/../server.py', '//evil.example/', '/page.html',
     '/favicon.ico'])
-def test_nothing_else_is_there(dashboard: Dashboard, path: str) -> None:
+def test_unknown_path_is_not_found(dashboard: Dashboard, path: str) -> None:
     assert ask(dashboard, path)[0] == 404
 
 
-def test_numbers_that_are_none(dashboard: Dashboard) -> None:
+def test_invalid_number_in_a_query_is_refused(dashboard: Dashboard) -> None:
     assert ask(dashboard, '/api/state?after=x')[0] == 400
     assert ask(dashboard, '/api/log?machine=a&after=')[0] == 200
 
 
-def test_a_ticket_is_for_once_and_for_a_minute(
-    dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def enter(ticket: Any, **headers: Optional[str]) -> tuple[int, Any]:
-        status, data, _ = ask(dashboard, '/api/enter', method='POST',
-                              body=json.dumps({'ticket': ticket}), **{HEADER: None, **headers})
-        return status, json.loads(data).get('token')
-
-    ticket = dashboard.url_with_ticket().partition('#')[2]
-    assert dashboard.token not in ticket
-    assert enter(ticket, Origin='http://evil.example')[0] == 403
-    assert enter(ticket, Host='evil.example')[0] == 421
-    assert ask(dashboard, '/api/state', **{HEADER: ticket})[0] == 401
-    assert enter(ticket) == (200, dashboard.token)
-    assert enter(ticket) == (401, None)
-    assert enter('ticket-other') == (401, None) and enter(1)[0] == 400
-    late = dashboard.url_with_ticket().partition('#')[2]
-    clock = time.monotonic() + 61
-    monkeypatch.setattr('fogros2_monitor.dashboard.server.time.monotonic', lambda: clock)
-    assert enter(late) == (401, None)
-
-
-def test_only_the_loopback_hears(dashboard: Dashboard) -> None:
+def test_dashboard_listens_only_on_the_loopback(dashboard: Dashboard) -> None:
     own = socket.gethostbyname(socket.gethostname())
     if own.startswith('127.'):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -191,7 +168,7 @@ def test_only_the_loopback_hears(dashboard: Dashboard) -> None:
         socket.create_connection((own, dashboard.port), timeout=5).close()
 
 
-def test_each_one_has_a_token_of_its_own() -> None:
+def test_each_dashboard_has_its_own_token() -> None:
     one, other = Dashboard(Canned()), Dashboard(Canned())
     try:
         assert one.token != other.token and len(one.token) >= 32
@@ -201,7 +178,7 @@ def test_each_one_has_a_token_of_its_own() -> None:
         other.close()
 
 
-def test_the_page_asks_nobody_else_and_makes_no_markup_of_what_it_is_told() -> None:
+def test_page_loads_nothing_and_escapes_its_data() -> None:
     page = PAGE.read_text()
     for words in ('innerHTML', 'outerHTML', 'insertAdjacentHTML', 'document.write', 'eval(',
                   'new Function', 'onclick="'):
@@ -211,13 +188,13 @@ def test_the_page_asks_nobody_else_and_makes_no_markup_of_what_it_is_told() -> N
     assert not re.search(r'<(script|link|img|iframe)[^>]+(src|href)="(?!data:)', page)
 
 
-def test_the_policy_names_the_pages_own_script() -> None:
+def test_content_policy_allows_only_the_pages_script() -> None:
     policy = content_policy('<style>a</style><script>b</script>')
     assert "script-src 'sha256-PiPoFgA5WUoziU9lZOGxNIu9egCI1CxKy3PurtWcAJ0='" in policy
     assert "default-src 'none'" in policy and 'unsafe' not in policy
 
 
-def test_a_port_that_is_taken_or_none() -> None:
+def test_taken_or_invalid_port_is_refused() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
         assert 'another --port' in str(main(argv=[

@@ -10,12 +10,13 @@ import re
 import subprocess
 import sys
 import threading
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import journal
+from fogros2 import events, journal
+from fogros2.events import Status
 from fogros2.journal import Journal, Step
 from fogros2.report import (
     Event,
@@ -27,6 +28,7 @@ from fogros2.report import (
     StepFailed,
     StepStarted,
 )
+from rigs import recorded_agent
 from ros2fog_cli.api import screen
 from ros2fog_cli.api.follower import agent_state, LogLine, node_name, rates
 from ros2fog_cli.api.reach import Link
@@ -38,7 +40,7 @@ def read(folder: Path) -> list[Step]:
     return journal.steps(path.read_text().splitlines()) if path.exists() else []
 
 
-def test_a_journal_hands_on_and_keeps(tmp_path: Path) -> None:
+def test_journal_forwards_and_stores_events(tmp_path: Path) -> None:
     heard: list[Event] = []
     times = iter([100.0, 101.0, 102.0, 103.0, 103.1, 104.0])
     folder = tmp_path / 'launch'
@@ -58,7 +60,7 @@ def test_a_journal_hands_on_and_keeps(tmp_path: Path) -> None:
     assert (folder / journal.FILE).stat().st_mode & 0o777 == 0o600
 
 
-def test_a_journal_without_a_place_stops_nothing(tmp_path: Path) -> None:
+def test_journal_without_a_folder_stops_nothing(tmp_path: Path) -> None:
     folder = tmp_path / 'launch'
     folder.mkdir()
     keep = Journal(silent, folder)
@@ -72,7 +74,7 @@ def test_a_journal_without_a_place_stops_nothing(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
-def test_a_journal_takes_events_of_several_threads(tmp_path: Path) -> None:
+def test_journal_accepts_events_of_several_threads(tmp_path: Path) -> None:
     keep = Journal(silent, tmp_path)
 
     def many(name: str) -> None:
@@ -93,13 +95,13 @@ def test_a_journal_takes_events_of_several_threads(tmp_path: Path) -> None:
     '{"time": "x", "machine": "a", "step": "s", "event": "started"}',
     '{"time": 1, "machine": "a", "step": "s", "event": "progress", "done": 1, "total": 2}',
     '{"time": 1, "machine": "a", "st', '[' * 100_000])
-def test_a_damaged_line_is_left_out(line: str) -> None:
+def test_damaged_line_of_a_journal_is_skipped(line: str) -> None:
     good = '{"time": 1, "machine": "a", "step": "s", "event": "started"}'
     assert journal.steps([line, good, line]) in (
         [Step('a', 's', 1.0)], [Step('a', 's', 1.0, done=1, total=2)])
 
 
-def test_an_undo_that_failed_is_told_alone() -> None:
+def test_step_that_only_failed_has_its_begin() -> None:
     line = ('{"time": 10, "machine": "a", "step": "left there", "event": "failed", '
             '"seconds": 2, "detail": "silent"}')
     assert journal.steps([line]) == [Step('a', 'left there', 8.0, 'failed', 2.0, 'silent')]
@@ -114,7 +116,7 @@ def test_an_undo_that_failed_is_told_alone() -> None:
     ([('agent', 'done'), ('delete', 'running')], 'ending'),
     ([('agent', 'done'), ('let go', 'done')], 'ending'),
 ])
-def test_the_phase_by_the_steps(steps: list[tuple[str, str]], expected: str) -> None:
+def test_phase_follows_from_the_steps(steps: list[tuple[str, str]], expected: str) -> None:
     assert phase(tuple(Step('a', name, 1.0, state) for name, state in steps)) == expected
 
 
@@ -124,37 +126,24 @@ def test_the_phase_by_the_steps(steps: list[tuple[str, str]], expected: str) -> 
     (['/usr/bin/python3', '/opt/ros/lib/p/talker.py', '-x'], 'talker'),
     (['/opt/ros/lib/p/listener', '--ros-args', '-p', 'a:=/b'], 'listener'),
     (['sleep', '1'], ''), ([], '')])
-def test_the_name_of_a_process_in_the_graph(words: list[str], expected: str) -> None:
+def test_node_name_is_read_from_a_command_line(words: list[str], expected: str) -> None:
     assert node_name(words) == expected
 
 
-@pytest.mark.parametrize('odd', [None, 'x', [], {}, True, 1e300, float('inf'), float('nan')])
-def test_an_agent_that_says_odd_things(odd: Any) -> None:
-    keys = ('name', 'state', 'pid', 'returncode', 'restarts', 'error')
-    state = agent_state({
-        'since': odd, 'rss_kb': odd, 'heartbeat_age': odd,
-        'nodes': [dict.fromkeys(keys, odd), odd]})
-    assert (state['since'], state['rss'], state['heartbeat_age']) == (None, None, None)
-    node = state['nodes'][0]
-    assert (node['pid'], node['returncode'], node['restarts']) == (0, None, 0)
-    assert isinstance(node['name'], str) and isinstance(node['state'], str)
-    assert agent_state({'nodes': odd})['nodes'] == [] == agent_state({})['nodes']
-    shown = screen.frame(machine(agent=state, nodes=state['nodes']), [], 1100.0)
-    assert any('heartbeat -' in line for line in shown)
-    assert json.loads(json.dumps(state)) == state
-
-
-def test_what_an_agent_says() -> None:
-    assert agent_state({
-        'id': 1, 'ok': True, 'since': 5.5, 'rss_kb': 16, 'heartbeat_age': 0.5, 'nodes': [
-            {'id': 'a/b', 'name': 'b', 'state': 'exited', 'pid': None, 'returncode': -9,
-             'restarts': 1}]}) == {
-        'since': 5.5, 'rss': 16000, 'heartbeat_age': 0.5, 'nodes': [
+def test_status_of_an_agent_is_shown() -> None:
+    nodes = [{'id': 'a/b', 'name': 'b', 'state': 'exited', 'pid': None, 'returncode': -9,
+              'restarts': 1}]
+    answer = recorded_agent.answer('status', since=5.5, rss_kb=16, nodes=nodes)
+    state = agent_state(cast(Status, events.answer('status', answer)))
+    assert state == {
+        'since': 5.5, 'rss': 16000, 'heartbeat_age': None, 'nodes': [
             {'name': 'b', 'state': 'exited', 'pid': 0, 'returncode': -9, 'restarts': 1,
              'error': ''}]}
+    shown = screen.frame(machine(agent=state, nodes=state['nodes']), [], 1100.0)
+    assert any('heartbeat -' in line for line in shown)
 
 
-def test_rates_between_two_looks() -> None:
+def test_rates_follow_from_two_counts() -> None:
     first = Link('198.18.0.2', 'fog1', received=1000.0, sent=50.0)
     before = {**rates(None, first, 10.0), **dataclasses.asdict(first)}
     assert (before['receiving'], before['sending']) == (None, None)
@@ -182,7 +171,7 @@ def machine(**changes: Any) -> dict[str, Any]:
                    'restarts': 2, 'error': None}], **changes}
 
 
-def test_a_machine_as_a_screenful() -> None:
+def test_machine_is_drawn_on_a_screen() -> None:
     lines = [LogLine(n, 1.0, 'slam-1', False, f'line {n}') for n in range(1, 100)]
     shown = screen.frame(machine(), lines, 1100.0, columns=90, rows=20)
     text = '\n'.join(shown)
@@ -200,7 +189,7 @@ def test_a_machine_as_a_screenful() -> None:
     assert screen.frame(gone, [], 1100.0)[0] == 'planner (aws i-1)  gone  50 s'
 
 
-def test_topics_across_the_vpn_in_a_screenful() -> None:
+def test_topics_across_the_vpn_are_drawn() -> None:
     shown = '\n'.join(screen.frame(machine(
         streams=[{'topic': '/camera', 'transport': 'h264', 'source': '', 'target': 'planner',
                   'rate': 29.96, 'bandwidth': 81_000.0},
@@ -213,11 +202,11 @@ def test_topics_across_the_vpn_in_a_screenful() -> None:
     assert '/map' not in shown
 
 
-def test_topics_take_a_watch() -> None:
+def test_topics_option_needs_watch() -> None:
     assert 'is for --watch' in str(main(argv=['fog', 'status', 'planner', '--topics']))
 
 
-def test_what_a_node_prints_commands_no_terminal() -> None:
+def test_output_of_a_node_has_no_escape_sequences() -> None:
     bad = '\x1b]0;owned\x07\x1b[2J\x9b31mred\r\n'
     lines = [LogLine(1, 1.0, f'n{bad}', True, f'before {bad}after')]
     shown = screen.frame(machine(problems=[bad], nodes=[
@@ -227,29 +216,29 @@ def test_what_a_node_prints_commands_no_terminal() -> None:
         assert line.isprintable(), line
 
 
-def test_what_changes_seldom_in_a_line() -> None:
+def test_summary_has_the_rarely_changing_parts() -> None:
     assert screen.summary(machine(phase='coming')) == (
         'planner: coming up; workspace running; slam-1 running, 2 restarts')
 
 
 @pytest.mark.parametrize('seconds', ['0', '-1', 'nan', '1e9'])
-def test_an_interval_that_makes_no_sense(seconds: str) -> None:
+def test_invalid_interval_is_refused(seconds: str) -> None:
     said = main(argv=['fog', 'status', 'planner', '--watch', '--interval', seconds])
     assert 'makes no sense' in str(said)
 
 
-def test_a_name_that_no_machine_can_have() -> None:
+def test_watch_refuses_an_invalid_name() -> None:
     assert 'no name for a machine' in str(main(argv=['fog', 'status', '../up', '--watch']))
 
 
-def test_a_step_as_json_when_all_is_over() -> None:
+def test_running_step_of_an_ended_launch_is_done() -> None:
     running = Step('a', 'delete', 1.0)
     assert as_json(running)['state'] == 'running'
     assert as_json(running, ended=True)['state'] == 'done'
     json.dumps(as_json(running))
 
 
-def test_a_reader_of_lines_that_goes_away(tmp_path: Path) -> None:
+def test_watch_ends_with_the_reader_of_its_lines(tmp_path: Path) -> None:
     # as behind `| head -n 1`
     program = tmp_path / 'program.py'
     program.write_text('import sys\nfrom ros2cli.cli import main\n'

@@ -131,7 +131,7 @@ def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
         assert interfaces[0].priority < 0
 
 
-def test_a_configuration_that_leaves_no_place_for_the_vpn_is_refused() -> None:
+def test_configuration_without_room_for_the_vpn_is_refused() -> None:
     uri = '<CycloneDDS><General><NetworkInterfaceAddress>eth0</NetworkInterfaceAddress></General>'
     with pytest.raises(DdsError, match='NetworkInterfaceAddress'):
         CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
@@ -145,7 +145,7 @@ def test_a_loopback_that_turns_multicast_off_is_refused() -> None:
     assert 'name="lo" multicast="true"' in caught.value.hint
 
 
-def test_a_configuration_that_is_not_there_is_found_before_nodes_fail() -> None:
+def test_missing_configuration_is_reported_before_nodes_start() -> None:
     with pytest.raises(DdsError, match='/nowhere/dds.xml'):
         CYCLONE.robot_interfaces('foga1b2c3', None, {'CYCLONEDDS_URI': 'file:///nowhere/dds.xml'})
 
@@ -163,7 +163,7 @@ def test_the_lan_is_the_interface_that_cyclone_would_take() -> None:
 
 
 @pytest.mark.parametrize('text', ['nonsense', '[1]', '7'])
-def test_what_ip_does_not_print_is_an_error(text: str) -> None:
+def test_unexpected_output_of_ip_is_an_error(text: str) -> None:
     with pytest.raises(DdsError, match='network interfaces'):
         CYCLONE.parse_lan(text)
 

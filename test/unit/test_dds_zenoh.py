@@ -39,7 +39,7 @@ def test_the_robots_router_dials_machines_and_what_the_user_has() -> None:
 @pytest.mark.parametrize('user', [
     None, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_STATIC_PEERS': 'nuc.local'},
     {'ROS_LOCALHOST_ONLY': '1'}])
-def test_a_machine_and_who_keeps_to_this_computer_meet_nobody_else(
+def test_local_node_and_machine_meet_no_other_computer(
         user: dict[str, str] | None) -> None:
     router = Zenoh().router(MACHINE, [OTHER], user)
     assert router is not None

@@ -14,10 +14,11 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, dependencies, modules, plan, workspace
-from fogros2.dependencies import PipFolder
+from fogros2 import plan
 from fogros2.errors import ConfigurationError, PrerequisiteError
-from fogros2.host import HostFacts
+from fogros2.host import bootstrap, dependencies, modules, workspace
+from fogros2.host.dependencies import PipFolder
+from fogros2.host.inspection import HostFacts
 from fogros2.model import Command, MachineSpec, Result
 from rigs.rosdep import rosdep_source
 
@@ -32,7 +33,7 @@ def test_names_of_debian_packages_are_taken(name: str) -> None:
 
 
 @pytest.mark.parametrize('name', ['', '-y', 'Zbar', 'a b', 'a;reboot', '$(reboot)', 'x='])
-def test_what_is_no_debian_package_is_refused(name: str) -> None:
+def test_invalid_debian_package_is_refused(name: str) -> None:
     with pytest.raises(ConfigurationError, match='no name of a Debian package'):
         dependencies.check_apt(name)
 
@@ -46,7 +47,7 @@ def test_requirements_are_taken(requirement: str) -> None:
 
 @pytest.mark.parametrize('requirement', [
     '', '-r file', '--index-url=https://example.com', '/tmp/x.whl', 'https://example.com/x.whl'])
-def test_what_is_no_requirement_is_refused(requirement: str) -> None:
+def test_invalid_requirement_is_refused(requirement: str) -> None:
     with pytest.raises(ConfigurationError, match='names no Python package'):
         dependencies.check_pip(requirement)
 

@@ -14,18 +14,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import plan, plugin_system, process
+from fogros2 import plan, process
 from fogros2.agent_client import AgentClient
-from fogros2.bootstrap import RosInstall
-from fogros2.deploy import entering, Launch, robot_vpn, watching
-from fogros2.deploy import launch as launches
-from fogros2.deploy.creating import Creation
-from fogros2.deploy.deployment import Deployment
-from fogros2.deploy.entering import Entrance
-from fogros2.deploy.guarding import Guard
-from fogros2.deploy.job import Job
-from fogros2.deploy.joining import Joining
-from fogros2.deploy.robot_vpn import RobotVpn, VpnMember
+from fogros2.deploy import Launch, robot_vpn
+from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.robot_vpn import VpnMember
+from fogros2.deploy.steps import connecting, dds, installing
+from fogros2.deploy.steps.arming import Arming
+from fogros2.deploy.steps.connecting import Connection
+from fogros2.deploy.steps.creating import Creation
+from fogros2.deploy.steps.joining import Joining
+from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
     AgentError,
     Cancelled,
@@ -41,6 +40,7 @@ from fogros2.errors import (
     StoreError,
     VpnError,
 )
+from fogros2.host.bootstrap import RosInstall
 from fogros2.model import (
     Command,
     Endpoint,
@@ -49,47 +49,53 @@ from fogros2.model import (
     MachineState,
     Peer,
     Result,
-    VpnInterface,
 )
+from fogros2.report import StepFailed
 from fogros2.shell import host_key
-from fogros2.store import MachineDirectory, Store
-from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
+from fogros2.store import Store
+from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
+from fogros2.testing.plugins import instead
 from fogros2.waiting import Timeouts, wait_until
 
 SPEC = MachineSpec('planner', 'fake')
-#: As it is; the fixture below has it do nothing.
-ENSURE = RobotVpn.ensure
-ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', guarded=True)
 
 
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider()
-    monkeypatch.setattr(launches, 'provider', lambda name: fake)
+    instead(monkeypatch, 'fogros2.provider', {'fake': lambda: fake, 'ssh': lambda: fake})
     return fake
 
 
 @pytest.fixture
-def launch(tmp_path, monkeypatch):
-    def choose(self, launch, folder):
-        self._launch, self._lock, self.interface = launch, threading.Lock(), ROBOT
-        self._members, self._up, self._stop = {}, False, threading.Event()
-
-    monkeypatch.setattr(RobotVpn, '__init__', choose)
-    monkeypatch.setattr(RobotVpn, 'ensure', lambda self: Peer('robot', '', ROBOT.address))
-    return Launch(store=Store(tmp_path), environment={})
+def events():
+    return []
 
 
-def test_a_machine_is_ended_though_its_id_could_not_be_written_down(
+@pytest.fixture
+def launch(tmp_path, monkeypatch, events):
+    instead(monkeypatch, 'fogros2.vpn', {'wireguard': FakeVpn})
+    made = Launch(store=Store(tmp_path), environment={}, report=events.append)
+    yield made
+    made.down()
+
+
+def begun(launch, spec=SPEC, **changes):
+    """Return the context and the job of a machine that is about to be deployed."""
+    context = dataclasses.replace(launch.context(spec), **changes)
+    return context, MachineJob(context, spec)
+
+
+def test_machine_is_deleted_if_its_id_cannot_be_stored(
         launch, provider, monkeypatch):
-    save = MachineDirectory.save
+    save = Store.save
 
     def full(self, record):
         if record.machine_id is not None:
             raise StoreError('record.json can not be written: No space left on device')
         save(self, record)
 
-    monkeypatch.setattr(MachineDirectory, 'save', full)
+    monkeypatch.setattr(Store, 'save', full)
     with pytest.raises(StoreError):
         launch.up(SPEC)
     assert list(provider.find({})) == []
@@ -116,7 +122,7 @@ def test_of_a_refused_creation_nothing_is_told_but_the_refusal(launch, provider)
         launch.up(SPEC)
     assert 'find' not in provider.calls
     assert launch.down() == []
-    assert not launch.store.machine(SPEC.name).exists()
+    assert not launch.store.exists(SPEC.name)
 
 
 def test_a_machine_that_may_have_been_made_is_not_forgotten(launch, provider):
@@ -126,10 +132,10 @@ def test_a_machine_that_may_have_been_made_is_not_forgotten(launch, provider):
         launch.up(SPEC)
     assert 'find' in provider.calls
     assert launch.down() == [lost]
-    assert launch.store.machine(SPEC.name).exists()
+    assert launch.store.exists(SPEC.name)
 
 
-def test_the_interface_goes_though_a_machine_ends_with_an_error_of_no_known_kind(launch):
+def test_unknown_error_of_a_machine_keeps_no_interface(launch):
     def fail():
         raise KeyError('InstanceId')
 
@@ -147,9 +153,9 @@ def kept(store, provider, **changes):
     """Leave a machine behind, as a launch does that keeps it."""
     spec = MachineSpec('planner', 'fake', on_exit='keep', options={'size': 1})
     launch = Launch(store=store, environment={})
-    with store.machine('planner').lock():
-        mine = Job(launch, spec)
-        Creation(mine)._claim('token')
+    with store.lock('planner'):
+        context, mine = begun(launch, spec)
+        Creation(context, mine)._claim('token')
         machine = Machine('fake-1', 'planner', 'fake', MachineState.PENDING, tags={
             'fogros2-on-exit': 'keep'})
         provider._machines['fake-1'], provider._waits['fake-1'] = machine, 0
@@ -167,7 +173,15 @@ def test_a_kept_machine_is_not_taken_for_another(launch, provider, changes, erro
     with pytest.raises(error, match=text):
         launch.up(MachineSpec('planner', 'fake', **asked))
     assert [machine.id for machine in provider.find({})] == ['fake-1']
-    assert launch.store.machine('planner').load().machine_id == 'fake-1'
+    assert launch.store.load('planner').machine_id == 'fake-1'
+
+
+def skip_early_steps(monkeypatch):
+    """Replace the steps before ROS 2 is installed."""
+    for step, name in [(Creation, 'run'), (Connection, 'open'), (Joining, 'choose_interface'),
+                       (Joining, 'avoid'), (Arming, 'arm')]:
+        monkeypatch.setattr(step, name, lambda self, *_: None)
+    monkeypatch.setattr(dds, 'configure', lambda *_: {})
 
 
 def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
@@ -177,19 +191,14 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
         assert syncing.wait(10)
         raise VpnError('no way there')
 
-    def sync(self, *arguments):
+    def send(context, job, *_):
         syncing.set()
-        wait_until(lambda: False, timeout=60, cancel=self.job.cancel, what='the workspace')
+        wait_until(lambda: False, timeout=60, cancel=job.cancel, what='the workspace')
 
-    stand_in = [
-        (Creation, 'run', None), (Entrance, 'connect', None), (Joining, 'interface', None),
-        (Joining, 'fit', None), (Guard, 'arm', None),
-        (Deployment, 'prepare_host', RosInstall('ros', ())),
-        (Deployment, 'configure_dds', {})]
-    for part, name, value in stand_in:
-        monkeypatch.setattr(part, name, lambda self, *_, value=value: value)
+    skip_early_steps(monkeypatch)
+    monkeypatch.setattr(installing, 'install_ros', lambda *_: RosInstall('ros', ()))
     monkeypatch.setattr(Joining, 'join', join)
-    monkeypatch.setattr(Deployment, 'sync', sync)
+    monkeypatch.setattr(installing, 'send_workspaces', send)
     begin = time.monotonic()
     with pytest.raises(VpnError, match='no way there'):
         launch.up(SPEC)
@@ -197,29 +206,26 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
     assert not launch.cancel.is_set(), 'other machines of the launch go on'
 
 
-def test_the_workspace_travels_and_the_vpn_comes_up_while_ros_is_installed(
+def test_workspace_vpn_and_ros_are_set_up_in_parallel(
         launch, provider, monkeypatch):
     travelling, joining = threading.Event(), threading.Event()
     equipped = []
 
-    def prepare_host(self, shell, on_plan):
+    def install_ros(context, job, on_plan):
         on_plan(RosInstall('ros', ()))
         assert travelling.wait(10) and joining.wait(10)
         assert not equipped
         raise PrerequisiteError('no such package')
 
-    def sync(self, shell, ros, installed):
+    def send(context, job, ros, installed):
         travelling.set()
-        installed.result()
+        installed()
 
-    for part, name, value in [
-            (Creation, 'run', None), (Entrance, 'connect', None), (Joining, 'interface', None),
-            (Joining, 'fit', None), (Guard, 'arm', None), (Deployment, 'configure_dds', {})]:
-        monkeypatch.setattr(part, name, lambda self, *_, value=value: value)
-    monkeypatch.setattr(Joining, 'join', lambda self, *arguments: joining.set())
-    monkeypatch.setattr(Deployment, 'prepare_host', prepare_host)
-    monkeypatch.setattr(Deployment, 'sync', sync)
-    monkeypatch.setattr(Deployment, 'equip', lambda self, equipment: equipped.append(equipment))
+    skip_early_steps(monkeypatch)
+    monkeypatch.setattr(Joining, 'join', lambda self: joining.set())
+    monkeypatch.setattr(installing, 'install_ros', install_ros)
+    monkeypatch.setattr(installing, 'send_workspaces', send)
+    monkeypatch.setattr(installing.Modules, 'ensure', lambda *_: equipped.append('modules'))
     with pytest.raises(PrerequisiteError, match='no such package'):
         launch.up(SPEC)
     assert not equipped
@@ -236,15 +242,15 @@ class BusyAgent(FakeStream):
             self.say(json.dumps(reply).encode() + b'\n')
 
 
-def test_a_computer_that_another_robot_uses_by_the_same_name_is_left_alone(
+def test_computer_of_another_robot_is_left_alone(
         launch, provider, monkeypatch):
     shell = FakeShell(
         handlers={'sh': lambda command: Result(0, 'there\n', '')},
         streams=[BusyAgent()])
     machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False,
                       shell=Endpoint('fake', user='fog'))
-    monkeypatch.setattr(Creation, 'run', lambda self: machine)
-    monkeypatch.setattr(Entrance, 'connect', lambda self, machine: shell)
+    monkeypatch.setattr(Creation, 'run', lambda self: setattr(self._job, 'machine', machine))
+    monkeypatch.setattr(Connection, 'open', lambda self: setattr(self._job, 'shell', shell))
     with pytest.raises(AgentError, match="belongs to launch 'abc'"):
         launch.up(MachineSpec('planner', 'ssh'))
     assert shell.files == {}
@@ -260,15 +266,16 @@ def mute():
 
 
 def reach(launch, port):
-    mine = Job(launch, MachineSpec('planner', 'ssh'))
-    machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False, shell=Endpoint(
-        'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
+    context, mine = begun(launch, MachineSpec('planner', 'ssh'))
+    mine.machine = Machine(
+        'x', 'planner', 'ssh', MachineState.RUNNING, owned=False, shell=Endpoint(
+            'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
     with mine.undo:
-        Entrance(mine).connect(machine)
+        Connection(context, mine).open()
 
 
 def test_a_login_that_nobody_answers_can_be_cancelled(launch, provider, monkeypatch, mute):
-    monkeypatch.setattr(entering, 'LOGIN_ATTEMPT', 0.5)
+    monkeypatch.setattr(connecting, 'LOGIN_TIMEOUT', 0.5)
     timer = threading.Timer(0.2, launch.cancel.set)
     timer.start()
     begin = time.monotonic()
@@ -287,34 +294,33 @@ def closed_port():
 
 
 @pytest.mark.parametrize('ended', [True, False])
-def test_a_machine_that_ends_while_it_boots_is_waited_for_no_longer(
+def test_wait_ends_when_a_booting_machine_ends(
         launch, provider, monkeypatch, ended, closed_port):
-    monkeypatch.setattr(entering, 'ADDRESS_INTERVAL', 0.1)
-    monkeypatch.setattr(FakeProvider, 'firewall', True)
-    mine = Job(launch, SPEC)
-    Creation(mine).run()
-    machine = dataclasses.replace(provider.describe(mine.machine_id), shell=Endpoint(
+    monkeypatch.setattr(connecting, 'POLL_INTERVAL', 0.1)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
+    context, mine = begun(launch, timeouts=Timeouts(ssh=0.8))
+    Creation(context, mine).run()
+    mine.machine = dataclasses.replace(provider.describe(mine.machine_id), shell=Endpoint(
         'ssh', '127.0.0.1', closed_port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
-    launch.timeouts = mine.timeouts = Timeouts(ssh=0.8)
     if ended:
         provider.destroy(mine.machine_id)
     known = (ProviderError, 'ended while') if ended else (ConnectError, 'refuses connections')
     with mine.undo, pytest.raises(known[0], match=known[1]):
-        Entrance(mine).connect(machine)
+        Connection(context, mine).open()
 
 
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
-    mine = Job(launch, SPEC)
-    mine.timeouts = Timeouts(boot=300.0, ssh=60.0)
+    context, mine = begun(launch, timeouts=Timeouts(boot=300.0, ssh=60.0))
+    connection = Connection(context, mine)
     mine.record = dataclasses.replace(mine.record, armed=time.time() - 20)
-    assert Entrance(mine)._patience() == 60.0
-    monkeypatch.setattr(FakeProvider, 'one_time_host_key', True)
-    assert 270 < Entrance(mine)._patience() <= 280
+    assert connection._timeout() == 60.0
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(one_time_host_key=True))
+    assert 270 < connection._timeout() <= 280
     mine.record = dataclasses.replace(mine.record, host_key='its own')
-    assert Entrance(mine)._patience() == 60.0
+    assert connection._timeout() == 60.0
 
 
-def test_a_login_that_is_refused_to_the_end_says_so(launch, provider, mute):
+def test_lasting_refusal_of_a_login_is_reported(launch, provider, mute):
     with socket.create_server(('127.0.0.1', 0)) as server:
         port = server.getsockname()[1]
     launch.timeouts = Timeouts(ssh=0.3)
@@ -322,56 +328,43 @@ def test_a_login_that_is_refused_to_the_end_says_so(launch, provider, mute):
         reach(launch, port)
 
 
-def test_the_vpn_is_looked_after_though_looking_fails_once(launch, monkeypatch):
-    seen = []
+def test_health_check_survives_time_out(launch, monkeypatch):
+    def run(command, **arguments):
+        raise DeadlineExceeded('it took longer than 30 s')
+
+    robot = launch.robot_vpn()
+    monkeypatch.setattr(process, 'run', run)
+    assert [robot.check_health(), robot.check_health()] == [2.0, 4.0]
+
+
+def test_failing_repair_is_reported_ever_more_seldom(launch, events, monkeypatch):
+    failures = [FogError('no')] * 5
 
     def run(command, **arguments):
-        seen.append(command)
-        if len(seen) == 1:
-            raise DeadlineExceeded('it took longer than 30 s')
-        robot._stop.set()
-        raise FogError('enough')
+        if command.what == 'health check':
+            return Result(1, '', '')
+        if failures:
+            raise failures.pop()
+        return Result(0, '', '')
 
     robot = launch.robot_vpn()
-    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     monkeypatch.setattr(process, 'run', run)
-    monkeypatch.setattr(robot._stop, 'wait', lambda timeout: robot._stop.is_set())
-    robot._keep()
-    assert len(seen) == 2
+    assert [robot.check_health() for _ in range(7)] == [2.0, 4.0, 8.0, 15.0, 15.0, 1.0, 1.0]
+    assert len([event for event in events if isinstance(event, StepFailed)]) == 5
 
 
-def test_a_vpn_that_cannot_be_repaired_is_told_now_and_then(launch, monkeypatch):
-    waits = []
-
-    def wait(seconds):
-        waits.append(seconds)
-        return len(waits) > 8
-
-    def run(command, **arguments):
-        if command.what.startswith('repair') and len(waits) < 7:
-            raise FogError('no')
-        return Result(1 if len(waits) < 8 else 0, '', '')
-
+def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):
     robot = launch.robot_vpn()
-    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
-    monkeypatch.setattr(process, 'run', run)
-    monkeypatch.setattr(robot._stop, 'wait', wait)
-    robot._keep()
-    assert waits == [1.0, 2.0, 4.0, 8.0, 15.0, 15.0, 15.0, 1.0, 1.0]
-
-
-def test_an_interface_that_was_taken_down_does_not_come_up_again(launch, monkeypatch):
-    robot = launch.robot_vpn()
-    robot._stop.set()
+    robot.ensure()
+    launch.undo.close()
     monkeypatch.setattr(process, 'run', None)
     with pytest.raises(Cancelled):
-        ENSURE(robot)
+        robot.ensure()
     assert robot.down
 
 
-def test_what_ended_wrongly_is_all_told_before_an_error_that_nobody_expected(launch):
-    steps, gone = [], []
-    launch.report = steps.append
+def test_known_errors_are_reported_before_unknown_ones(launch, events):
+    gone = []
     launch.undo.callback(gone.append, 'interface')
 
     def machine(error):
@@ -385,7 +378,7 @@ def test_what_ended_wrongly_is_all_told_before_an_error_that_nobody_expected(lau
     launch._ups = {'a': machine(ValueError('odd')), 'b': machine(ProviderError('still there'))}
     with pytest.raises(ValueError, match='odd'):
         launch.down()
-    assert [(step.machine, step.reason) for step in steps] == [('b', 'still there')]
+    assert [(step.machine, step.reason) for step in events] == [('b', 'still there')]
     assert gone == ['interface']
 
 
@@ -399,31 +392,27 @@ class Members:
 
     def add(self, number):
         name = f'm{number}'
-        place = plan.Place(Peer(name, f'key {name}', f'198.18.7.{number}', f'{name}:1'))
+        route = plan.Route(Peer(name, f'key {name}', f'198.18.7.{number}', f'{name}:1'))
 
-        def on(commands):
-            for peers in commands:
+        def run(commands):
+            for command in commands:
                 if name in self.away:
                     raise ConnectError(f"'{name}' is out of reach")
-                self.told.append((name, peers))
+                self.told.append((name, [*command.argv[1:]]))
 
-        member = VpnMember(place, ROBOT, on, lambda peers: None)
+        member = VpnMember(route, self.robot.interface, run, lambda peers: None)
         member.up(self.robot)
         self.robot.admit(member)
         self.robot.spread(member)
 
 
 @pytest.fixture
-def members(launch, monkeypatch):
-    robot = launch.robot_vpn()
-    names = staticmethod(lambda interface, peers: [sorted(peer.name for peer in peers)])
-    robot.vpn = type('Names', (), {'up': names, 'peers': names})()
-    monkeypatch.setattr(launch, 'robot', lambda commands: None)
-    return Members(robot)
+def members(launch):
+    return Members(launch.robot_vpn())
 
 
-def test_a_new_machine_does_not_fail_as_another_cannot_be_told_of_it(members, monkeypatch):
-    monkeypatch.setattr(robot_vpn, 'TELLING', 0.2)
+def test_new_machine_survives_an_unreachable_peer(members, monkeypatch):
+    monkeypatch.setattr(robot_vpn, 'UPDATE_TIMEOUT', 0.2)
     members.add(2)
     members.away = {'m2'}
     begin = time.monotonic()
@@ -444,9 +433,9 @@ def test_everybody_knows_of_a_new_machine_when_it_is_up(members):
         [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
 
 
-def test_a_port_that_speaks_no_ssh_is_told_soon(launch, provider, monkeypatch):
-    monkeypatch.setattr(FakeProvider, 'owned', False)
-    monkeypatch.setattr(entering, 'LOGIN_ATTEMPT', 0.5)
+def test_port_without_ssh_is_reported_soon(launch, provider, monkeypatch):
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
+    monkeypatch.setattr(connecting, 'LOGIN_TIMEOUT', 0.5)
     with socket.create_server(('127.0.0.1', 0)) as server:
         def serve():
             with contextlib.suppress(OSError):
@@ -472,14 +461,15 @@ def test_a_host_key_is_taken_from_what_the_machine_prints():
             host_key.parse(said)
 
 
-def test_a_machine_with_a_network_that_overlaps_the_vpn_s_keeps_it(launch, provider):
-    launch.expect(['planner'])
-    mine = Job(launch, SPEC)
-    joining = Joining(mine, Guard(mine))
-    plain = joining.interface()
-    assert joining.fit(plain, ['10.0.0.0/8', '172.17.0.0/16']) == plain
-    fitted = joining.fit(plain, ['10.0.0.0/8', '198.18.0.0/16'])
-    assert fitted.host_routes and launch.store.machine('planner').load().vpn == fitted
+def test_machine_keeps_a_network_that_overlaps_the_vpn(launch, provider):
+    context, mine = begun(launch)
+    joining = Joining(context, mine, lambda: None)
+    joining.choose_interface()
+    plain = mine.interface
+    joining.avoid(['10.0.0.0/8', '172.17.0.0/16'])
+    assert mine.interface == plain
+    joining.avoid(['10.0.0.0/8', plain.network])
+    assert mine.interface.host_routes and launch.store.load('planner').vpn == mine.interface
 
 
 @pytest.mark.parametrize('there', [True, False])
@@ -491,25 +481,26 @@ def test_connection_that_breaks_at_the_end_is_opened_again(launch, provider, the
         if len(ran) == 1 or not there:
             raise ConnectError('the connection was lost')
 
-    mine = Job(launch, SPEC)
-    mine.ask, mine.shell = lambda seconds: None, SimpleNamespace(run=run)
-    mine.patience(30.0)
-    mine.ask = None
+    _, mine = begun(launch)
+    mine.shell = SimpleNamespace(run=run)
+    mine.probes = [lambda seconds: None]
+    mine.timeout(30.0)
+    mine.probes = [lambda seconds: run(Command(('true',)))]
     if there:
-        mine.tidy(mine.shell, [Command(('remove',))])
+        mine.clean_up([Command(('remove',))])
         assert ran == ['remove', 'true', 'remove']
     else:
         with pytest.raises(ConnectError):
-            mine.tidy(mine.shell, [Command(('remove',))])
-        assert ran == ['remove', 'true'] and mine.patience(30.0) < 30.0
+            mine.clean_up([Command(('remove',))])
+        assert ran == ['remove', 'true'] and mine.timeout(30.0) < 30.0
 
 
 @pytest.mark.parametrize('where', ['describe', 'found', 'gone'])
-def test_a_watch_that_fails_says_so_and_is_a_fault_in_the_end(
+def test_failing_watch_is_reported_and_becomes_a_fault(
         launch, provider, monkeypatch, where):
     heard = []
-    launch.report = heard.append
-    mine = Job(launch, SPEC)
+    context, mine = begun(launch, report=heard.append)
+    mine.agent, mine.heartbeat = SimpleNamespace(silent_for=60.0), SimpleNamespace(age=60.0)
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
     state = MachineState.DELETED if where == 'gone' else MachineState.RUNNING
 
@@ -522,8 +513,7 @@ def test_a_watch_that_fails_says_so_and_is_a_fault_in_the_end(
         raise KeyError('Reservations')
 
     monkeypatch.setattr(provider, 'describe', describe)
-    watch = watching.Watch(mine, SimpleNamespace(silent_for=60.0), SimpleNamespace(age=60.0),
-                           gone=fail, found=fail)
+    watch = Watch(context, mine, gone=fail, found=fail)
     wait_until(lambda: bool(heard), timeout=10, what='a word of it')
     assert "KeyError: 'Reservations'" in heard[0].reason and heard[0].machine == 'planner'
     with pytest.raises(KeyError):
@@ -537,38 +527,41 @@ def test_a_port_of_the_robot_that_is_taken_says_what_to_do(launch, monkeypatch):
             command, Result(1, '', 'UDP port 51820: Address already in use'), 'this computer')
 
     robot = launch.robot_vpn()
-    robot.vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
-    monkeypatch.setattr(process, 'run', run)
-    with pytest.raises(VpnError, match='in use already.*FOGROS2_VPN_PORT names another'):
-        robot._bring_up()
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeVpn, 'keys', lambda self, interface: Command(('true',)))
+        patch.setattr(process, 'run', run)
+        with pytest.raises(VpnError, match='in use already.*FOGROS2_VPN_PORT names another'):
+            robot._bring_up()
 
 
 @pytest.mark.parametrize(('on_exit', 'owned', 'hint'), [
     ('keep', True, 'ros2 fog delete planner'), ('delete', False, 'nothing needs to be done')])
 def test_what_stays_on_a_machine_out_of_reach_is_told_once(
         launch, provider, monkeypatch, on_exit, owned, hint):
-    monkeypatch.setattr(FakeProvider, 'owned', owned)
-    mine = Job(launch, dataclasses.replace(SPEC, on_exit=on_exit))
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=owned))
+    context, mine = begun(launch, dataclasses.replace(SPEC, on_exit=on_exit))
     mine.reused = True
 
     def silent(command):
         raise ConnectError("'planner' has not answered for 2 s")
 
-    shell = mine.shell = FakeShell(handlers={'ip': silent, 'true': silent})
+    mine.shell = FakeShell(handlers={'ip': silent})
+    mine.probes = [silent]
     with mine.undo:
-        Creation(mine)._claim('token')
-        mine.undoing('end', Creation(mine)._end)
+        creation = Creation(context, mine)
+        creation._claim('token')
+        mine.undoing('end', creation._end)
         for name in ('agent', 'VPN', 'nodes'):
-            mine.undoing(name, lambda: mine.tidy(shell, [Command(('ip', 'link'))]))
+            mine.undoing(name, lambda: mine.clean_up([Command(('ip', 'link'))]))
     told, = launch.down()
     assert 'stays there (nodes, VPN, agent)' in str(told) and hint in told.hint
 
 
-def test_a_machine_that_vanishes_while_it_ends_its_nodes_is_given_up(launch):
+def test_machine_that_vanishes_at_its_end_is_given_up():
     said = FakeStream()
     client = AgentClient(FakeShell(streams=[said]), '/run/x', agent_path='agent.py')
     begin = time.monotonic()
-    with pytest.raises(DeadlineExceeded, match="hasn't said a word for 0.3 s"):
+    with pytest.raises(DeadlineExceeded, match='sent nothing for 0.3 s'):
         client.request('release', timeout=30.0, silent=0.3)
     assert time.monotonic() - begin < 5
     client.close()

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 import dataclasses
 from decimal import Decimal
-import threading
 import time
 
 import pytest
 
 from fogros2.deploy import choosing, Launch
 from fogros2.deploy import launch as launches
-from fogros2.deploy.creating import Creation
-from fogros2.deploy.job import Job
-from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.deploy.context import Context
+from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import ConfigurationError, NameTaken, ProviderError, WorkspaceError
-from fogros2.model import MachineSpec, VpnInterface
+from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider
+from fogros2.testing.fakes import FakeProvider, FakeVpn
+from fogros2.testing.plugins import instead
 from rigs.pip_site import distribution, package
 
 SPEC = MachineSpec('planner', 'fake', {'size': 'cheapest'})
@@ -29,7 +29,7 @@ PRICES = {'large': Decimal(2), 'small': Decimal('0.5')}
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider(prices=PRICES)
-    monkeypatch.setattr(launches, 'provider', lambda name: fake)
+    instead(monkeypatch, 'fogros2.provider', {'fake': lambda: fake})
     monkeypatch.setattr(launches, 'check_robot', lambda: None)
     return fake
 
@@ -41,23 +41,20 @@ def events():
 
 @pytest.fixture
 def launch(tmp_path, monkeypatch, events):
-    def choose(self, launch, folder):
-        self._launch, self._lock, self._members = launch, threading.Lock(), {}
-        self.interface = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/no/key')
-
-    monkeypatch.setattr(RobotVpn, '__init__', choose)
+    instead(monkeypatch, 'fogros2.vpn', {'wireguard': FakeVpn})
     monkeypatch.setattr('fogros2.shell.warm', lambda kind: None)
     return Launch(store=Store(tmp_path), environment={}, report=events.append)
 
 
 def create(launch, spec=SPEC):
     """Take a machine through its first steps; returns what they share."""
-    mine = Job(launch, spec)
-    Creation(mine).run()
+    context = launch.context(spec)
+    mine = MachineJob(context, spec)
+    Creation(context, mine).run()
     return mine
 
 
-def test_choices_are_made_once_before_anything_is_created_and_shown_with_the_price(
+def test_choices_are_made_once_and_shown_with_the_price(
         launch, provider, events):
     launch.prepare([SPEC])
     assert 'create' not in provider.calls
@@ -68,12 +65,12 @@ def test_choices_are_made_once_before_anything_is_created_and_shown_with_the_pri
     mine = create(launch)
     assert provider.calls.count('resolve') == 1
     assert mine.spec.options == {'size': 'small'}
-    assert launch.store.machine('planner').load().spec == mine.spec
+    assert launch.store.load('planner').spec == mine.spec
     done = [event for event in events if isinstance(event, StepDone)][-1]
     assert done.step == 'machine' and '$0.5000 an hour' in done.detail
 
 
-def test_a_choice_that_nothing_fits_ends_the_launch_before_anything_is_created(
+def test_choice_without_a_match_ends_the_launch_at_once(
         launch, provider):
     provider.failures['resolve'] = ProviderError('nothing costs less than $0.1')
     with pytest.raises(ProviderError, match='nothing costs less'):
@@ -122,34 +119,35 @@ def test_launch_goes_on_where_packages_cannot_be_looked_at(
     def names():
         raise error
 
-    monkeypatch.setattr('fogros2.wheels.names', names)
+    monkeypatch.setattr('fogros2.host.wheels.names', names)
     package(tmp_path / 'ws', 'rob_tools')
     launch.prepare([dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws'))])
     assert not [event for event in events if isinstance(event, Warned)]
     assert 'resolve' in provider.calls
 
 
-def test_several_choices_are_told_in_words(provider):
+def test_several_choices_are_described(provider):
     chosen = dataclasses.replace(SPEC, options={'size': 'small', 'others': ['large', 'huge']})
     assert provider.choices(SPEC, chosen) == ['others large or huge', 'size small']
 
 
-def test_what_a_creation_could_not_take_away_is_reported_beside_its_error(
+def test_leftovers_of_a_creation_are_reported_with_its_error(
         launch, provider, events):
     error = ProviderError('no room')
     error.refused = True
     error.undo_failures = (ProviderError('the key is left'),)
     provider.failures['create'] = error
-    mine = Job(launch, SPEC)
+    context = launch.context(SPEC)
+    mine = MachineJob(context, SPEC)
     with pytest.raises(ProviderError, match='no room'):
-        Creation(mine).run()
+        Creation(context, mine).run()
     mine.undo.close()
     assert [event.reason for event in events if isinstance(event, StepFailed)] == [
         'the key is left', 'no room']
     assert [str(failure) for failure in launch.down()] == ['the key is left']
 
 
-def test_who_asks_for_the_choices_knows_when_the_launch_ends(launch, provider):
+def test_choice_is_cancelled_with_the_launch(launch, provider):
     assert launch.provider('fake').cancel is launch.cancel
 
 
@@ -159,7 +157,15 @@ def keep(launch, spec):
     mine.undo.close()
 
 
-def test_a_kept_machine_is_what_was_asked_for_though_another_would_be_chosen_now(
+def test_launch_replaces_machine_whose_id_was_not_saved(launch, provider, tmp_path):
+    killed = create(launch)
+    killed.save(machine_id=None, pid=1, pid_start=1)
+    again = create(Launch(store=Store(tmp_path), environment={}))
+    assert [machine.id for machine in provider.find({})] == [again.machine_id]
+    assert again.machine_id is not None and not again.reused
+
+
+def test_kept_machine_fits_though_today_differs(
         launch, provider, tmp_path):
     keep(launch, SPEC)
     provider.prices['tiny'] = Decimal('0.1')
@@ -175,7 +181,7 @@ def test_a_kept_machine_is_what_was_asked_for_though_another_would_be_chosen_now
     assert list(provider.find({})) == []
 
 
-def test_a_kept_machine_is_not_what_somebody_asks_for_by_its_chosen_value(
+def test_kept_machine_does_not_fit_an_explicit_choice(
         launch, provider, tmp_path):
     keep(launch, SPEC)
     again = Launch(store=Store(tmp_path), environment={})
@@ -183,7 +189,7 @@ def test_a_kept_machine_is_not_what_somebody_asks_for_by_its_chosen_value(
         create(again, MachineSpec('planner', 'fake', {'size': 'small'}))
 
 
-def test_a_kept_machine_is_told_whose_it_is_before_it_is_started(
+def test_kept_machine_gets_its_owner_before_it_starts(
         launch, provider, tmp_path, monkeypatch):
     keep(launch, SPEC)
     adopted = []
@@ -193,7 +199,7 @@ def test_a_kept_machine_is_told_whose_it_is_before_it_is_started(
     spec = dataclasses.replace(SPEC, on_exit='stop', lifetime=60.0)
     provider.calls.clear()
     # the kept one can be stopped, since who has it says so
-    monkeypatch.setattr(FakeProvider, 'adopt', provider.adopt)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(adopt=True))
     mine = create(again, spec)
     (calls, machine_id, told, tags), = adopted
     assert calls == ['describe'] and machine_id == mine.machine_id
@@ -221,12 +227,13 @@ def test_a_machine_without_a_price_costs_nothing(launch, provider):
     assert launch.cost() == []
 
 
-def test_a_provider_is_told_what_will_be_installed(launch, provider, monkeypatch):
+def test_provider_knows_what_will_be_installed(launch, provider, monkeypatch):
     requests = []
     made = provider.create
     monkeypatch.setattr(
         provider, 'create', lambda spec, request: requests.append(request) or made(spec, request))
-    monkeypatch.setattr('fogros2.bootstrap.dependencies', lambda spec, under, packages: 'a' * 16)
-    monkeypatch.setattr(Launch, 'underlay', lambda self, workspace: None)
+    monkeypatch.setattr(
+        'fogros2.host.bootstrap.dependencies', lambda spec, under, packages: 'a' * 16)
+    monkeypatch.setattr(Context, 'underlay', lambda self, workspaces: None)
     create(launch)
     assert requests[0].dependencies == requests[0].tags['fogros2-dependencies'] == 'a' * 16

@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-import threading
 
 import pytest
 
 from fogros2 import process
 from fogros2.deploy import Launch
-from fogros2.deploy.robot_vpn import RobotVpn
-from fogros2.model import Command, VpnInterface
+from fogros2.model import Command
 from fogros2.report import Event, StepFailed
 from fogros2.store import Store
-from fogros2.vpn.wireguard import WireGuard
+from fogros2.testing.fakes import FakeVpn
+from fogros2.testing.plugins import instead
 from ros2fog_cli.api import endings
 
 
@@ -25,30 +24,22 @@ def events() -> list[Event]:
 
 @pytest.fixture
 def launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: list[Event]) -> Launch:
-    def choose(self: RobotVpn, launch: Launch, folder: Path) -> None:
-        self._launch, self._lock, self._members = launch, threading.Lock(), {}
-        self._up, self._stop, self.vpn = False, threading.Event(), WireGuard()
-        self.interface = VpnInterface(
-            f'fog{launch.id}', '127.0.0.1', '127.0.0.1/32', 0, str(folder / 'vpn.key'))
-
-    monkeypatch.setattr(RobotVpn, '__init__', choose)
-    monkeypatch.setattr(WireGuard, 'keys', lambda self, interface: Command(('true',)))
-    monkeypatch.setattr(WireGuard, 'up', lambda self, interface, peers: iter(()))
+    instead(monkeypatch, 'fogros2.vpn', {'wireguard': FakeVpn})
     return Launch(store=Store(tmp_path), environment={}, report=events.append)
 
 
 @pytest.mark.parametrize('refused', [False, True])
-def test_the_folder_by_which_gc_finds_the_interface_stays_as_long(
+def test_launch_folder_stays_as_long_as_the_interface(
         launch: Launch, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
     down = Command(('false' if refused else 'true',), what='take it down')
-    monkeypatch.setattr(WireGuard, 'down', lambda self, interface: iter([down]))
+    monkeypatch.setattr(FakeVpn, 'down', lambda self, interface: iter([down]))
     launch.robot_vpn().ensure()
     folder = launch.store.launch(launch.id)
     assert len(launch.down()) == refused
     assert folder.exists() == refused
     # what gc sees when this process has gone
     monkeypatch.setattr(endings, 'process_alive', lambda *noted: False)
-    assert [found.launch for found in endings.leftovers(launch.store)] == [launch.id] * refused
+    assert [found.name for found in endings.leftovers(launch.store)] == [launch.id] * refused
 
 
 def test_it_is_said_once_each_time(

@@ -33,7 +33,7 @@ class Given:
 
 @pytest.mark.parametrize(('value', 'default', 'least', 'most'), [
     (0, 10, 0, math.inf), (64, 640, 64, 4096), (4096, 640, 64, 4096), (0.01, 1.0, 0.01, 1e3)])
-def test_a_number_that_is_taken(value, default, least, most):
+def test_number_in_range_is_accepted(value, default, least, most):
     taken = within(Given(value), 'rate', default, least, most)
     assert (taken, type(taken)) == (value, type(default))
 
@@ -44,13 +44,13 @@ def test_a_number_that_is_taken(value, default, least, most):
     (math.nan, 10.0, 0.01, 1000, "'rate' is nan: it has to be from 0.01 to 1000"),
     (math.inf, 10.0, 0.01, 1000, "'rate' is inf: it has to be from 0.01 to 1000"),
     (0, 640, 64, 4096, "'rate' is 0: it has to be from 64 to 4096")])
-def test_a_number_that_is_not(value, default, least, most, said):
+def test_number_out_of_range_is_refused(value, default, least, most, said):
     with pytest.raises(BadParameter) as caught:
         within(Given(value), 'rate', default, least, most)
     assert str(caught.value) == said
 
 
-def test_files_that_can_be_written(tmp_path):
+def test_writable_file_is_accepted(tmp_path):
     there = tmp_path / 'there.PNG'
     there.touch()
     for path in (there, tmp_path / 'new.jpg'):
@@ -59,7 +59,7 @@ def test_files_that_can_be_written(tmp_path):
     assert writable(Given(''), 'picture', PICTURES) == ''
 
 
-def test_files_that_can_not(tmp_path):
+def test_unwritable_file_is_refused(tmp_path):
     (tmp_path / 'folder.png').mkdir()
     for name, said in (
             ('no/x.png', f'there is no folder {tmp_path}/no'), ('folder.png', "can't be written"),
@@ -68,7 +68,7 @@ def test_files_that_can_not(tmp_path):
             writable(Given(str(tmp_path / name)), 'picture', PICTURES)
 
 
-def test_a_launch_ends_as_its_node_does():
+def test_launch_ends_with_the_status_of_its_node():
     context = LaunchContext()
 
     def exited(status):

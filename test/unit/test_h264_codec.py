@@ -33,8 +33,8 @@ DEEP = [name for name, layout in LAYOUTS.items() if layout.kind == 'deep']
 
 def smooth(width: int, height: int, number: int = 0) -> NDArray[numpy.uint8]:
     """Return a picture (height, width, 3) that any codec keeps: soft waves in soft colours."""
-    y, x = numpy.mgrid[0:height, 0:width]
-    waves = [128 + 60 * numpy.sin((x + 2 * number) / 23 + c) * numpy.cos(y / 31 - c)
+    y, x = numpy.arange(height), numpy.arange(width)
+    waves = [128 + 60 * numpy.outer(numpy.cos(y / 31 - c), numpy.sin((x + 2 * number) / 23 + c))
              for c in (0, 0.3, 0.6)]
     return numpy.dstack(waves).astype(numpy.uint8)
 
@@ -79,7 +79,7 @@ def fields(p: Picture) -> tuple[object, ...]:
 
 @pytest.mark.parametrize('encoding', EIGHT_BIT)
 @pytest.mark.parametrize('size', SIZES, ids=str)
-def test_round_trip(encoding: str, size: tuple[int, int]) -> None:
+def test_picture_survives_encoding_and_decoding(encoding: str, size: tuple[int, int]) -> None:
     """All fields are as they were, the pixels nearly; each packet gives its picture at once."""
     encoder, decoder = Encoder(Settings(quality=18)), Decoder()
     for number in range(4):
@@ -210,7 +210,7 @@ def test_loss_duplicates_and_late_packets() -> None:
     assert decoder.decode(packets[5].data) is None
 
 
-def test_what_came_late_can_still_close_the_gap() -> None:
+def test_late_packet_closes_the_gap() -> None:
     """A lost packet that comes again is decoded, and so are those after it, come again."""
     encoder, decoder = Encoder(), Decoder()
     packets = [encoder.encode(picture('bgr8', 64, 48, n)) for n in range(5)]
@@ -294,7 +294,7 @@ def recording(settings: Settings, encoding: str, size: tuple[int, int]) -> tuple
         bytes, list[Picture]]:
     encoder, decoder = Encoder(settings), Decoder()
     pictures, stream = [], b''
-    for number in range(25):
+    for number in range(14):
         packet = encoder.encode(picture(encoding, *size, number), key=number == 11,
                                 seconds=number / 30)
         stream += packet.data
@@ -336,14 +336,14 @@ def test_ffmpeg_agrees(
     assert told['streams'][0]['codec_name'] == 'h264'
     assert told['streams'][0]['has_b_frames'] == 0
     kinds = ''.join(frame['pict_type'] for frame in told['frames'])
-    assert kinds == 'I' + 'P' * 10 + 'I' + 'P' * 13
+    assert kinds == 'I' + 'P' * 10 + 'I' + 'P' * 2
     raw = subprocess.run(
         ['ffmpeg', '-v', 'error', '-xerror', '-err_detect', 'explode', '-i', str(path),
          '-f', 'rawvideo', '-pix_fmt', 'rgb24', '-'],
         capture_output=True, check=True, timeout=60)
     assert raw.stderr == b''
     width, height = told['streams'][0]['width'], told['streams'][0]['height']
-    frames = numpy.frombuffer(raw.stdout, numpy.uint8).reshape(25, height, width, 3)
+    frames = numpy.frombuffer(raw.stdout, numpy.uint8).reshape(14, height, width, 3)
     if encoding in ('rgb8', 'bgr8'):
         ours = numpy.stack([p.rows().reshape(size[1], size[0], 3) for p in pictures])
         if encoding == 'bgr8':

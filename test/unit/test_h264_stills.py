@@ -61,7 +61,7 @@ def test_yuv_comes_back_as_colours(encoding: str) -> None:
 
 
 @pytest.mark.parametrize(('encoding', 'kind'), [('16UC1', 'jpeg'), ('32FC1', 'png')])
-def test_what_a_format_cannot_hold_is_refused(encoding: str, kind: stills.Format) -> None:
+def test_picture_that_a_format_cannot_hold_is_refused(encoding: str, kind: stills.Format) -> None:
     with pytest.raises(BadPicture, match=encoding):
         stills.encode(picture(encoding), kind)
 

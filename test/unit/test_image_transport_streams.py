@@ -104,7 +104,7 @@ def test_two_images_of_one_camera_have_one_camera_info() -> None:
     assert ['camera_info:=true' in spec.arguments for spec in nodes(streams)[None]] == 3 * [True]
 
 
-def test_camera_info_that_a_transport_leaves_alone_keeps_its_name(
+def test_camera_info_outside_of_a_stream_keeps_its_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Theora, 'check', lambda self: None)
@@ -113,7 +113,7 @@ def test_camera_info_that_a_transport_leaves_alone_keeps_its_name(
 
 
 @pytest.mark.parametrize('module', ['av', 'cv2', 'numpy'])
-def test_what_the_robot_lacks_is_found_at_once(
+def test_missing_module_of_the_robot_is_found_at_once(
     monkeypatch: pytest.MonkeyPatch, module: str,
 ) -> None:
     find = importlib.util.find_spec

@@ -149,7 +149,7 @@ def test_a_context_that_is_not_there_is_named(api):
     assert 'first, second' in error.hint
 
 
-def test_a_kubeconfig_that_is_none_is_told(tmp_path, monkeypatch):
+def test_invalid_kubeconfig_is_reported(tmp_path, monkeypatch):
     path = tmp_path / 'config'
     monkeypatch.setenv('KUBECONFIG', str(path))
     assert not kubernetes_client.configured()
@@ -160,7 +160,7 @@ def test_a_kubeconfig_that_is_none_is_told(tmp_path, monkeypatch):
         assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_client.connect))
 
 
-def test_credentials_that_a_plugin_does_not_give_are_told(tmp_path, monkeypatch):
+def test_failing_credential_plugin_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9', **{
         'exec': {'apiVersion': 'client.authentication.k8s.io/v1', 'interactiveMode': 'Never',
                  'command': '/no/such/plugin', 'args': []}})))
@@ -187,7 +187,7 @@ def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9')))
     api = kubernetes_client.connect()
     begin = time.monotonic()
-    error = raised(Unreachable, lambda: api.request('GET', '/x', patience=0.5))
+    error = raised(Unreachable, lambda: api.request('GET', '/x', timeout=0.5))
     assert 0.4 < time.monotonic() - begin < 10.0
     assert 'Connection refused' in str(error)
     assert '0x' not in str(error)
@@ -234,7 +234,7 @@ def test_what_is_there_after_a_loss_may_be_enough(api, server):
     assert follow(api, lambda kind, thing: None, again=lambda: 'gone') == 'gone'
 
 
-def test_a_watch_that_is_not_allowed_says_so(api, server):
+def test_forbidden_watch_is_reported(api, server):
     server.answers = [refusal(403, 'Forbidden', 'cannot watch resource "pods"')]
     error = raised(ApiError, lambda: follow(api, lambda kind, thing: None))
     assert 'cannot watch' in str(error)
@@ -266,7 +266,7 @@ def test_something_else_can_end_a_watch(api, server):
 
 
 @pytest.mark.parametrize('call', ['request', 'watch'])
-def test_a_server_that_takes_the_question_and_says_nothing_holds_up_no_ctrl_c(api, server, call):
+def test_ctrl_c_ends_a_request_without_an_answer(api, server, call):
     asked = threading.Event()
 
     def silent() -> Answer:

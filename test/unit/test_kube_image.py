@@ -94,7 +94,7 @@ def test_it_is_built_and_pushed(engine):
         'Containerfile', 'package.xml']
 
 
-def test_a_registry_that_wants_a_login_is_told(engine):
+def test_registry_that_needs_a_login_is_reported(engine):
     (engine / 'refuse').touch()
     error = raised(ProviderError, lambda: image.build(
         recipe(), engine / 'context', program='buildah'))
@@ -102,7 +102,7 @@ def test_a_registry_that_wants_a_login_is_told(engine):
     assert error.hint == 'buildah login registry.example'
 
 
-def test_a_program_that_is_not_there_is_told(monkeypatch):
+def test_missing_program_is_reported_with_its_name(monkeypatch):
     monkeypatch.setattr(process, 'which', lambda name: None)
     assert 'podman, docker, buildah' in str(raised(PrerequisiteError, lambda: image.engine()))
     raised(ConfigurationError, lambda: image.engine('kaniko'))

@@ -8,7 +8,7 @@ import os
 from rigs.cluster import ros
 
 
-def test_the_ros_2_of_an_environment_is_the_prefix_with_the_middleware(tmp_path):
+def test_ros_prefix_is_the_one_with_the_middleware(tmp_path):
     overlay, underlay = tmp_path / 'overlay', tmp_path / 'jazzy'
     (overlay / 'share').mkdir(parents=True)
     index = underlay / 'share/ament_index/resource_index/rmw_typesupport'

@@ -84,7 +84,7 @@ def test_manifests_are_valid_in_old_and_new_versions(options):
 
 
 @pytest.mark.parametrize('name', ['role.yaml', 'networkpolicy.yaml'])
-def test_what_a_cluster_s_keeper_applies_is_valid(name):
+def test_manifests_for_administrators_are_valid(name):
     documents = list(yaml.safe_load_all((ROOT / 'deploy' / 'kubernetes' / name).read_text()))
     assert documents
     for document in documents:
@@ -198,7 +198,7 @@ def test_options_reach_the_pod():
     assert container_of(job)['image'].endswith('/slam:1')
 
 
-def test_a_zone_that_the_cluster_lacks_keeps_nothing_from_running():
+def test_unknown_zone_does_not_prevent_the_pod():
     _, pod = made(zone='us-central1-a')
     affinity = pod['affinity']['nodeAffinity']
     assert list(affinity) == ['preferredDuringSchedulingIgnoredDuringExecution']
@@ -440,7 +440,7 @@ def test_why_a_machine_has_ended():
     ('ErrImagePull', 'dial tcp 1.2.3.4:443: i/o timeout', False, 'reach the registry'),
     ('InvalidImageName', "couldn't parse image reference", True, "no image's name"),
     ('CreateContainerConfigError', 'secret "x" not found', True, '')])
-def test_an_image_that_can_not_be_had_is_told(reason, message, final, word):
+def test_unavailable_image_is_reported(reason, message, final, word):
     trouble = pods.trouble_of(pod_of(
         'Pending', state={'waiting': {'reason': reason, 'message': message}}))
     assert trouble is not None
@@ -468,7 +468,7 @@ def test_a_container_that_is_being_made_is_no_trouble():
     ("0/1 nodes are available: 1 node(s) didn't match Pod's node affinity/selector.",
      'node_selector='),
     ('0/1 nodes are available: 1 node(s) had untolerated taint {gpu: true}.', 'tolerations=')])
-def test_a_pod_that_fits_on_no_node_is_told(message, word):
+def test_pod_that_fits_on_no_node_is_reported(message, word):
     trouble = pods.trouble_of(pod_of('Pending', state={}, conditions=[
         {'type': 'PodScheduled', 'status': 'False', 'reason': 'Unschedulable',
          'message': message}]))
@@ -504,8 +504,8 @@ def test_who_makes_load_balancers(server, groups, maker):
 
 
 def test_a_load_balancer_of_a_cloud_s_is_waited_for_longer():
-    assert exposure.patience('EKS') == exposure.patience('') == 180.0
-    assert exposure.patience('k3s') == exposure.patience('MetalLB') == 60.0
+    assert exposure.timeout('EKS') == exposure.timeout('') == 180.0
+    assert exposure.timeout('k3s') == exposure.timeout('MetalLB') == 60.0
 
 
 def test_a_load_balancer_has_an_address_or_a_name():

@@ -3,19 +3,19 @@
 
 from __future__ import annotations
 
-import asyncio
 from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
 
-from fogros2.actions.session import Session
 from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Endpoint, MachineSpec
 from fogros2.shell import lines
 from fogros2.shell.ssh import SSHShell
+from fogros2.testing.fakes import FakeProvider
+from rigs import deploying
 
 
 class Endless:
@@ -70,56 +70,22 @@ def test_command_starts_anew_after_its_connection_was_closed(monkeypatch):
             if fails:
                 raise EOFError
             started.append(line)
-        return SimpleNamespace(exec_command=exec_command, get_transport=lambda: transport)
+        return SimpleNamespace(exec_command=exec_command)
 
     shell = SSHShell(Endpoint('ssh', '127.0.0.1', 22, 'fog'), name='planner')
     channels = iter([channel(True), channel(False), channel(True), channel(True)])
-    monkeypatch.setattr(shell, 'channel', lambda *_: next(channels))
+    monkeypatch.setattr(shell, '_connect', lambda *_: transport)
+    monkeypatch.setattr(shell, '_session', lambda *_: next(channels))
     shell.start('true')
     assert started == ['true']
     with pytest.raises(ConnectError, match='can not start a command'):
         shell.start('true')
 
 
-def test_that_it_is_gone_is_its_provider_s_to_say():
-    job = SimpleNamespace(spec=None, provider=SimpleNamespace(owned=False))
-    agent, heard = Told(), []
-    machine = RunningMachine(
-        SimpleNamespace(ending=False), job, None, None, agent, None,
-        SimpleNamespace(address='198.18.7.2'), 7, None, None, None)
-    machine.subscribe(heard.append)
-    assert agent.since == 7
-    for event in ('lost', 'connection', 'gap'):
-        agent.callback({'event': event, 'seq': 8, 'state': 'absent', 'reason': 'x', 'count': 1})
-    assert heard == []
-    agent.callback({'event': 'connection', 'state': 'lost'})
-    agent.callback({'event': 'notice', 'seq': 9, 'reason': 'soon'})
-    assert [event['event'] for event in heard] == ['connection', 'notice']
-
-
-@pytest.mark.parametrize('event', [
-    {'event': ['started']}, {'event': 'started', 'node': ['n']}, {'event': 'started', 'node': 'n'},
-    {'event': 'started', 'node': 'n', 'pid': 1, 'cmd': [1]},
-    {'event': 'output', 'node': 'n', 'text': 5}, {'event': 'exited', 'node': 'n'},
-    {'event': 'exited', 'node': 'n', 'returncode': 'x'}, {'event': 'refused', 'node': 'n'},
-    {'event': 'vpn_repaired', 'seconds': 'x'}, {'event': 'connection', 'state': {}},
-    {'event': 'launch_exited', 'returncode': []}])
-def test_an_event_that_makes_no_sense_is_left_aside(event):
+def test_machine_lost_at_subscription_affects_no_other(
+        tmp_path, monkeypatch):
     heard = []
-    loop = asyncio.new_event_loop()
-    try:
-        session = Session(MachineSpec('planner', 'ssh'), loop, in_thread=None, fail=heard.append,
-                          changed=lambda: None, taken_away=lambda session, reason: None)
-        session._runs['n'] = SimpleNamespace(on_event=heard.append)
-        session._on_event(event)
-    finally:
-        loop.close()
-    assert heard == []
-
-
-def test_a_machine_that_goes_while_it_is_subscribed_to_is_lost_and_nothing_else():
-    heard = []
-    job = SimpleNamespace(spec=None, provider=SimpleNamespace(owned=False))
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
 
     class Closing(Told):
         def subscribe(self, callback, since):
@@ -129,8 +95,9 @@ def test_a_machine_that_goes_while_it_is_subscribed_to_is_lost_and_nothing_else(
         def close(self):
             pass
 
-    machine = RunningMachine(
-        SimpleNamespace(ending=False), job, None, None, Closing(), None,
-        SimpleNamespace(address='198.18.7.2'), 7, None, None, None)
+    context, job = deploying.job(tmp_path, MachineSpec('planner', 'fake'))
+    job.machine = job.shell = job.heartbeat = None
+    job.agent, job.interface = Closing(), deploying.ROBOT
+    machine = RunningMachine(context, job, None, None)
     machine.subscribe(heard.append)
     assert heard == [{'event': 'lost', 'reason': 'it was deleted'}]

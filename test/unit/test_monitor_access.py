@@ -11,6 +11,7 @@ from pathlib import Path
 import shutil
 import socket
 import threading
+import time
 from types import SimpleNamespace
 import urllib.parse
 
@@ -19,19 +20,22 @@ from launch.substitutions import TextSubstitution
 import pytest
 
 from fogros2 import ContainerInstance, Foxglove, monitor_addresses
-from fogros2.actions import carriers, foxglove, networks, streaming
-from fogros2.deploy import Launch, RunningMachine
-from fogros2.deploy import launch as launches
-from fogros2.deploy.creating import Creation
-from fogros2.deploy.job import Job
+from fogros2.actions import foxglove
+from fogros2.deploy import RunningMachine
+from fogros2.deploy.steps.creating import Creation
+from fogros2.describe import networks
 from fogros2.errors import AgentError, ConfigurationError, ProviderError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
 from fogros2.provider.kubernetes import publishing
 from fogros2.provider.kubernetes.names import MachineId
+from fogros2.runtime import foxglove as runtime_foxglove
+from fogros2.runtime import republishers, streaming
 from fogros2.store import process_start, Record, record_from_json, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2_monitor import credentials
+from rigs import deploying
 from ros2fog_cli.api import monitor
+from ros2fog_cli.api.browser import Ticket
 from ros2fog_cli.api.machines import Entry
 
 SOURCES = ('198.51.100.0/28',)
@@ -41,7 +45,7 @@ VPN = VpnInterface('fog1', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
 @pytest.mark.parametrize(('text', 'found'), [
     ('198.51.100.0/28', '198.51.100.0/28'), (' 198.51.100.7 ', '198.51.100.7/32'),
     ('2001:db8::1', '2001:db8::1/128')])
-def test_networks_are_in_one_form(text, found):
+def test_networks_are_normalised(text, found):
     given = networks.items([text, TextSubstitution(text=text)])
     assert networks.resolve(LaunchContext(), given) == (found, found)
     assert networks.resolve(LaunchContext(), networks.items(None)) == ()
@@ -52,7 +56,7 @@ def test_networks_are_in_one_form(text, found):
     (['everybody'], "'everybody' is no network"),
     ('198.51.100.0/28', 'is no list of networks'),
     ([''], "'' is no network")])
-def test_what_is_no_network_is_refused_where_it_is_written(given, said):
+def test_invalid_network_is_refused_in_the_launch_file(given, said):
     for make in (lambda: ContainerInstance(name='a', monitor_allow=given),
                  lambda: Foxglove('a', monitor_allow=given)):
         with pytest.raises(ConfigurationError, match=said):
@@ -61,56 +65,48 @@ def test_what_is_no_network_is_refused_where_it_is_written(given, said):
 
 @pytest.fixture
 def provider(monkeypatch):
-    fake = FakeProvider()
-    monkeypatch.setattr(FakeProvider, 'firewall', True)
-    monkeypatch.setattr(launches, 'provider', lambda name: fake)
-    return fake
-
-
-@pytest.fixture
-def deployment(tmp_path, provider):
-    made = Launch(store=Store(tmp_path), environment={})
-    made._robot = SimpleNamespace(interface=VPN, down=True)
-    return made
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
+    return FakeProvider()
 
 
 @pytest.mark.parametrize(
     ('on_exit', 'closed'), [('keep', True), ('stop', True), ('delete', False)])
-def test_a_port_is_open_until_the_launch_ends_unless_it_goes_with_the_machine(
-        deployment, provider, monkeypatch, on_exit, closed):
-    job = Job(deployment, MachineSpec('planner', 'fake', on_exit=on_exit))
+def test_port_is_closed_at_the_end_of_the_launch(
+        tmp_path, provider, on_exit, closed):
+    context, job = deploying.job(
+        tmp_path, MachineSpec('planner', 'fake', on_exit=on_exit), provider=provider)
     job.save(machine_id='fake-1')
     job.failed = False
-    machine = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING, vpn_host='198.51.100.9')
-    monkeypatch.setattr(FakeProvider, 'owned', False)
-    running = RunningMachine(
-        deployment, job, machine, None, None, None, VPN, 1, None, None, None)
-    monkeypatch.setattr(FakeProvider, 'owned', True)
-    assert running.publish(8766, SOURCES) == ('198.51.100.9', 8766)
+    job.machine = Machine(
+        'fake-1', 'planner', 'fake', MachineState.RUNNING, vpn_host='198.51.100.9')
+    job.shell, job.interface = FakeShell(), VPN
+    job.agent, job.heartbeat = None, SimpleNamespace(age=None)
+    running = RunningMachine(context, job, None, None)
+    assert running.open_port(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.allowed == {('fake-1', 8766): list(SOURCES)}
-    assert job.folder.load().monitor_open == '198.51.100.9:8766'
+    assert context.store.load('planner').monitor_open == '198.51.100.9:8766'
     # the bridge was started again: nothing is opened twice
-    assert running.publish(8766, SOURCES) == ('198.51.100.9', 8766)
+    assert running.open_port(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.calls.count('allow') == 1
     running.close()
     assert provider.allowed == {('fake-1', 8766): [] if closed else list(SOURCES)}
 
 
-def test_what_a_killed_launch_left_open_is_closed_and_forgotten_by_the_next(
-        deployment, provider):
-    spec = MachineSpec('planner', 'fake', on_exit='keep')
-    job = Job(deployment, spec)
-    with job.folder.lock():
+def test_next_launch_closes_the_port_of_a_killed_one(
+        tmp_path, provider):
+    context, job = deploying.job(
+        tmp_path, MachineSpec('planner', 'fake', on_exit='keep'), provider=provider)
+    with context.store.lock('planner'):
         job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766')
         provider._machines['fake-1'] = machine = Machine(
             'fake-1', 'planner', 'fake', MachineState.RUNNING)
-        Creation(job)._adopt(machine)
+        Creation(context, job)._adopt(machine)
     assert provider.allowed == {('fake-1', 8766): []}
-    after = job.folder.load()
+    after = context.store.load('planner')
     assert (after.monitor, after.monitor_open) == (0, '')
 
 
-def test_a_record_of_before_has_no_networks():
+def test_older_record_has_no_networks():
     spec = {'name': 'a', 'provider': 'fake'}
     assert record_from_json({'name': 'a', 'provider': 'fake', 'spec': spec}).spec == MachineSpec(
         'a', 'fake')
@@ -126,7 +122,7 @@ def entry(**changes):
         dataclasses.replace(made, **changes))
 
 
-def test_where_topics_are_seen_is_told_while_a_launch_serves_them():
+def test_monitor_address_is_shown_while_a_launch_serves_it():
     assert entry().monitor == 'ws://198.18.7.2:8765'
     assert entry().to_json()['monitor_open'] == '198.51.100.9:8766'
     for changes in ({'monitor': 0}, {'pid': 0}, {'vpn': None}):
@@ -134,7 +130,7 @@ def test_where_topics_are_seen_is_told_while_a_launch_serves_them():
         assert entry(**changes).to_json()['monitor_open'] is None
 
 
-def test_the_token_is_the_machine_s_to_tell(tmp_path):
+def test_share_reads_token_and_certificate(tmp_path):
     if shutil.which('openssl') is None:
         pytest.skip('needs openssl')
     made = credentials.make(tmp_path / 'monitor' / 'x', 'planner')
@@ -147,12 +143,12 @@ def test_the_token_is_the_machine_s_to_tell(tmp_path):
     for changes, kind, said in (
             ({'monitor': 0}, AgentError, 'serves the topics'),
             ({'pid': 0}, AgentError, 'serves the topics'),
-            ({'monitor_open': ''}, ConfigurationError, 'nobody but this robot')):
+            ({'monitor_open': ''}, ConfigurationError, 'only this robot')):
         with pytest.raises(kind, match=said):
             monitor.credentials_of(entry(**changes), shell)
 
 
-def test_tunnel_reads_the_token_of_the_bridge_s_port():
+def test_tunnel_reads_the_token_of_the_bridges_port():
     shell = FakeShell(handlers={'sh': lambda command: Result(0, 'sesame\n', '')})
     assert monitor.token_of(entry(), shell, 9000) == 'sesame'
     assert [command.argv[2:] for command in shell.commands] == [
@@ -160,7 +156,7 @@ def test_tunnel_reads_the_token_of_the_bridge_s_port():
     assert shell.commands[0].sudo
 
 
-def test_bridge_of_this_computer_is_found_while_it_listens():
+def test_bridge_of_the_robot_is_found_while_it_listens():
     folder = monitor_addresses.on_robot(Store(), 'planner')
     with socket.create_server(('127.0.0.1', 0)) as bridge:
         port = bridge.getsockname()[1]
@@ -170,8 +166,8 @@ def test_bridge_of_this_computer_is_found_while_it_listens():
     assert monitor.on_robot('planner') is None
 
 
-def test_browser_is_led_to_the_page_once():
-    with contextlib.closing(monitor.Ticket('http://localhost:1/?token=sesame')) as ticket:
+def test_browser_is_led_to_the_page_once_and_in_time(monkeypatch):
+    with contextlib.closing(Ticket('http://localhost:1/?token=sesame')) as ticket:
         assert 'sesame' not in ticket.url
         place = urllib.parse.urlsplit(ticket.url)
 
@@ -186,10 +182,16 @@ def test_browser_is_led_to_the_page_once():
         assert ask(place.path) == (303, 'http://localhost:1/?token=sesame')
         assert ticket.used.is_set()
         assert ask(place.path) == (404, '')
+    with contextlib.closing(Ticket('http://localhost:1/?token=sesame')) as ticket:
+        place = urllib.parse.urlsplit(ticket.url)
+        late = time.monotonic() + 61
+        with monkeypatch.context() as patch:
+            patch.setattr('ros2fog_cli.api.browser.time.monotonic', lambda: late)
+            assert ask(place.path) == (404, '')
 
 
 def test_silent_connection_does_not_hold_up_the_browser():
-    ticket = monitor.Ticket('http://localhost:1/')
+    ticket = Ticket('http://localhost:1/')
     place = urllib.parse.urlsplit(ticket.url)
     with socket.create_connection((place.hostname, place.port)):
         with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=5)) as link:
@@ -201,7 +203,7 @@ def test_silent_connection_does_not_hold_up_the_browser():
         assert not closing.is_alive()
 
 
-def test_a_pod_s_service_keeps_the_callers_addresses():
+def test_service_of_a_pod_keeps_the_callers_addresses():
     where = MachineId('robots', 'fogros2-planner', 'u-1', '')
     made = publishing.service('LoadBalancer', where, 8766, SOURCES)
     assert made['metadata']['name'] == 'fogros2-planner-8766'
@@ -212,7 +214,7 @@ def test_a_pod_s_service_keeps_the_callers_addresses():
         'NodePort', where, 8766, SOURCES)['spec']
 
 
-def test_a_service_that_can_not_be_removed_says_how():
+def test_service_that_cannot_be_removed_has_a_hint():
     from fogros2.kubernetes_client import ApiError
 
     class Api:
@@ -228,12 +230,12 @@ def made(monkeypatch):
     """Return the specs of the processes that actions make."""
     found = []
 
-    class Carrier(carriers.Carrier):
+    class Added(republishers.AddedProcess):
         def __init__(self, spec):
             found.append(spec)
             super().__init__(spec)
 
-    monkeypatch.setattr(foxglove, 'Carrier', Carrier)
+    monkeypatch.setattr(runtime_foxglove, 'AddedProcess', Added)
     monkeypatch.setattr(foxglove, 'send', lambda process, machine: None)
     return found
 
@@ -246,11 +248,11 @@ def coordinated(monkeypatch, spec, *, on_robot=False):
 
 
 @pytest.mark.parametrize(('launch_foxglove', 'beside'), [(True, True), (False, False)])
-def test_gate_leads_to_the_application_that_the_provider_serves(
+def test_gate_forwards_to_the_providers_application(
     monkeypatch, made, launch_foxglove, beside,
 ):
-    monkeypatch.setattr(FakeProvider, 'runs_containers', False)
-    monkeypatch.setattr(FakeProvider, 'application_port', 8080)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(containers=False))
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(application_port=8080))
     coordinated(monkeypatch, MachineSpec('pod', 'fake', launch_foxglove=launch_foxglove))
     Foxglove('pod').execute(LaunchContext())
     words = ' '.join(made[0].arguments)
@@ -258,8 +260,8 @@ def test_gate_leads_to_the_application_that_the_provider_serves(
 
 
 @pytest.mark.parametrize(('runs', 'on_robot'), [(True, False), (False, False), (True, True)])
-def test_the_bridge_is_told_what_the_machine_can_do(monkeypatch, made, runs, on_robot):
-    monkeypatch.setattr(FakeProvider, 'runs_containers', runs)
+def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robot):
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(containers=runs))
     coordinated(monkeypatch, MachineSpec('planner', 'fake'), on_robot=on_robot)
     Foxglove('planner', topics=['/a', '/b*'], port=9000, image='x:1',
              monitor_allow=SOURCES).execute(LaunchContext())

@@ -18,7 +18,7 @@ with_openssl = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs
 
 
 @with_openssl
-def test_they_are_private_and_stay_for_a_launch(tmp_path):
+def test_credentials_are_private_and_kept_for_a_launch(tmp_path):
     folder = Path(monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3'))
     made = credentials.make(folder, 'planner')
     token = made.token.read_text()
@@ -35,7 +35,7 @@ def test_they_are_private_and_stay_for_a_launch(tmp_path):
 
 
 @with_openssl
-def test_the_fingerprint_is_as_openssl_has_it(tmp_path):
+def test_fingerprint_is_that_of_openssl(tmp_path):
     made = credentials.make(Path(monitor_addresses.folder_of(str(tmp_path), 1, 'x')), 'planner')
     said = process.run(Command(('openssl', 'x509', '-in', str(made.certificate), '-noout',
                         '-fingerprint', '-sha256')), timeout=20).stdout
@@ -43,13 +43,13 @@ def test_the_fingerprint_is_as_openssl_has_it(tmp_path):
         made.certificate.read_text())
 
 
-def test_folder_of_somebody_s_own_loses_nothing(tmp_path):
+def test_foreign_folder_is_not_emptied(tmp_path):
     (tmp_path / 'mine').touch()
     assert credentials.make_token(tmp_path / 'secrets').token.exists()
     assert (tmp_path / 'mine').exists()
 
 
-def test_token_needs_no_openssl_and_gets_a_certificate_later(tmp_path, monkeypatch):
+def test_token_needs_no_openssl(tmp_path, monkeypatch):
     folder = Path(monitor_addresses.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
     token = credentials.make_token(folder).token.read_text()
     assert len(token.strip()) == 32
@@ -59,7 +59,7 @@ def test_token_needs_no_openssl_and_gets_a_certificate_later(tmp_path, monkeypat
         assert made.certificate.exists() and made.token.read_text() == token
 
 
-def test_a_machine_without_openssl_lets_nobody_in(tmp_path, monkeypatch, capsys):
+def test_machine_without_openssl_admits_nobody_else(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(process, 'argv', lambda command: ['/no/such/openssl'])
     serve = pytest.importorskip(
         'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')

@@ -10,7 +10,7 @@ from fogros2_monitor.definitions import definition, message_class
 RULE = '=' * 80
 
 
-def test_fields_and_the_messages_in_them():
+def test_definition_has_fields_and_nested_messages():
     pytest.importorskip('sensor_msgs.msg')
     assert definition('sensor_msgs/msg/Imu').split(RULE)[0] == (
         'std_msgs/Header header\n'
@@ -36,13 +36,13 @@ def test_fields_and_the_messages_in_them():
     ('shape_msgs/msg/SolidPrimitive', 'float64[<=3] dimensions'),
     ('geometry_msgs/msg/PoseWithCovariance', 'float64[36] covariance'),
 ])
-def test_types(name, line):
+def test_types_of_fields_are_those_of_message_files(name, line):
     assert line in definition(name).splitlines()
 
 
 @pytest.mark.parametrize('name', [
     'std_msgs/msg/Nothing', 'no_such_msgs/msg/String', 'std_msgs/srv/String', 'String',
     'std_msgs/msg/a/b'])
-def test_what_is_not_there_is_named(name):
+def test_missing_message_is_named(name):
     with pytest.raises(LookupError, match=name):
         message_class(name)

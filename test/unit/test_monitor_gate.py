@@ -31,7 +31,7 @@ def request(target: str, method: str = 'GET', more: str = '') -> bytes:
     return f'{method} {target} HTTP/1.1\r\nHost: x\r\n{more}\r\n'.encode()
 
 
-def test_the_token_is_taken_out_of_what_is_handed_on():
+def test_token_is_removed_from_forwarded_requests():
     for target, left in ((f'/a?x=1&token={TOKEN}&y=%20', '/a?x=1&y=+'),
                          (f'/?token={TOKEN}', '/'), ('/a?x=%20', '/a?x=%20')):
         assert parse(request(target)).handed_on() == request(left)
@@ -40,7 +40,7 @@ def test_the_token_is_taken_out_of_what_is_handed_on():
         '/a', more='Connection: close\r\n')
 
 
-def test_a_cookie_gets_a_page_and_no_websocket():
+def test_cookie_admits_pages_but_no_websocket():
     name, value = cookie(TOKEN)
     more = f'Cookie: a=b; {name}={value}\r\n'
     check(parse(request('/', more=more)), TOKEN)
@@ -53,7 +53,7 @@ def test_a_cookie_gets_a_page_and_no_websocket():
 
 
 @pytest.mark.parametrize('target', ['//evil.example/x', '/\\evil.example/x', 'http://x//evil'])
-def test_nobody_is_led_elsewhere(target):
+def test_redirect_stays_on_the_host(target):
     answer = page.redirect(
         parse(request(f'{target}?token={TOKEN}')), TOKEN, encrypted=True)
     place, = (line for line in answer.split(b'\r\n') if line.startswith(b'Location: '))
@@ -68,7 +68,7 @@ def test_nobody_is_led_elsewhere(target):
     ('198.18.1.2', 'https://lichtblick-suite.github.io'),
     ('198.18.1.2:8765', 'http://localhost:8080'), ('198.18.1.2:8765', 'http://[::1]:8080'),
 ])
-def test_sites_that_lead_to_the_bridge_may_ask(host, origin):
+def test_linked_applications_are_admitted(host, origin):
     more = '' if origin is None else f'Origin: {origin}\r\n'
     head = f'GET / HTTP/1.1\r\nHost: {host}\r\n{more}\r\n'.encode()
     check_site(parse(head), 'planner', encrypted=False)
@@ -88,7 +88,7 @@ def test_sites_that_lead_to_the_bridge_may_ask(host, origin):
     ('localhost.evil.example', [], '421'), ('127.0.0.1.evil.example', [], '421'),
     ('localhost\r\nHost: evil.example', [], '400'),
 ])
-def test_other_sites_may_not_ask(host, origins, status):
+def test_other_sites_are_refused(host, origins, status):
     more = ''.join(f'Origin: {origin}\r\n' for origin in origins)
     with pytest.raises(Refused) as refused:
         check_site(parse(f'GET / HTTP/1.1\r\nHost: {host}\r\n{more}\r\n'.encode()), 'planner',
@@ -97,7 +97,7 @@ def test_other_sites_may_not_ask(host, origins, status):
     assert 'evil' not in str(refused.value), 'the log takes no words of a stranger'
 
 
-def test_certificate_stands_for_the_name_over_tls():
+def test_host_name_is_free_over_tls():
     """A cluster's load balancer has a name that the machine doesn't know."""
     head = 'GET / HTTP/1.1\r\nHost: lb.example:8766\r\nOrigin: {}\r\n\r\n'
     check_site(parse(head.format('https://lb.example:8766').encode()), 'm', encrypted=True)
@@ -119,14 +119,14 @@ def test_certificate_stands_for_the_name_over_tls():
     (b'GET / HTTP/2\r\n\r\n', '400'),
     (b'GET //[x HTTP/1.1\r\n\r\n', '400'),
 ])
-def test_others_are_refused(head, status):
+def test_requests_without_the_token_are_refused(head, status):
     with pytest.raises(Refused) as refused:
         check(parse(head), TOKEN)
     assert refused.value.status.startswith(status)
     assert TOKEN not in str(refused.value)
 
 
-def test_an_endpoint_is_an_address_and_a_port():
+def test_endpoint_is_an_address_and_a_port():
     assert endpoint('198.18.0.1:8765') == ('198.18.0.1', 8765)
     assert endpoint('[::1]:0') == ('::1', 0)
     for text in ('8765', 'here:', 'here:x', 'here:70000'):
@@ -134,7 +134,7 @@ def test_an_endpoint_is_an_address_and_a_port():
             endpoint(text)
 
 
-def test_addresses_are_what_they_are_whichever_socket_they_come_by():
+def test_ipv4_address_is_the_same_on_an_ipv6_socket():
     assert plain_address('::ffff:198.51.100.1') == '198.51.100.1'
     assert plain_address('fe80::1%eth0') == 'fe80::1'
     with pytest.raises(Exception, match='host bits'):
@@ -148,14 +148,14 @@ def test_addresses_are_what_they_are_whichever_socket_they_come_by():
     ('198.18.0.1:8765', False, 'ws://198.18.0.1:8765'),
     ('"><script>', False, 'ws://&quot;&gt;&lt;script&gt;'),
 ])
-def test_a_page_leads_to_applications_that_may_open_the_bridge(host, links, shown):
+def test_page_links_applications_that_can_open_the_bridge(host, links, shown):
     asked = parse(f'GET / HTTP/1.1\r\nHost: {host}\r\n\r\n'.encode())
     text = page.links(asked, 'planner', TOKEN, encrypted=False).decode()
     assert (f'{shown}/?token={TOKEN}' in text, 'https://' in text) == (True, links)
     assert '<script>' not in text
 
 
-def test_who_came_with_the_token_is_led_on_with_it():
+def test_page_links_contain_the_token():
     asked = parse(b'GET /?token=x HTTP/1.1\r\nHost: 198.51.100.2:8766\r\n\r\n')
     text = page.links(asked, 'planner', TOKEN, encrypted=True).decode()
     assert ('https://lichtblick-suite.github.io/lichtblick/?ds=foxglove-websocket&amp;'
@@ -241,7 +241,7 @@ def ask(gate: Running, target: str, more: str = UPGRADE, at: str = '127.0.0.1') 
             return b''.join(iter(lambda: connection.recv(4096), b''))
 
 
-def test_who_may_comes_in_and_others_are_logged_once(tmp_path, bridge):
+def test_refused_clients_are_logged_once(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
         open_port, guarded = gate.ports
         with closing(socket.create_connection(('127.0.0.1', open_port), timeout=20)) as robot:
@@ -263,7 +263,7 @@ def test_who_may_comes_in_and_others_are_logged_once(tmp_path, bridge):
     assert gate.ended() == []
 
 
-def test_other_networks_do_not_even_get_a_handshake(tmp_path, bridge):
+def test_other_networks_get_no_handshake(tmp_path, bridge):
     with running(tmp_path, bridge, '--allow', '127.0.0.2/32', '--allow', '::1/128') as gate:
         for _ in range(3):
             with pytest.raises(OSError, match='reset|EOF|violation'):
@@ -273,7 +273,7 @@ def test_other_networks_do_not_even_get_a_handshake(tmp_path, bridge):
     assert gate.ended() == []
 
 
-def test_pages_go_to_the_application_where_there_is_one(tmp_path, bridge):
+def test_pages_are_forwarded_to_the_application(tmp_path, bridge):
     """The application is served to who has come with the token once, its links without it."""
     with running(tmp_path, bridge, '--application', f'127.0.0.1:{bridge}') as gate:
         answer = ask(gate, f'/?token={gate.token}&ds=x', more='')
@@ -286,7 +286,7 @@ def test_pages_go_to_the_application_where_there_is_one(tmp_path, bridge):
         assert ask(gate, '/main.js', more='').startswith(b'HTTP/1.1 401 ')
 
 
-def test_without_an_application_a_page_says_where_there_are_some(tmp_path, bridge, free_udp_port):
+def test_page_without_application_has_links(tmp_path, bridge, free_udp_port):
     with running(tmp_path, bridge, '--application', f'127.0.0.1:{free_udp_port}',
                  '--name', 'planner') as gate:
         with closing(socket.create_connection(('127.0.0.1', gate.ports[0]), timeout=20)) as robot:
@@ -300,7 +300,7 @@ def test_without_an_application_a_page_says_where_there_are_some(tmp_path, bridg
             b'HTTP/1.1 404 ')
 
 
-def test_the_process_list_does_not_have_the_token(tmp_path, bridge):
+def test_token_is_not_in_the_process_list(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
         children = Path(f'/proc/{os.getpid()}/task').glob('*/children')
         words = b' '.join(
@@ -310,13 +310,13 @@ def test_the_process_list_does_not_have_the_token(tmp_path, bridge):
     assert gate.token.encode() not in words
 
 
-def test_a_bridge_that_is_not_there_yet_is_told(tmp_path, free_udp_port):
+def test_missing_bridge_is_reported(tmp_path, free_udp_port):
     with running(tmp_path, free_udp_port) as gate:
         assert ask(gate, f'/?token={gate.token}').startswith(b'HTTP/1.1 502 ')
         assert 'the bridge does not answer' in gate.line()
 
 
-def test_a_long_request_is_cut_off(tmp_path, bridge):
+def test_long_request_is_refused(tmp_path, bridge):
     with running(tmp_path, bridge) as gate:
         answer = ask(gate, f'/?token={gate.token}&x=' + 'x' * 40000)
         assert answer.startswith(b'HTTP/1.1 431 ')

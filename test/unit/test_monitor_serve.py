@@ -16,7 +16,7 @@ serve = pytest.importorskip(
     'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
 
 
-def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
+def test_patterns_become_regular_expressions():
     assert serve.regular_expression('/camera/*') == '/camera/.*'
     assert serve.regular_expression('/a.b?[c]') == r'/a\.b.\[c\]'
     assert serve.command('127.9.9.9', 5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
@@ -25,7 +25,7 @@ def test_patterns_are_regular_expressions_for_ros_2_s_bridge():
     assert serve.command('127.9.9.9', 5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2_monitor.bridge']
 
 
-def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
+def test_foxglove_bridge_of_ros_runs_if_installed(tmp_path):
     """It is on the loopback, the gate stands before it, and both end together."""
     index = tmp_path / 'share/ament_index/resource_index/packages'
     index.mkdir(parents=True)
@@ -53,7 +53,7 @@ def test_ros_2_s_own_bridge_runs_where_it_is_installed(tmp_path):
         assert process.communicate(timeout=20)[0] == ''
 
 
-def test_folder_that_takes_no_token_is_named(tmp_path, monkeypatch):
+def test_unwritable_token_folder_is_named(tmp_path, monkeypatch):
     (tmp_path / 'file').touch()
     monkeypatch.setattr(sys, 'argv', ['bridge', '--secrets', f'{tmp_path}/file/secrets'])
     with pytest.raises(SystemExit, match='its token to .*\n--secrets names another folder'):

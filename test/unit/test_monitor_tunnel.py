@@ -64,7 +64,7 @@ def received(link: socket.socket, size: int) -> bytes:
     return data
 
 
-def test_bytes_get_through_both_ways(echo):
+def test_tunnel_forwards_bytes_in_both_directions(echo):
     blocks = [os.urandom(size) for size in (1, 10, 32768, 200_000)]
     with tunnel(echo) as (port, said):
         links = [socket.create_connection(('127.0.0.1', port), timeout=20) for _ in range(2)]
@@ -80,7 +80,7 @@ def test_bytes_get_through_both_ways(echo):
     assert said == []
 
 
-def test_what_is_not_there_is_told():
+def test_unreachable_port_is_reported():
     # a port that is taken and refuses connections: no other program can answer there
     with socket.socket() as taken:
         taken.bind(('127.0.0.1', 0))
@@ -91,7 +91,7 @@ def test_what_is_not_there_is_told():
     assert said == [f'nothing answers at 127.0.0.1:{closed} there']
 
 
-def test_its_end_ends_the_connections(echo):
+def test_closed_tunnel_ends_its_connections(echo):
     with tunnel(echo) as (port, _):
         link = socket.create_connection(('127.0.0.1', port), timeout=20)
         link.sendall(b'x')

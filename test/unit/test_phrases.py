@@ -46,6 +46,14 @@ def test_other_words_are_not_refused(tmp_path, text):
     assert refused(tmp_path, 'a.py', f'# {text}\n') == []
 
 
+@pytest.mark.parametrize('length, refusals', [(60, 0), (61, 1)])
+def test_long_name_of_a_test_is_refused(tmp_path, length, refusals):
+    name = 'test_'.ljust(length, 'x')
+    text = f'class TestIt:\n    async def {name}(self):\n        pass\n'
+    assert refused(tmp_path, 'page.md', text) == []
+    assert len(refused(tmp_path, 'a.py', text)) == refusals
+
+
 def test_built_files_and_binary_files_are_not_read(tmp_path):
     (tmp_path / 'picture.png').write_bytes(b'\xff' + phrases.PHRASES[0].encode())
     assert refused(tmp_path, 'build/a.py', f'# {phrases.PHRASES[0]}\n') == []

@@ -9,6 +9,7 @@ import pytest
 
 from fogros2 import plan
 from fogros2.errors import ConfigurationError, DdsError, VpnError, WorkspaceError
+from fogros2.host.programs import check_program
 from fogros2.model import Machine, MachineSpec, MachineState, Peer
 
 NETWORK = '198.18.7.0/24'
@@ -31,22 +32,22 @@ def test_addresses_are_robot_first_then_machines_in_order():
     assert plan.machine_interface('a1b2c3', NETWORK, 9, 4, '/k').address == '198.18.7.11'
 
 
-def test_interface_names_fit_the_kernel_and_differ_on_one_computer():
+def test_interface_names_are_short_and_unique():
     robot = plan.robot_interface('a1b2c3', NETWORK, 4, '/k')
     machine = plan.machine_interface('a1b2c3', NETWORK, 250, 4, '/k')
     assert robot.name != machine.name
     assert len(machine.name) <= 15
-    assert robot.guarded and not machine.guarded
+    assert robot.firewall and not machine.firewall
 
 
-def test_a_subnet_that_is_full_says_so():
+def test_full_subnet_is_reported():
     with pytest.raises(ConfigurationError, match='no address'):
         plan.machine_interface('a1b2c3', NETWORK, 253, 4, '/k')
 
 
 ROBOT = Peer('robot', 'R', '198.18.7.1', '198.51.100.9:1')
-PLANNER = plan.Place(Peer('planner', 'P', '198.18.7.2', '198.51.100.1:1'))
-SLAM = plan.Place(Peer('slam', 'S', '198.18.7.3', '198.51.100.2:1'))
+PLANNER = plan.Route(Peer('planner', 'P', '198.18.7.2', '198.51.100.1:1'))
+SLAM = plan.Route(Peer('slam', 'S', '198.18.7.3', '198.51.100.2:1'))
 
 
 def test_a_machine_dials_its_siblings_but_not_the_robot():
@@ -55,16 +56,16 @@ def test_a_machine_dials_its_siblings_but_not_the_robot():
 
 
 def test_a_machine_that_nobody_can_dial_dials_the_robot():
-    hidden = plan.Place(Peer('pod', 'D', '198.18.7.4'), robot_endpoint='198.51.100.9:4')
+    hidden = plan.Route(Peer('pod', 'D', '198.18.7.4'), robot_endpoint='198.51.100.9:4')
     assert plan.machine_peers(ROBOT, hidden, [PLANNER]) == [
         Peer('robot', 'R', '198.18.7.1', '198.51.100.9:4'), PLANNER.peer]
     # and the others wait for it
     assert plan.machine_peers(ROBOT, PLANNER, [hidden])[1].endpoint is None
 
 
-def test_machines_of_one_inner_network_dial_each_other_there():
-    def inside(place, network, host):
-        return dataclasses.replace(place, inner_network=network, inner_endpoint=host)
+def test_machines_of_one_private_network_dial_each_other_there():
+    def inside(route, network, host):
+        return dataclasses.replace(route, private_network=network, private_endpoint=host)
 
     one, two = inside(PLANNER, 'c', '10.0.0.1:5'), inside(SLAM, 'c', '10.0.0.2:5')
     assert plan.machine_peers(ROBOT, one, [two])[1] == Peer(
@@ -79,19 +80,19 @@ def test_machines_of_one_inner_network_dial_each_other_there():
     ({'vpn_host': '2001:db8::1'}, '[2001:db8::1]:7', None, None),
     ({'vpn_host': 'node.example', 'vpn_port': 30007}, 'node.example:30007', None, None),
     ({'robot_host': '198.51.100.9'}, None, None, '198.51.100.9:9'),
-    ({'vpn_host': 'n', 'vpn_port': 3, 'inner_network': 'c', 'inner_host': '10.0.0.1'},
+    ({'vpn_host': 'n', 'vpn_port': 3, 'private_network': 'c', 'private_ip': '10.0.0.1'},
      'n:3', '10.0.0.1:7', None)])
-def test_a_machine_s_place_is_where_its_provider_says(known, peer, inner, robot):
+def test_route_comes_from_provider_report(known, peer, inner, robot):
     machine = Machine('id', 'pod', 'fake', MachineState.RUNNING, **known)
-    place = plan.place(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
-    assert (place.peer.endpoint, place.inner_endpoint, place.robot_endpoint) == (
+    route = plan.route(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
+    assert (route.peer.endpoint, route.private_endpoint, route.robot_endpoint) == (
         peer, inner, robot)
 
 
 def test_a_machine_without_any_way_is_refused():
     machine = Machine('id', 'pod', 'fake', MachineState.RUNNING)
     with pytest.raises(VpnError, match="no way to 'pod'.*UDP"):
-        plan.place(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
+        plan.route(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
 
 
 def test_a_price_reads_as_money():
@@ -99,7 +100,7 @@ def test_a_price_reads_as_money():
     assert plan.price(Decimal(3)) == '$3.0000 an hour'
 
 
-def test_underlay_keeps_ros_and_the_workspace_and_nothing_of_the_users():
+def test_underlay_has_ros_and_the_workspace_only():
     environment = {
         'AMENT_PREFIX_PATH': '/home/me/ws/install/a:/opt/ros/jazzy',
         'PYTHONPATH': '/home/me/ws/install/a/lib/python3:/home/me/own:/opt/ros/jazzy/lib/python3',
@@ -135,7 +136,7 @@ def prefix(tmp_path):
 
 
 def test_a_program_in_the_index_is_found(prefix):
-    plan.check_program('arm_planning', 'planner', ['/nowhere', prefix])
+    check_program('arm_planning', 'planner', ['/nowhere', prefix])
 
 
 @pytest.fixture
@@ -153,14 +154,14 @@ def unsourced(tmp_path):
 
 
 def test_a_named_workspace_need_not_be_sourced(unsourced):
-    plan.check_program('rob_tools', 'params', [], str(unsourced))
+    check_program('rob_tools', 'params', [], str(unsourced))
     with pytest.raises(WorkspaceError, match="no package is called 'rob_tools'"):
-        plan.check_program('rob_tools', 'params', [])
+        check_program('rob_tools', 'params', [])
 
 
-def test_a_package_that_is_not_built_says_so(unsourced):
+def test_unbuilt_package_is_reported(unsourced):
     with pytest.raises(WorkspaceError) as error:
-        plan.check_program('unbuilt', 'params', [], str(unsourced))
+        check_program('unbuilt', 'params', [], str(unsourced))
     assert str(error.value) == (f"package 'unbuilt' in {unsourced}/src/unbuilt is not built "
                                 f'(run colcon build in {unsourced})')
 
@@ -171,7 +172,7 @@ def test_a_weak_guess_does_not_hide_the_hint(tmp_path):
     for name in ('tracetools', *(f'package_{number}' for number in range(9))):
         (index / name).touch()
     with pytest.raises(WorkspaceError) as error:
-        plan.check_program('rob_tools', 'params', [str(tmp_path)])
+        check_program('rob_tools', 'params', [str(tmp_path)])
     assert 'tracetools' not in str(error.value) and 'ros_workspace=' in str(error.value)
 
 
@@ -183,7 +184,7 @@ def test_a_weak_guess_does_not_hide_the_hint(tmp_path):
 def test_a_program_that_is_not_there_is_refused_with_the_nearest(
         prefix, package, executable, words):
     with pytest.raises(WorkspaceError, match=words):
-        plan.check_program(package, executable, [prefix])
+        check_program(package, executable, [prefix])
 
 
 def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> None:

@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion planning: scenes, motions held against another way to look for contact, bad input."""
+"""Motion planning: scenes, the steps of a collision check, pictures, files of OMPL.app."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
-from pathlib import Path
-import signal
-import threading
 
 import numpy
 import pytest
 
-fcl = pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
+pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 base = pytest.importorskip('ompl.base', reason='ompl is in the extra applications')
 
-from fogros2.waiting import wait_until  # noqa: E402 - only where its libraries are
-from fogros2_examples.meshes import (  # noqa: E402
+from fogros2_examples.meshes import (  # noqa: E402 - only where its libraries are
     box,
     cylinder,
     joined,
@@ -28,8 +23,7 @@ from fogros2_examples.meshes import (  # noqa: E402
 )
 from fogros2_examples.planning.app_files import BadFile, loaded  # noqa: E402
 from fogros2_examples.planning.picture import between, picture, spaced  # noqa: E402
-from fogros2_examples.planning.racing import Racer  # noqa: E402
-from fogros2_examples.planning.scene import apartment, MADE, pose, Scene  # noqa: E402
+from fogros2_examples.planning.scene import pose, Scene  # noqa: E402
 from fogros2_examples.planning.search import Space  # noqa: E402
 
 
@@ -55,54 +49,6 @@ def test_quaternions_and_matrices_agree(axis, angle):
     assert numpy.trace(matrix) == pytest.approx(1 + 2 * math.cos(angle))
 
 
-def depth(first, second):
-    """Return by how much two boxes overlap at least, m; 0 where they don't."""
-    def axes(corners):
-        return [(corners[i] - corners[0]) / numpy.linalg.norm(corners[i] - corners[0])
-                for i in (1, 2, 4)]
-
-    least = math.inf
-    a, b = axes(first), axes(second)
-    for axis in [*a, *b, *(numpy.cross(x, y) for x in a for y in b)]:
-        length = numpy.linalg.norm(axis)
-        if length < 1e-6:
-            continue
-        p, q = first @ axis / length, second @ axis / length
-        least = min(least, p.max() - q.min(), q.max() - p.min())
-    return max(0.0, least)
-
-
-def boxes(mesh):
-    return [mesh.vertices[i:i + 8] for i in range(0, len(mesh.vertices), 8)]
-
-
-@pytest.mark.parametrize('name', sorted(MADE))
-def test_a_motion_touches_nothing(name):
-    # the boxes that the meshes are made of are held against each other without FCL
-    scene = MADE[name]()
-    racer = Racer(workers=2)
-    try:
-        racer.enter(scene)
-        outcome = racer.plan(scene.start, scene.goal, seconds=60, seed=3)
-    finally:
-        racer.close()
-    assert outcome['end'] == 'found'
-    path = numpy.array(outcome['path'])
-    assert path[0] == pytest.approx(scene.start, abs=1e-6)
-    assert path[-1][:3] == pytest.approx(scene.goal[:3], abs=1e-6)
-    assert abs(path[-1][3:] @ scene.goal[3:]) == pytest.approx(1)
-    assert outcome['length'] >= numpy.linalg.norm(scene.goal[:3] - scene.start[:3])
-    around = [(part, part.min(axis=0), part.max(axis=0))
-              for part in boxes(scene.walls) + boxes(scene.shell)]
-    for at in between(path, 0.05):
-        body = scene.at(at)
-        low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
-        for part, under, over in around:
-            if (low < over).all() and (high > under).all():
-                # OMPL looks at poses some centimetres apart
-                assert all(depth(piece, part) < 0.02 for piece in boxes(body)), at
-
-
 def box_room(wall):
     """Return a room 4 m long; ``wall`` says whether a wall closes its middle."""
     walls = joined([box((1.9, -1, -1), (2.1, 3, 3))] if wall else [box((1.9, 1, 0), (2.1, 2, 2))])
@@ -115,7 +61,7 @@ def box_room(wall):
     (pose(3.5, 0.5, 0.5), 3.0),
     # a corner of the cube goes along an arc
     (pose(0.5, 0.5, 0.5, yaw=3.0), 3.0 * 0.2 * math.sqrt(3))])
-def test_way_and_turn_are_looked_at_as_closely(end, farthest):
+def test_ways_and_turns_are_checked_in_equal_steps(end, farthest):
     """In steps of a five hundredth of the diagonal for the body's outermost point."""
     room, looked = box_room(wall=False), itertools.count()
     states = Space(room).states
@@ -130,69 +76,7 @@ def test_way_and_turn_are_looked_at_as_closely(end, farthest):
     assert next(looked) == math.ceil(farthest / (math.sqrt(4 ** 2 + 2 ** 2 + 2 ** 2) / 500))
 
 
-@pytest.fixture(scope='module')
-def racer():
-    racer = Racer(workers=2, planners=['RRTConnect', 'KPIECE1'])
-    yield racer
-    racer.close()
-
-
-def test_what_can_not_be_planned_is_told_apart(racer):
-    racer.enter(box_room(wall=True))
-    start, goal = pose(0.5, 0.5, 0.5), pose(3.5, 0.5, 0.5)
-    outcome = racer.plan(start, goal, seconds=0.5)
-    assert outcome['end'] == 'time' and outcome['path'] == []
-    assert 0.5 <= outcome['seconds'] < 3
-    assert racer.plan(pose(2, 0.5, 0.5), goal, seconds=5)['end'] == 'start'
-    assert racer.plan(start, pose(3.5, 0.5, 9), seconds=5)['end'] == 'goal'
-    # and it goes on
-    racer.enter(box_room(wall=False))
-    assert racer.plan(start, goal, seconds=20)['end'] == 'found'
-
-
-def test_a_seed_finds_the_same(racer):
-    racer.enter(apartment())
-    one = Racer(workers=1)
-    try:
-        scene = box_room(wall=False)
-        one.enter(scene)
-        found = [one.plan(scene.start, scene.goal, seconds=20, seed=5) for _ in range(2)]
-    finally:
-        one.close()
-    assert found[0]['path'] == found[1]['path'] and found[0]['checks'] == found[1]['checks']
-
-
-def test_a_search_that_dies_is_told_and_replaced():
-    racer, scene = Racer(workers=1), box_room(wall=False)
-    try:
-        racer.enter(scene)
-        os.kill(racer._process.pid, signal.SIGSTOP)
-        threading.Timer(0.3, racer._process.kill).start()
-        with pytest.raises(RuntimeError, match='has ended'):
-            racer.plan(scene.start, scene.goal, seconds=20)
-        assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
-    finally:
-        racer.close()
-
-
-def test_searches_end_with_who_asked():
-    racer, scene = Racer(workers=2), box_room(wall=True)
-    racer.enter(scene)
-    worker = racer._process.pid
-    asking = threading.Thread(target=lambda: pytest.raises(
-        RuntimeError, racer.plan, scene.start, scene.goal, seconds=60), daemon=True)
-    asking.start()
-    children = Path(f'/proc/{worker}/task/{worker}/children')
-    searches = wait_until(lambda: len(found := children.read_text().split()) == 2 and found,
-                          timeout=20.0, what='the searches')
-    racer._process.stdin.close()
-    asking.join(20)
-    racer.close()
-    assert not asking.is_alive()
-    assert not [pid for pid in searches if Path('/proc', pid).exists()]
-
-
-def test_a_path_between_its_poses_turns_the_shorter_way():
+def test_path_turns_the_shorter_way():
     path = numpy.array([pose(0, 0, 0), pose(1, 0, 0, yaw=1.0)])
     path[1, 3:] *= -1  # the same turn
     fine = between(path, 0.1, 0.1)
@@ -203,7 +87,7 @@ def test_a_path_between_its_poses_turns_the_shorter_way():
     assert spaced(path, 0.5)[:, 0] == pytest.approx([0, 0.5, 1], abs=0.03)
 
 
-def test_the_picture_shows_start_and_goal():
+def test_picture_shows_start_and_goal():
     scene = box_room(wall=False)
     image = picture(scene, numpy.array([scene.start, scene.goal]), 'a room', width=200, height=150)
     assert image.shape == (150, 200, 3)
@@ -246,7 +130,7 @@ def write(path, mesh):
         + [f"f {' '.join(str(i + 1) for i in t)}\n" for t in mesh.triangles.tolist()]))
 
 
-def test_a_problem_of_ompl_app(tmp_path, racer):
+def test_problem_of_ompl_app_is_read(tmp_path):
     pytest.importorskip('trimesh', reason='trimesh is in the extra applications')
     room = box_room(wall=False)
     write(tmp_path / 'body.obj', room.body)
@@ -258,8 +142,7 @@ def test_a_problem_of_ompl_app(tmp_path, racer):
     assert scene.high.tolist() == [4, 2, 2]
     assert rotation(scene.start[3:]) == pytest.approx(turned((0, 0, 1), 1.5))
     assert scene.body.vertices.mean(axis=0) == pytest.approx(numpy.zeros(3), abs=1e-9)
-    racer.enter(scene)
-    assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
+    assert Space(scene).search(scene.start, scene.goal, seconds=20).end == 'found'
     for words, text in [
             ({'robot': 'none.obj'}, 'there is no .*none.obj'), ({'theta': 'x'}, 'could not'),
             ({'robot': 'room.cfg'}, "can't be read as a mesh")]:
@@ -276,7 +159,7 @@ def test_a_problem_of_ompl_app(tmp_path, racer):
 
 
 @pytest.mark.parametrize('up, vertex', [('Y_UP', (1, 2, 3)), ('Z_UP', (1, 3, -2))])
-def test_collada_is_read_as_ompl_app_reads_it(tmp_path, up, vertex):
+def test_collada_file_is_read_with_its_up_axis(tmp_path, up, vertex):
     trimesh = pytest.importorskip('trimesh', reason='trimesh is in the extra applications')
     pytest.importorskip('collada', reason='pycollada is in the extra applications')
     mesh = box((0, 0, 0), (1, 2, 3))

@@ -50,7 +50,7 @@ def test_without_sudo_it_is_a_session_of_its_own() -> None:
 
 
 @pytest.mark.parametrize('script', ['sleep $1; true', "trap '' TERM; sleep $1; sleep $1"])
-def test_what_sudo_runs_ends_with_all_that_it_started(as_user: None, script: str) -> None:
+def test_command_under_sudo_ends_with_its_children(as_user: None, script: str) -> None:
     # a number that tells its sleep from every other one's
     seconds = f'6{uuid.uuid4().int % 10 ** 8}'
     with pytest.raises(DeadlineExceeded):
@@ -91,7 +91,7 @@ def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):
     (['sudo: The "no new privileges" flag is set, which prevents sudo from running as root.'],
      "sudo doesn't work here: The", 'as root'),
     ([''], 'it says nothing', 'as root')])
-def test_it_is_said_why_sudo_gives_no_root(monkeypatch, said, reason, hint):
+def test_failure_of_sudo_has_its_reason(monkeypatch, said, reason, hint):
     answers = list(said)
     monkeypatch.setattr(process.os, 'geteuid', lambda: 1000)
     monkeypatch.setattr(process, 'run', lambda command, **more: Result(1, '', answers.pop(0)))
@@ -100,7 +100,7 @@ def test_it_is_said_why_sudo_gives_no_root(monkeypatch, said, reason, hint):
     assert reason in trouble[0] and hint in trouble[1]
 
 
-def test_a_user_who_may_not_use_sudo_is_told_so(root, monkeypatch):
+def test_user_without_sudo_rights_is_reported(root, monkeypatch):
     if os.geteuid() != 0 or process.which('sudo') is None:
         pytest.skip('takes root, to become a user who may not')
 
@@ -114,3 +114,22 @@ def test_a_user_who_may_not_use_sudo_is_told_so(root, monkeypatch):
     monkeypatch.setattr(process.os, 'geteuid', lambda: 65534)
     trouble = process.sudo_trouble()
     assert trouble is not None and trouble[0] == 'this user may not use sudo'
+
+
+def test_an_interrupt_ends_the_command(tmp_path: Path) -> None:
+    written = tmp_path / 'pid'
+
+    def interrupt(*_: object) -> None:
+        if written.read_text():
+            raise KeyboardInterrupt
+
+    written.write_text('')
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            process.run(Command.script(f'echo $$ > {written}; sleep 60'), timeout=60.0)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert not Path('/proc', written.read_text().strip()).exists()

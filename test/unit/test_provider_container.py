@@ -24,17 +24,15 @@ from fogros2.errors import (
     ProviderError,
 )
 from fogros2.model import Command, CreateRequest, MachineSpec, Result
-from fogros2.provider import (
-    container,
-    container_engine,
-    container_entry,
-    container_machine,
-    container_options,
-    container_root,
-    debian_root,
-)
-from fogros2.provider.container_engine import Engine
-from fogros2.provider.container_options import Options
+from fogros2.provider import container
+from fogros2.provider.container import debian_root
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container import entry as container_entry
+from fogros2.provider.container import machine as container_machine
+from fogros2.provider.container import options as container_options
+from fogros2.provider.container import root as container_root
+from fogros2.provider.container.engine import Engine
+from fogros2.provider.container.options import Options
 
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
 
@@ -104,7 +102,7 @@ def test_settings_keep_links_and_programs(etc):
     assert found['etc/nsswitch.conf'].mode == 0o644
 
 
-def test_large_folders_are_mounted_only_if_all_of_them_may_be_seen(etc):
+def test_large_folder_is_mounted_only_if_all_of_it_is_public(etc):
     for number in range(container_root.MANY):
         (etc / f'ssl/certs/{number}').symlink_to('ca.crt')
         (etc / f'profile.d/{number}.sh').write_text('')
@@ -161,7 +159,7 @@ def test_outermost_folders_are_mounted_once():
         ['/a/b/c', '/a/b', '/a/bc', '/usr/lib/x', '/lib/y', '/', '/a/b/']) == ['/a/b', '/a/bc']
 
 
-def test_the_environment_is_prefix_underlays_and_editable_packages(tmp_path, monkeypatch):
+def test_mounts_cover_prefix_underlays_and_editable_packages(tmp_path, monkeypatch):
     site = tmp_path / 'venv/lib/python3.11/site-packages'
     site.mkdir(parents=True)
     for name in ('ros/share', 'work/install/pkg', 'work/.git', 'source/one', 'source/test'):
@@ -250,7 +248,7 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
     MachineSpec('m', 'container', {'containers': True}), MachineSpec('m', 'container')])
 @pytest.mark.parametrize('apparmor', [True, False])
 @pytest.mark.parametrize('engine', ['podman', 'docker'])
-def test_containers_of_its_own_take_a_right_that_is_given_where_asked(
+def test_nested_containers_get_their_right_on_request(
         spec, apparmor, engine, tmp_path, monkeypatch):
     monkeypatch.setattr(container_options, 'APPARMOR', tmp_path / ('' if apparmor else 'no'))
     options = Options.parse(spec.options)
@@ -291,7 +289,7 @@ def test_other_flags_are_tried_where_control_groups_mislead(monkeypatch):
     ('Error: crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error', True),
     ('Error: the container name "x" is already in use', False),
 ])
-def test_trouble_with_the_runtime_is_told_from_other_trouble(message, trouble):
+def test_runtime_errors_are_recognised(message, trouble):
     assert container_engine.is_runtime_trouble(ProviderError(message)) is trouble
 
 
@@ -306,7 +304,7 @@ def test_limits_never_ask_for_more_than_there_is():
 @pytest.mark.parametrize('options', [
     {'memory': '2g'}, {'memory': '1.5GB'}, {'memory': '1048576'}, {'ports': ['8080:80/udp']},
     {'ports': ['80', '127.0.0.1:8080:80', '9000-9005:9000-9005']}])
-def test_what_the_engine_takes_is_let_through(options):
+def test_options_of_the_engine_are_passed_on(options):
     Options.parse(options)
 
 
@@ -314,7 +312,7 @@ def test_what_the_engine_takes_is_let_through(options):
     '[{"name": "n", "subnets": [{"subnet": "198.51.100.0/28", "gateway": "198.51.100.1"},'
     ' {"subnet": "fd00::/64"}]}]',
     '[{"Name": "n", "IPAM": {"Config": [{"Subnet": "198.51.100.0/28"}]}}]'])
-def test_an_address_out_of_the_network_is_refused_with_the_network_s(monkeypatch, said):
+def test_address_outside_of_the_network_is_refused(monkeypatch, said):
     monkeypatch.setattr(Engine, 'call', lambda self, *words, **more: Result(0, said, ''))
     engine = Engine('podman')
     container_options.check_network(engine, Options(network='n', ip='198.51.100.7'))
@@ -404,7 +402,7 @@ def test_the_ssh_server_takes_our_key_alone():
     assert text(data, 'opt/fogros2/authorized_keys') == 'ssh-ed25519 AAAA me\n'
 
 
-def test_a_machine_cannot_lead_the_robot_elsewhere_by_its_host_key(tmp_path, monkeypatch):
+def test_host_key_cannot_redirect_the_robot(tmp_path, monkeypatch):
     monkeypatch.setattr(container_machine, 'ROOTS', tmp_path)
     monkeypatch.setattr(os, 'geteuid', lambda: 0)
     entry = {'Id': 'c' * 64, 'Config': {'Labels': {
@@ -444,11 +442,11 @@ def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
 
     monkeypatch.setattr(container_engine.process, 'run', run)
     monkeypatch.setattr(container_engine, 'select', lambda *_: container_engine.named('podman'))
-    request = dataclasses.replace(REQUEST, cancel=threading.Event())
-    request.cancel.set()
+    provider = container.ContainerProvider()
+    provider.cancel = threading.Event()
+    provider.cancel.set()
     with pytest.raises(Cancelled):
-        container.ContainerProvider().create(
-            MachineSpec('m', 'container', {'image': 'large'}), request)
+        provider.create(MachineSpec('m', 'container', {'image': 'large'}), REQUEST)
 
 
 def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):
@@ -493,3 +491,9 @@ def test_computer_without_own_sources_gets_a_hint(system, targets):
     with pytest.raises(PrerequisiteError, match='knows no packages') as error:
         debian_root.parse_release(system, 'noble', targets)
     assert 'image=' in error.value.hint
+
+
+@pytest.mark.parametrize(('options', 'own'), [({}, False), ({'image': 'theirs'}, True)])
+def test_packages_of_a_container_image_are_its_own(options, own):
+    spec = MachineSpec('m', 'container', options)
+    assert container.ContainerProvider().has_own_packages(spec) is own

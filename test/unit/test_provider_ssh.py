@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import socket
 
 import pytest
@@ -97,3 +98,16 @@ def test_options_that_make_no_sense_are_refused(given, words):
 def test_ids_that_aren_t_ours_are_unknown(machine_id):
     with pytest.raises(MachineNotFound):
         SSHProvider().describe(machine_id)
+
+
+@pytest.mark.parametrize('content', ['', 'cut'])
+def test_damaged_key_is_named_without_an_argument(content: str, tmp_path: Path) -> None:
+    """A launch makes the keys of its own machines: they have no argument for a key."""
+    from fogros2.errors import AuthenticationError
+    from fogros2.shell import ssh_connection
+    key = tmp_path / 'key'
+    key.write_text(content)
+    for path in (key, tmp_path / 'missing'):
+        with pytest.raises(AuthenticationError) as failed:
+            ssh_connection.load_key(path, 'planner')
+        assert str(path) in str(failed.value) and 'key=' not in failed.value.hint

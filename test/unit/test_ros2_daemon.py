@@ -80,7 +80,7 @@ def test_stop_without_a_daemon_does_nothing(tmp_path: Path) -> None:
 def test_stop_gives_up_on_a_silent_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ros2_daemon, 'PATIENCE', 0.1)
+    monkeypatch.setattr(ros2_daemon, 'TIMEOUT', 0.1)
     ros2_daemon.install(tmp_path, sys.executable)
     with socket.create_server(('127.0.0.1', port_of(tmp_path))):
         ros2_daemon.stop(tmp_path)

@@ -23,7 +23,7 @@ from fogros2.shell import command_line
     (Command(('ls',), environment={'A': '$x'}, sudo=True), 'fog',
      ['sudo', '-n', '--', 'env', 'A=$x', 'ls']),
 ])
-def test_words_are_quoted_once(command, user, words):
+def test_arguments_are_quoted_once(command, user, words):
     assert shlex.split(command_line.remote_line(command, user=user)) == words
 
 
@@ -89,7 +89,7 @@ def test_common_failures_have_a_hint(code, stderr, words):
     assert words in hint if words else not hint
 
 
-def test_paramiko_is_imported_when_it_is_needed_and_without_invoke():
+def test_paramiko_is_imported_late_and_without_invoke():
     code = (
         'import sys\n'
         'from fogros2.shell import ssh, ssh_connection\n'

@@ -61,7 +61,7 @@ def test_progress_narrows_the_total_down():
     assert seen == [(2_000_000, 10_000_000), (5_100_000, 10_000_000), (10_000_000, 10_000_000)]
 
 
-def test_progress_is_told_now_and_then():
+def test_progress_is_reported_now_and_then():
     seen = []
     progress = sync.Progress(lambda done, total: seen.append(done), interval=60.0)
     for percent in range(1, 101):

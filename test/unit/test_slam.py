@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visual SLAM of the examples, by value: geometry, room, tracking, map, accuracy, data sets."""
+"""Visual SLAM of the examples, by value: geometry, matching, accuracy, data sets."""
 
 from __future__ import annotations
 
@@ -16,32 +16,17 @@ pytest.importorskip('evo', reason='evo (the extra "applications") is not install
 
 from fogros2_examples.slam import geometry, matching, room, sources, tum  # noqa: E402
 from fogros2_examples.slam.evaluation import accuracy  # noqa: E402
-from fogros2_examples.slam.features import Extractor, Features, with_depth, with_pair  # noqa: E402
+from fogros2_examples.slam.features import Features  # noqa: E402
 from fogros2_examples.slam.pose import solve  # noqa: E402
-from fogros2_examples.slam.tracking import Slam, State  # noqa: E402
 
 WIDTH, HEIGHT = 320, 240
-FRAMES, LAP = 100, 87
-
-
-@pytest.fixture(scope='module')
-def made() -> Any:
-    return room.Room(room.camera(WIDTH, HEIGHT))
-
-
-@pytest.fixture(scope='module')
-def walk(made: Any) -> Any:
-    """A walk through the room with an RGB-D camera."""
-    return [(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), depth, pose)
-            for number, pose in enumerate(room.trajectory(FRAMES, LAP))
-            for image, depth in [made.colour_and_depth(pose, number)]]
 
 
 # --- geometry ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('vector', [(0, 0, 0), (0.1, -0.2, 0.3), (math.pi, 0, 0), (0, 3.1, 0.2),
                                     (0, 0, -2.5)])
-def test_rotations_there_and_back(vector: Any) -> None:
+def test_rotation_survives_conversion_to_quaternion(vector: Any) -> None:
     pose = geometry.from_vectors(vector, (1, 2, 3))
     again = geometry.from_quaternion(pose[:3, 3], geometry.quaternion(pose))
     assert numpy.allclose(again, pose, atol=1e-9)
@@ -49,86 +34,14 @@ def test_rotations_there_and_back(vector: Any) -> None:
     assert numpy.allclose(geometry.inverse(pose) @ pose, numpy.eye(4))
 
 
-def test_a_quaternion_without_direction_is_refused() -> None:
+def test_quaternion_of_length_zero_is_refused() -> None:
     with pytest.raises(ValueError, match='length 0'):
         geometry.from_quaternion(numpy.zeros(3), numpy.zeros(4))
 
 
-# --- the room ------------------------------------------------------------------------------------
-
-def facing(x: float, y: float, z: float, yaw: float) -> Any:
-    """Return the pose of a level camera."""
-    pose = numpy.eye(4)
-    pose[:3, 0] = math.sin(yaw), -math.cos(yaw), 0
-    pose[:3, 1] = 0, 0, -1
-    pose[:3, 2] = math.cos(yaw), math.sin(yaw), 0
-    pose[:3, 3] = x, y, z
-    return pose
-
-
-@pytest.mark.parametrize(('pose', 'metres'), [
-    (facing(3, 2, 2.2, 0.0), 3.0),            # the wall at x = 6
-    (facing(3, 2, 1.0, math.pi), 2.65),       # the book case before the one at x = 0
-    (facing(3, 2, 1.2, math.pi / 2), 3.0),    # over a chest of drawers, the wall at y = 5
-    (facing(3, 2, 0.5, math.pi / 2 - 1e-9), 0.25)])  # the stool in the middle
-def test_depth_is_the_distance(made: Any, pose: Any, metres: float) -> None:
-    _, depth = made.exact(pose)
-    assert depth[HEIGHT // 2, WIDTH // 2] == pytest.approx(metres, abs=0.01)
-    _, noisy = made.colour_and_depth(pose, 1)
-    assert numpy.median(noisy[100:140, 140:180]) == pytest.approx(1000 * metres, abs=20)
-
-
-def test_frames_are_always_the_same_and_neighbours_differ(made: Any) -> None:
-    pose = room.trajectory(50, LAP)[7]
-    left, right = made.pair(pose, 3)
-    assert (made.pair(pose, 3)[0] == left).all()
-    assert (made.pair(pose, 4)[0] != left).any()
-    assert (left != right).mean() > 0.5
-    assert 40 < left.mean() < 220
-    assert left.std() > 20
-
-
-# --- features ------------------------------------------------------------------------------------
-
-def test_features_are_spread_and_have_depths(made: Any) -> None:
-    """From stereo images within the accuracy that a fifth of a pixel gives, nearly all of them."""
-    camera, pose = made.camera, room.trajectory(50, LAP)[10]
-    _, exact = made.exact(pose)
-    left, right = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in made.pair(pose, 0))
-    plain = Extractor(camera, 500).extract(left)
-    assert 300 < len(plain) <= 500
-    assert not plain.deep.any()
-    found = with_pair(plain, left, right, camera)
-    columns, rows = numpy.round(found.pixels).astype(int).T
-    true = exact[rows, columns]
-    assert found.deep.mean() > 0.7
-    disparity = camera.fx * camera.baseline * numpy.abs(1 / found.depths - 1 / true)
-    assert numpy.nanmedian(disparity) < 0.2
-    assert numpy.nanquantile(disparity, 0.9) < 1.0
-    quarters = {(x > WIDTH / 2, y > HEIGHT / 2) for x, y in found.pixels}
-    assert len(quarters) == 4
-    assert numpy.allclose(with_depth(plain, exact, camera).depths, true)
-
-
-@pytest.mark.parametrize('image', [
-    numpy.zeros((HEIGHT, WIDTH), numpy.uint8), numpy.full((HEIGHT, WIDTH), 255, numpy.uint8)])
-def test_a_blank_image_has_no_features(made: Any, image: Any) -> None:
-    found = Extractor(made.camera).extract(image)
-    assert len(found) == 0
-    assert len(with_pair(found, image, image, made.camera)) == 0
-
-
-def test_depths_that_are_none(made: Any) -> None:
-    some = Features(numpy.array([[1.0, 1], [2, 1], [3, 1], [4, 1]]), numpy.zeros(4, numpy.int32),
-                    numpy.zeros((4, 32), numpy.uint8), numpy.full(4, numpy.nan))
-    image = numpy.zeros((HEIGHT, WIDTH), numpy.float32)
-    image[1, 1:5] = math.nan, 0.0, math.inf, 1.5
-    assert with_depth(some, image, made.camera).deep.tolist() == [False, False, False, True]
-
-
 # --- matching, and the pose from matches ---------------------------------------------------------
 
-def test_matches_are_alike_and_near() -> None:
+def test_features_match_by_descriptor_and_distance() -> None:
     random = numpy.random.default_rng(3)
     one = random.integers(0, 256, (80, 32), dtype=numpy.uint8)
     order = random.permutation(80)
@@ -149,7 +62,7 @@ def test_matches_are_alike_and_near() -> None:
 
 
 @pytest.mark.parametrize('deep', [True, False])
-def test_the_pose_is_found_among_outliers(deep: bool) -> None:
+def test_pose_is_found_among_outliers(deep: bool) -> None:
     camera, random = room.camera(), numpy.random.default_rng(5)
     pose = geometry.from_vectors((0.1, -0.3, 0.05), (0.4, -0.1, 0.2))
     seen = random.uniform((-1, -1, 1.5), (1, 1, 5), (200, 3))
@@ -169,82 +82,9 @@ def test_the_pose_is_found_among_outliers(deep: bool) -> None:
     assert solve(camera, seen[:3], features.chosen(numpy.arange(3)), 3) is None
 
 
-# --- SLAM ----------------------------------------------------------------------------------------
-
-def error(slam: Slam, truth: dict[int, Any]) -> float:
-    found = slam.trajectory()
-    return accuracy([truth[stamp] for stamp, _ in found], [pose for _, pose in found]).ate
-
-
-def test_a_walk_with_depth(made: Any, walk: Any) -> None:
-    """Within 3 cm of the truth; it sees that it comes back, and the map gets no bigger there."""
-    slam = Slam(made.camera)
-    for number, (grey, depth, _) in enumerate(walk):
-        tracked = slam.track(number, grey, depth=depth)
-        assert tracked.state is State.TRACKING, (number, tracked.why)
-        slam.extend(tracked)
-    assert error(slam, {n: pose for n, (_, _, pose) in enumerate(walk)}) < 0.03
-    assert slam.map.loops >= 1
-    assert 10 < len(slam.map.keyframes) < FRAMES // 2
-    points = slam.map.points(slam.map.keyframes).places
-    start = walk[0][2]
-    world = geometry.moved(start, points)
-    inside = ((world > -0.1) & (world < numpy.array(room.SIZE) + 0.1)).all(1)
-    assert inside.mean() > 0.95
-
-
-def test_a_walk_with_two_eyes(made: Any) -> None:
-    slam = Slam(made.camera)
-    poses = room.trajectory(40, LAP)
-    for number, pose in enumerate(poses):
-        left, right = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in made.pair(pose, number))
-        tracked = slam.track(number, left, right=right)
-        assert tracked.state is State.TRACKING, (number, tracked.why)
-        slam.extend(tracked)
-    # a disparity of a pixel is 16 cm at a wall, in images so small
-    assert error(slam, dict(enumerate(poses))) < 0.05
-
-
-def test_lost_and_found_again(made: Any, walk: Any) -> None:
-    """A covered lens, then another place of the room: lost; back where it was: it knows."""
-    slam = Slam(made.camera)
-    for number, (grey, depth, _) in enumerate(walk[:25]):
-        slam.extend(slam.track(number, grey, depth=depth))
-    keyframes = len(slam.map.keyframes)
-    for number in range(3):
-        covered = slam.track(100 + number, numpy.zeros((HEIGHT, WIDTH), numpy.uint8),
-                             depth=walk[0][1])
-        assert (covered.state, covered.pose) == (State.LOST, None)
-        assert covered.why == '0 features in the image'
-        assert not slam.extend(covered)
-    elsewhere = slam.track(110, walk[60][0], depth=walk[60][1])
-    assert (elsewhere.state, elsewhere.why) == (State.LOST, 'nothing known is in view')
-    assert len(slam.map.keyframes) == keyframes
-    back = slam.track(111, walk[5][0], depth=walk[5][1])
-    assert back.state is State.TRACKING
-    assert back.pose is not None
-    off = geometry.inverse(geometry.inverse(walk[0][2]) @ walk[5][2]) @ back.pose
-    assert numpy.linalg.norm(off[:3, 3]) < 0.05
-    # and goes on, over an image without any depth too
-    blind = slam.track(112, walk[6][0], depth=numpy.zeros((HEIGHT, WIDTH), numpy.uint16))
-    assert blind.state is State.TRACKING
-
-
-def test_no_start_without_depth_or_features(made: Any, walk: Any) -> None:
-    slam, grey = Slam(made.camera), walk[0][0]
-    empty = slam.track(0, grey, depth=numpy.zeros((HEIGHT, WIDTH), numpy.uint16))
-    assert empty.state is State.STARTING
-    assert empty.why.startswith('0 of ')
-    blank = slam.track(1, numpy.full_like(grey, 80), depth=walk[0][1])
-    assert (blank.state, blank.why) == (State.STARTING, '0 features in the image')
-    with pytest.raises(ValueError, match='an image of 100x50 from a camera of 320x240'):
-        slam.track(2, numpy.zeros((50, 100), numpy.uint8), depth=walk[0][1])
-    assert slam.track(3, grey, depth=walk[0][1]).state is State.TRACKING
-
-
 # --- accuracy ------------------------------------------------------------------------------------
 
-def test_errors_are_what_they_are_called() -> None:
+def test_trajectory_errors_have_their_known_values() -> None:
     truth = room.trajectory(60)
     # in another frame of the world: that is no error
     other = geometry.from_vectors((0.2, 0.4, -1.0), (5, 6, 7))
@@ -263,29 +103,35 @@ def test_errors_are_what_they_are_called() -> None:
 
 # --- data sets -----------------------------------------------------------------------------------
 
+CAMERA = room.camera(WIDTH, HEIGHT)
+POSES = room.trajectory(40)[:5]
+#: Colours and depths in millimetres of five frames.
+FRAMES = [(numpy.full((HEIGHT, WIDTH, 3), 40 * number, numpy.uint8),
+           numpy.arange(WIDTH * HEIGHT, dtype=numpy.uint16).reshape(HEIGHT, WIDTH) % 9000 + number)
+          for number in range(5)]
+
+
 @pytest.fixture
-def folder(tmp_path: Path, made: Any) -> Path:
-    poses = room.trajectory(40)[:5]
-    frames = [(10 + number / 30, *made.colour_and_depth(pose, number))
-              for number, pose in enumerate(poses)]
-    tum.write(tmp_path / 'set', made.camera, frames,
-              [(10.005 + number / 30, pose) for number, pose in enumerate(poses)])
+def folder(tmp_path: Path) -> Path:
+    """Return a folder in TUM's format with five frames and their true poses."""
+    tum.write(tmp_path / 'set', CAMERA,
+              [(10 + number / 30, *frame) for number, frame in enumerate(FRAMES)],
+              [(10.005 + number / 30, pose) for number, pose in enumerate(POSES)])
     return tmp_path / 'set'
 
 
-def test_a_folder_there_and_back(folder: Path, made: Any) -> None:
+def test_dataset_is_read_as_it_was_written(folder: Path) -> None:
     source = sources.dataset(folder)
     assert source.count == 5
-    assert (source.camera.fx, source.camera.cy) == (made.camera.fx, made.camera.cy)
-    for number, (shot, pose) in enumerate(zip(source.shots, room.trajectory(40))):
-        image, depth = made.colour_and_depth(pose, number)
+    assert (source.camera.fx, source.camera.cy) == (CAMERA.fx, CAMERA.cy)
+    for shot, (image, depth), pose in zip(source.shots, FRAMES, POSES):
         assert (shot.image == image).all()
         assert (shot.depth == depth).all()
         assert numpy.allclose(shot.truth, pose, atol=1e-6)
     assert sources.dataset(folder, 2).count == 2
 
 
-def test_what_belongs_together_by_time(folder: Path) -> None:
+def test_colour_and_depth_are_paired_by_time(folder: Path) -> None:
     """An image whose depth is missing is left out, and nothing is used twice."""
     lines = (folder / 'depth.txt').read_text().splitlines()
     (folder / 'depth.txt').write_text('\n'.join(['# time file', *lines[:2], '', *lines[3:]]))
@@ -295,14 +141,14 @@ def test_what_belongs_together_by_time(folder: Path) -> None:
     assert all(shot.truth is None for shot in shots)
 
 
-def test_tums_own_cameras(folder: Path) -> None:
+def test_name_of_a_tum_dataset_selects_its_camera(folder: Path) -> None:
     (folder / 'camera.txt').unlink()
     assert tum.read(folder).camera.fx == 525.0
     renamed = folder.rename(folder.parent / 'rgbd_dataset_freiburg1_xyz')
     assert tum.read(renamed).camera.fx == 517.3
 
 
-def test_what_a_lens_bends_is_straightened(folder: Path) -> None:
+def test_lens_distortion_is_corrected(folder: Path) -> None:
     """TUM's first camera moves the corners of its images by five pixels and more."""
     renamed = folder.rename(folder.parent / 'rgbd_dataset_freiburg1_xyz')
     (renamed / 'camera.txt').unlink()
@@ -343,7 +189,9 @@ def test_what_a_lens_bends_is_straightened(folder: Path) -> None:
     ('groundtruth.txt', '1 0 0 0 0 0 0 0\n', 'groundtruth.txt:1: a quaternion of length 0'),
     ('camera.txt', '500 500\n', 'camera.txt:1: 2 words'),
 ])
-def test_a_malformed_folder_says_where(folder: Path, name: str, text: Any, said: str) -> None:
+def test_bad_dataset_is_reported_with_its_line(
+    folder: Path, name: str, text: Any, said: str,
+) -> None:
     if text is None:
         (folder / name).unlink()
     else:

@@ -29,16 +29,15 @@ def test_a_record_comes_back_as_it_was_saved(store):
         shell=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
         vpn=VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k'),
         machine_id='abc')
-    directory = store.machine('planner')
-    directory.save(saved)
-    assert directory.load() == saved
+    store.save(saved)
+    assert store.load('planner') == saved
 
 
 def test_files_are_for_the_user_alone(store):
+    store.save(record())
     directory = store.machine('planner')
-    directory.save(record())
-    assert stat.S_IMODE((directory.path / 'record.json').stat().st_mode) == 0o600
-    for folder in (directory.path, directory.path.parent):
+    assert stat.S_IMODE((directory / 'record.json').stat().st_mode) == 0o600
+    for folder in (directory, directory.parent):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
@@ -50,33 +49,31 @@ def test_names_that_a_shell_or_dns_would_trip_over_are_refused(store, name):
 
 
 @pytest.mark.parametrize('content', ['', '{', '[]', '{"name": 1}', '{"spec": {}}', '\0'])
-def test_a_damaged_record_is_listed_as_such_and_loads_with_a_hint(store, content):
-    directory = store.machine('planner')
-    directory.save(record())
-    (directory.path / 'record.json').write_text(content)
+def test_damaged_record_is_listed_and_loads_with_a_hint(store, content):
+    store.save(record())
+    (store.machine('planner') / 'record.json').write_text(content)
     with pytest.raises(StoreError, match='ros2 fog delete planner'):
-        directory.load()
+        store.load('planner')
     assert 'damaged' in store.machines()[0].damage
 
 
 def test_unknown_keys_of_a_later_version_are_left_aside(store):
-    directory = store.machine('planner')
-    directory.save(record())
-    path = directory.path / 'record.json'
+    store.save(record())
+    path = store.machine('planner') / 'record.json'
     path.write_text(path.read_text().replace('{', '{"from_the_future": 1,', 1))
-    assert directory.load() == record()
+    assert store.load('planner') == record()
 
 
 def test_a_name_is_held_by_one_at_a_time(store):
-    with store.machine('planner').lock():
+    with store.lock('planner'):
         with pytest.raises(NameTaken):
-            with store.machine('planner').lock():
+            with store.lock('planner'):
                 pass
-        with store.machine('slam').lock():
+        with store.lock('slam'):
             pass
-    with store.machine('planner').lock():
+    with store.lock('planner'):
         pass
-    assert list(store.machine('planner').path.parent.iterdir()) == []
+    assert list(store.machine('planner').parent.iterdir()) == []
 
 
 def test_a_name_that_cannot_be_held_is_a_clear_error(store, monkeypatch):
@@ -85,34 +82,34 @@ def test_a_name_that_cannot_be_held_is_a_clear_error(store, monkeypatch):
 
     monkeypatch.setattr('builtins.open', full)
     with pytest.raises(StoreError, match='No space left'):
-        with store.machine('planner').lock():
+        with store.lock('planner'):
             pass
 
 
 def test_a_killed_holder_frees_the_name(store):
     code = (
         'import sys; from pathlib import Path; from fogros2.store import Store\n'
-        f'with Store(Path({str(store.root)!r})).machine("planner").lock():\n'
+        f'with Store(Path({str(store.root)!r})).lock("planner"):\n'
         '    print("held", flush=True); sys.stdin.read()')
     child = subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
                              stdout=subprocess.PIPE)
     assert child.stdout.readline() == b'held\n'
     with pytest.raises(NameTaken):
-        with store.machine('planner').lock():
+        with store.lock('planner'):
             pass
     child.kill()
     child.communicate()
     assert [p.name for p in (store.root / 'machines').iterdir()] == ['.planner.lock']
     store.sweep()
     assert list((store.root / 'machines').iterdir()) == []
-    with store.machine('planner').lock():
+    with store.lock('planner'):
         store.sweep()
         with pytest.raises(NameTaken):
-            with store.machine('planner').lock():
+            with store.lock('planner'):
                 pass
 
 
-def test_a_process_is_told_from_another_with_its_id():
+def test_process_differs_from_another_with_its_id():
     child = subprocess.Popen([sys.executable, '-c', 'import sys; sys.stdin.read()'],
                              stdin=subprocess.PIPE)
     start = process_start(child.pid)
@@ -131,12 +128,11 @@ def test_after_a_boot_no_process_is_one_from_before(monkeypatch):
 
 def test_options_are_remembered_as_they_were_asked_for(store):
     spec = MachineSpec('planner', 'fake', {'size': 'small'})
-    folder = store.machine('planner')
-    folder.save(Record('planner', 'fake', spec, asked={'size': 'cheapest'}))
-    assert folder.load().asked_options == {'size': 'cheapest'}
+    store.save(Record('planner', 'fake', spec, asked={'size': 'cheapest'}))
+    assert store.load('planner').asked_options == {'size': 'cheapest'}
     # as an earlier version wrote it
-    folder.save(Record('planner', 'fake', spec))
-    assert folder.load().asked_options == {'size': 'small'}
+    store.save(Record('planner', 'fake', spec))
+    assert store.load('planner').asked_options == {'size': 'small'}
 
 
 def test_a_zombie_counts_as_gone():
@@ -158,4 +154,4 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(store, tmp_path):
 def test_a_state_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(StoreError, match='FOGROS2_STATE_HOME'):
-        Store(tmp_path / 'file').machine('planner').save(record())
+        Store(tmp_path / 'file').save(record())

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from fogros2 import undeclared, workspace
+from fogros2.host import undeclared, workspace
 from fogros2.model import MachineSpec
 from rigs.pip_site import distribution, package
 
@@ -170,7 +170,7 @@ def test_what_the_machine_names_or_has_is_not_named(scientific: Path, site: Path
 
 
 def test_packages_that_come_with_fogros2_are_not_named(root: Path) -> None:
-    from fogros2 import wheels
+    from fogros2.host import wheels
     if 'numpy' not in wheels.names():
         pytest.skip('this robot sends no numpy')
     package(root, 'mine', 'import numpy')
@@ -180,8 +180,8 @@ def test_packages_that_come_with_fogros2_are_not_named(root: Path) -> None:
 
 def test_container_shows_packages_unless_its_root_is_its_own() -> None:
     from fogros2.provider.container import ContainerProvider
-    shown = ContainerProvider().shown(MachineSpec('a', 'container'))
+    shown = ContainerProvider().shared_folders(MachineSpec('a', 'container'))
     assert any(Path(os.path.abspath(sys.prefix)).is_relative_to(folder) for folder in shown)
     assert '/usr' in shown
     for options in ({'isolated': True}, {'image': 'ros:jazzy'}):
-        assert ContainerProvider().shown(MachineSpec('a', 'container', options)) == ()
+        assert ContainerProvider().shared_folders(MachineSpec('a', 'container', options)) == ()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import ipaddress
-import itertools
 import json
 import socket
 
@@ -22,7 +21,7 @@ def test_the_subnet_is_the_same_for_the_same_launch() -> None:
     assert first != addresses.choose_subnet([], launch_id='a1b2c4')
 
 
-def test_what_is_in_use_is_skipped() -> None:
+def test_subnet_in_use_is_skipped() -> None:
     first = addresses.choose_subnet([], launch_id='a1b2c3')
     second = addresses.choose_subnet([first], launch_id='a1b2c3')
     assert second != first
@@ -66,11 +65,6 @@ def test_a_pool_that_is_none_is_refused(text: str) -> None:
         addresses.pool_from({'FOGROS2_VPN_POOL': text})
 
 
-def test_the_robot_comes_first() -> None:
-    assert list(itertools.islice(addresses.addresses('198.18.7.0/24'), 2)) == [
-        '198.18.7.1', '198.18.7.2']
-
-
 def test_routes_and_addresses_are_read() -> None:
     routes = [{'dst': 'default', 'gateway': '192.0.2.1'}, {'dst': '10.0.0.0/8', 'dev': 'tun0'},
               {'type': 'local', 'dst': '192.0.2.2'}]
@@ -97,7 +91,7 @@ def test_a_port_can_be_fixed() -> None:
 
 
 @pytest.mark.parametrize('text', ['0', '65536', '-1', 'any', '5182 0'])
-def test_what_is_no_port_to_fix_is_refused(text: str) -> None:
+def test_invalid_fixed_port_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match=f'FOGROS2_VPN_PORT={text} is no'):
         addresses.choose_port({'FOGROS2_VPN_PORT': text})
 

@@ -179,7 +179,7 @@ def test_both_sides_mean_the_same() -> None:
 # -- the caller's side ---------------------------------------------------------------------------
 
 def interface(key_file: str) -> VpnInterface:
-    return VpnInterface('fog0a1b2c', '198.18.7.1', NETWORK, 51820, key_file, guarded=True)
+    return VpnInterface('fog0a1b2c', '198.18.7.1', NETWORK, 51820, key_file, firewall=True)
 
 
 PEERS = [Peer('first', KEY, '198.18.7.2', '203.0.113.9:51820'), Peer('b', OTHER, '198.18.7.3')]
@@ -203,7 +203,7 @@ def test_what_is_asked_of_it_is_what_it_takes() -> None:
             assert [(p.public_key, p.address, p.endpoint) for p in vpn.peers_of(
                 request['peers'], NETWORK)] == [
                     (p.public_key, p.address, p.endpoint) for p in PEERS[:len(request['peers'])]]
-    assert not plugin.alive(made).sudo
+    assert not plugin.health_check(made).sudo
 
 
 def test_all_other_interfaces_are_root_s_commands() -> None:
@@ -256,7 +256,7 @@ def test_doctor_asks_root_for_nothing_where_the_helper_is_enough(
         assert [check.verdict for check in found] == verdicts
 
 
-def test_who_is_not_in_the_group_is_told_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
     monkeypatch.setattr(process, 'sudo_trouble', lambda: process.PASSWORD)
     with pytest.raises(PrerequisiteError) as caught:

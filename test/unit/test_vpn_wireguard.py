@@ -16,9 +16,9 @@ from fogros2.vpn.wireguard import dds_ports, WireGuard
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 OTHER = 'Kg7ZbFqs9cU1UuPHc9zzQUoyo+MdSEgx7xQ7iDqIexk='
 ROBOT = VpnInterface(
-    'foga1b2c3', '198.18.7.1', '198.18.7.0/24', 40000, '/state/vpn.key', guarded=True)
+    'foga1b2c3', '198.18.7.1', '198.18.7.0/24', 40000, '/state/vpn.key', firewall=True)
 MACHINE = dataclasses.replace(
-    ROBOT, name='foga1b2c3m0', address='198.18.7.2', guarded=False, key_file="/run/it's/vpn.key")
+    ROBOT, name='foga1b2c3m0', address='198.18.7.2', firewall=False, key_file="/run/it's/vpn.key")
 TO_MACHINE = Peer('planner', KEY, '198.18.7.2', '203.0.113.9:50000')
 TO_ROBOT = Peer('robot', OTHER, '198.18.7.1')
 
@@ -27,7 +27,7 @@ def every_command(interface: VpnInterface, peer: Peer) -> list[Command]:
     wireguard = WireGuard()
     return [
         wireguard.keys(interface), *wireguard.up(interface, [peer]),
-        *wireguard.peers(interface, [peer]), wireguard.alive(interface),
+        *wireguard.peers(interface, [peer]), wireguard.health_check(interface),
         *wireguard.repair(interface, [peer]), wireguard.status(interface),
         *wireguard.down(interface)]
 
@@ -52,7 +52,7 @@ def test_one_process_is_started_per_task() -> None:
 
 
 def test_all_but_looking_needs_root() -> None:
-    looks = WireGuard().alive(ROBOT)
+    looks = WireGuard().health_check(ROBOT)
     assert not looks.sudo
     assert all(c.sudo for c in every_command(ROBOT, TO_MACHINE) if c != looks)
 
@@ -64,7 +64,7 @@ def test_the_private_key_is_made_where_it_stays() -> None:
     assert text.splitlines()[-1] == 'wg pubkey </state/vpn.key'
 
 
-def test_the_filter_is_there_before_the_interface_and_goes_after_it() -> None:
+def test_filter_exists_before_and_after_the_interface() -> None:
     up, down = script(*WireGuard().up(ROBOT, [])), script(*WireGuard().down(ROBOT))
     assert up.index('nft -f') < up.index('ip link add') < up.index('wg syncconf')
     assert down.index('ip link delete') < down.index('nft -f') < down.index('rm -f /state/vpn.key')
@@ -114,7 +114,7 @@ def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
     text = script(*wireguard.repair(MACHINE, [TO_ROBOT]))
     assert f'seen {OTHER}' in text and 'seen()' not in script(*wireguard.up(MACHINE, [TO_ROBOT]))
     assert '</run/foga1b2c3m0.noted' in text
-    assert '>/run/foga1b2c3m0.noted' in script(wireguard.alive(MACHINE))
+    assert '>/run/foga1b2c3m0.noted' in script(wireguard.health_check(MACHINE))
     down = script(*wireguard.down(MACHINE))
     assert "rm -f '/run/it'\"'\"'s/vpn.key' /run/foga1b2c3m0.noted" in down
 
@@ -122,7 +122,7 @@ def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
 @pytest.mark.parametrize(('endpoint', 'host'), [
     ('198.51.100.7:51820', '198.51.100.7'), ('[2001:db8::1]:51820', '2001:db8::1'),
     ('[fe80::1%eth0]:1', 'fe80::1%eth0'), ('(none)', '')])
-def test_what_wg_prints_of_endpoints_is_understood(
+def test_endpoints_are_read_from_the_output_of_wg(
     tmp_path: Path, endpoint: str, host: str,
 ) -> None:
     """The robot notes from which of its addresses packets to a machine leave."""
@@ -133,7 +133,7 @@ def test_what_wg_prints_of_endpoints_is_understood(
     wireguard = WireGuard()
     noted = str(tmp_path / 'noted')
     key = dataclasses.replace(ROBOT, key_file='/dev/null')
-    for command in (*wireguard.peers(key, []), wireguard.alive(key)):
+    for command in (*wireguard.peers(key, []), wireguard.health_check(key)):
         text = command.argv[-1].replace('/run/foga1b2c3.noted', noted)
         begin = text.index('ask=' if 'ask=' in text else '[ ! -e')
         done = subprocess.run(
@@ -197,7 +197,7 @@ def test_status_that_isnt_wireguards_is_an_error(text: str) -> None:
         WireGuard().parse_status(text)
 
 
-def test_a_machine_that_can_have_no_tun_says_so(tmp_path: Path) -> None:
+def test_machine_without_tun_is_reported(tmp_path: Path) -> None:
     """A pod has no such device, and some runtimes let nobody make it."""
     for name in ('wg', 'ip', 'mknod', 'wireguard-go'):
         program = tmp_path / name

@@ -10,13 +10,13 @@ import zipfile
 
 import pytest
 
-from fogros2 import bootstrap, wheels
 from fogros2.errors import PrerequisiteError
-from fogros2.host import HostFacts, Python
+from fogros2.host import bootstrap, wheels
+from fogros2.host.inspection import HostFacts, Python
+from fogros2.host.wheels import Wheels
+from fogros2.host.workspace import inspect
 from fogros2.model import MachineSpec
 from fogros2.plan import Underlay
-from fogros2.wheels import Wheels
-from fogros2.workspace import inspect
 
 INDEX = 'share/ament_index/resource_index/packages'
 
@@ -94,7 +94,7 @@ def test_another_content_is_another_wheel(colcon, tmp_path, monkeypatch):
     assert wheels.collect(tmp_path / 'cache').key != first.key
 
 
-def test_a_folder_of_sources_is_not_searched_where_nothing_travels_from(tmp_path):
+def test_source_folder_outside_of_a_workspace_is_ignored(tmp_path):
     for name in ('fogros2/b.py', 'fogros2/a.py', 'setup.py', '.venv/lib/x.py', 'test/unit/y.py',
                  'build/z.py', 'fogros2/notes.txt'):
         path = tmp_path / name
@@ -104,19 +104,19 @@ def test_a_folder_of_sources_is_not_searched_where_nothing_travels_from(tmp_path
         'fogros2/a.py', 'fogros2/b.py', 'setup.py']
 
 
-def test_a_path_without_the_set_up_script_is_told(colcon, tmp_path, monkeypatch):
+def test_path_without_a_setup_script_is_reported(colcon, tmp_path, monkeypatch):
     (colcon / INDEX / 'fogros2').unlink()
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
     with pytest.raises(PrerequisiteError, match='in no ament prefix.*setup.bash'):
         wheels.collect(tmp_path / 'cache')
 
 
-def test_a_workspace_with_this_package_brings_the_launch_file_along(tmp_path):
+def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
     root = tmp_path / 'ws'
     install(root)
     workspace = inspect(root)
     robot = HostFacts(
-        'ubuntu', '24.04', 'noble', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
+        'ubuntu', '24.04', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
         (Python('/usr/bin/python3', (3, 12), True),),
         frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
         {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_cyclonedds_cpp',)},
@@ -133,7 +133,7 @@ def test_a_workspace_with_this_package_brings_the_launch_file_along(tmp_path):
     other = dataclasses.replace(robot, environments={})
     packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', embedded=False)
     todo = bootstrap.plan(spec, other, robot, under, packed, [workspace])
-    assert not todo.send_wheels and todo.commands == ()
+    assert not todo.wheels_target and todo.commands == ()
     assert todo.install.command == alike.install.command
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
     assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{root}/install/fogros2'

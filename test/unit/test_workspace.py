@@ -10,9 +10,9 @@ import subprocess
 
 import pytest
 
-from fogros2 import workspace
 from fogros2.errors import WorkspaceError
-from fogros2.host import HostFacts, Python
+from fogros2.host import workspace
+from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Result, SyncReport
 from fogros2.shell import sync
 from fogros2.testing.fakes import FakeShell
@@ -103,7 +103,7 @@ def test_packages_below_a_package_or_an_ignore_marker_are_none(tmp_path: Path) -
     assert list(workspace.inspect(tmp_path).sources) == ['outer']
 
 
-def test_what_is_no_workspace_is_refused_with_a_hint(tmp_path: Path, root: Path) -> None:
+def test_invalid_workspace_is_refused_with_a_hint(tmp_path: Path, root: Path) -> None:
     with pytest.raises(WorkspaceError, match='is no folder'):
         workspace.inspect(tmp_path / 'nowhere')
     empty = tmp_path / 'empty'
@@ -121,14 +121,14 @@ def test_a_broken_manifest_is_named(tmp_path: Path) -> None:
         workspace.inspect(tmp_path)
 
 
-def test_an_install_space_travels_as_it_is_between_computers_alike(root: Path) -> None:
+def test_install_space_is_copied_between_equal_computers(root: Path) -> None:
     way = plan(workspace.inspect(root))
     assert (way.source, way.target, way.commands, way.reason) == (root, str(root), (), '')
     assert way.includes == ()
     assert '/log' in way.excludes and '.git' in way.excludes
 
 
-def test_python_alone_travels_to_another_system_of_the_same_python(root: Path) -> None:
+def test_pure_python_is_copied_to_another_system(root: Path) -> None:
     machine = HostFacts(system='debian', release='13', architecture='aarch64', pythons=(PYTHON,))
     assert plan(workspace.inspect(root), machine).commands == ()
 
@@ -347,7 +347,7 @@ def test_all_sourced_workspaces_travel_but_ros_itself(chain: list[Path]) -> None
     assert workspace.left_behind(environment, found) == []
 
 
-def test_what_does_not_travel_is_named_with_the_reason(chain: list[Path]) -> None:
+def test_files_that_are_not_copied_are_named(chain: list[Path]) -> None:
     environment = environment_of(chain)
     environment['AMENT_PREFIX_PATH'] += ':/srv/acme'
     top, middle, base = map(str, chain)

@@ -8,10 +8,10 @@ from typing import Any, cast, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 
-from fogros2.actions import words
-from fogros2.actions.coordinator import Coordinator
 from fogros2.actions.launch_description import FogROSLaunchDescription
+from fogros2.describe import values
 from fogros2.errors import ConfigurationError
+from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -65,8 +65,8 @@ class FogROSLaunch(Action):
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action: return the description."""
-        return [self._description(words.resolve(context, self._robot_nodes),
-                                  words.resolve(context, self._dds))]
+        return [self._description(values.resolve(context, self._robot_nodes),
+                                  values.resolve(context, self._dds))]
 
     def _description(self, robot_nodes: str, dds: Optional[str]) -> FogROSLaunchDescription:
         return FogROSLaunchDescription(
@@ -89,6 +89,6 @@ def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopi
             entries.append(action.entry)
         else:
             raise ConfigurationError(
-                f'{words.describe(action.entry.topic)}: a stream of one part of a launch has no '
+                f'{values.describe(action.entry.topic)}: a stream of one part of a launch has no '
                 'condition', 'give the node or the group one')
     return others, entries

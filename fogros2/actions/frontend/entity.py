@@ -8,25 +8,28 @@ from collections.abc import Iterable, Mapping
 import re
 from typing import Any, List, Optional, TYPE_CHECKING, Union
 
-from fogros2.actions import keywords, words
+from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from launch import Substitution
     from launch.frontend import Entity, Parser
 
-    Parsed = Union[str, list[Substitution]]
+    #: A text, or substitutions to resolve later.
+    ParsedText = Union[str, list[Substitution]]
+    #: The class of an action, and its constructor's keywords.
+    Parsed = tuple[type[Any], dict[str, Any]]
 
 #: The parsers' error about attributes that were not read: ``... found in `node`: {'a', 'b'}``.
 _UNREAD = re.compile(r'found in `.*?`: (\{.*\})', re.DOTALL)
 #: Attributes of every action.
 CONDITIONS = ('if', 'unless')
 _EXPECTED = {
-    'text': "a text, such as '512'", 'number': 'a number', 'truth': 'true or false',
+    'text': "a text, such as '512'", 'number': 'a number', 'bool': 'true or false',
     'scalar': 'true, a number or a text', 'list': 'a list of texts'}
 
 
-def text(parser: Parser, raw: str) -> Parsed:
+def text(parser: Parser, raw: str) -> ParsedText:
     """Parse a text as launch does: a plain string, or substitutions to resolve later."""
     from launch.substitutions import TextSubstitution
     parts: list[Substitution] = parser.parse_substitution(raw)
@@ -34,17 +37,17 @@ def text(parser: Parser, raw: str) -> Parsed:
     return ''.join(plain) if len(plain) == len(parts) else parts
 
 
-def attribute(entity: Entity, parser: Parser, name: str) -> Optional[Parsed]:
+def attribute(entity: Entity, parser: Parser, name: str) -> Optional[ParsedText]:
     """
     Return a text attribute, None if it is missing.
 
     :raises ConfigurationError: the attribute is not a text.
     """
-    found: Optional[Parsed] = value(entity, parser, keywords.Keyword(name, 'text'))
+    found: Optional[ParsedText] = value(entity, parser, kinds.Keyword(name, 'text'))
     return found
 
 
-def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
+def value(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
     """
     Return the value of a keyword, converted to its kind; None if it is missing.
 
@@ -67,7 +70,7 @@ def value(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
         parsed = text(parser, raw)
         if isinstance(parsed, str):
             return keywords.read(keyword, parsed)
-        return words.Listed(parsed) if keyword.kind == 'list' else parsed
+        return values.List(parsed) if keyword.kind == 'list' else parsed
     if raw is None or _fits(keyword.kind, raw):
         return raw
     raise _wrong(entity, keyword, raw)
@@ -97,13 +100,13 @@ def _raw(entity: Entity, name: str) -> Union[str, int, float, bool, list[Any], N
         'several of these; names and values are elements of their own')
 
 
-def _fits(kind: keywords.Kind, raw: object) -> bool:
+def _fits(kind: kinds.Kind, raw: object) -> bool:
     if isinstance(raw, bool):
-        return kind in ('truth', 'scalar')
+        return kind in ('bool', 'scalar')
     return kind in ('number', 'scalar') and isinstance(raw, (int, float))
 
 
-def _wrong(entity: Entity, keyword: keywords.Keyword, raw: object) -> ConfigurationError:
+def _wrong(entity: Entity, keyword: kinds.Keyword, raw: object) -> ConfigurationError:
     return ConfigurationError(f"{entity.type_name}: {keyword.name} can't be {raw!r}",
                               f'it takes {_EXPECTED[keyword.kind]}')
 
@@ -129,8 +132,8 @@ def _list_of_entities() -> Any:
     return List[Entity]
 
 
-def _mapping(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
-    found: dict[str, Parsed] = {}
+def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
+    found: dict[str, ParsedText] = {}
     for child in children(entity, keyword.name):
         name, content = attribute(child, parser, 'name'), attribute(child, parser, 'value')
         complete(child, ('name', 'value'))
@@ -142,10 +145,10 @@ def _mapping(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
     return found or None
 
 
-def _table(entity: Entity, parser: Parser, keyword: keywords.Keyword) -> Any:
+def _table(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
     rows: list[Mapping[str, Any]] = []
     for child in children(entity, keyword.name):
-        columns = {name: value(child, parser, keywords.Keyword(name, kind))
+        columns = {name: value(child, parser, kinds.Keyword(name, kind))
                    for name, kind in keyword.columns.items()}
         complete(child, keyword.columns)
         rows.append({name: content for name, content in columns.items() if content is not None})

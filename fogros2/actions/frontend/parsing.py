@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action
 from launch.actions import GroupAction
 
-from fogros2.actions import keywords, words
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
 from fogros2.actions.frontend.actions import FogROSLaunch, instead_of, StreamTopicEverywhere
@@ -20,16 +19,17 @@ from fogros2.actions.frontend.entity import (
     text,
     value,
 )
-from fogros2.actions.frontend.scope import scoped
-from fogros2.actions.nodes import CloudNode, Node
-from fogros2.containers import described
+from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, Node
+from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
+from fogros2.host.containers import described
 from fogros2.image_transport.streams import StreamTopic
+from fogros2.launch_internals.parsers import scoped
 
 if TYPE_CHECKING:
     from launch.frontend import Entity, Parser
 
-    from fogros2.actions.frontend import Parsed
+    from fogros2.actions.frontend.entity import Parsed
 
 #: Attributes and elements of ``<node>`` and ``<node_container>`` that launch_ros reads.
 _NODE = (
@@ -67,10 +67,10 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
 
 def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
     """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
-    known = {'cmd': keywords.Keyword('cmd', 'text'), **keywords.parameters_of(described)}
+    known = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
     complete(entity, known)
-    found = {name: words.items(content) if known[name].kind == 'list' else content
+    found = {name: values.items(content) if known[name].kind == 'list' else content
              for name, content in given.items() if content is not None}
     if ('cmd' in found) == ('image' in found) or ('cmd' in found and len(found) > 1):
         raise ConfigurationError('a docker_container takes a cmd, or an image and what it needs',
@@ -96,15 +96,27 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     """Read an element of ``cls`` as launch_ros does, with the keywords of a machine."""
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
-    known = {'image': keywords.Keyword('image', 'text'),
-             'image_options': keywords.Keyword('image_options', 'list')}
+    known = {'image': kinds.Keyword('image', 'text'),
+             'image_options': kinds.Keyword('image_options', 'list')}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
-    kwargs.update({name: words.items(content) if name == 'image_options' else content
+    kwargs.update({name: values.items(content) if name == 'image_options' else content
                    for name, content in given.items() if content is not None})
     streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
     _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
     complete(entity, ('machine', 'stream_topic', *known, *_NODE, *CONDITIONS))
     return cls, kwargs
+
+
+#: Elements that may have a machine inside ``<fogros_launch>``.
+_WITH_MACHINE = {'node': Node, 'node_container': ComposableNodeContainer}
+
+
+def _node_with_machine(entity: Entity, parser: Parser) -> Optional[Action]:
+    cls = _WITH_MACHINE.get(entity.type_name)
+    if cls is None or entity.get_attr('machine', data_type=None, optional=True) is None:
+        return None
+    _, kwargs = node(entity, parser, cls)
+    return cls(**kwargs)
 
 
 def cloud_group(entity: Entity, parser: Parser) -> Parsed:
@@ -133,17 +145,17 @@ def stream_topic(entity: Entity, parser: Parser) -> Parsed:
     parameters: dict[str, Any] = {}
     for child in children(entity, 'param'):
         name = attribute(child, parser, 'name')
-        content = value(child, parser, keywords.Keyword('value', 'scalar'))
+        content = value(child, parser, kinds.Keyword('value', 'scalar'))
         complete(child, ('name', 'value'))
         if not name or not isinstance(name, str) or content is None or name in _STREAM:
             raise ConfigurationError('a param of a stream_topic takes a name, written out, and a '
                                      'value', '<param name="bitrate" value="2000000"/>')
         parameters[name] = content
-    said: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         name: attribute(entity, parser, name) for name in _STREAM if name != 'topic'}
     complete(entity, ('param', *_STREAM, *CONDITIONS))
     kwargs['entry'] = StreamTopic(
-        topic, **{name: content for name, content in said.items() if content is not None},
+        topic, **{name: content for name, content in attributes.items() if content is not None},
         **parameters)
     return StreamTopicEverywhere, kwargs
 
@@ -155,7 +167,7 @@ def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
         value = entity.get_attr(name, optional=True)
         if value is not None:
             kwargs[name] = text(parser, value)
-    below = scoped(parser)
+    below = scoped(parser, _node_with_machine)
     kwargs['actions'], kwargs['stream_topics'] = instead_of(
         below.parse_action(child) for child in entity.children)
     complete(entity, ('robot_nodes', 'dds', *CONDITIONS))

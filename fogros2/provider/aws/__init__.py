@@ -1,19 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines at AWS: EC2 instances, found, priced, made, baked into images and ended by boto3."""
+"""
+EC2 instances, by boto3.
+
+In reading order: ``options``, ``regions``, ``spot`` (the preemption notice), ``failures`` (AWS's
+refusals), ``patience`` and ``clients`` (calls), ``instances``, ``network``, ``ending``,
+``images``, ``prices``, ``cloud`` (the adapter).
+"""
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from collections.abc import Sequence
+import dataclasses
+from typing import ClassVar, Optional
 
-if TYPE_CHECKING:
-    from fogros2.provider.aws.provider import AWSProvider
+from fogros2.provider import Capabilities
+from fogros2.provider.aws import clients, spot
+from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.vm.provider import VmProvider
 
 __all__ = ['AWSProvider']
 
 
-def __getattr__(name: str) -> Any:
-    """Return the provider; what only looks at prices or regions doesn't load it."""
-    if name == 'AWSProvider':
-        from fogros2.provider.aws.provider import AWSProvider
-        return AWSProvider
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+class AWSProvider(VmProvider):
+    """
+    EC2 instances.
+
+    :param account: the AWS account; None for the account of this computer's user.
+    """
+
+    name: ClassVar[str] = 'aws'
+    capabilities: ClassVar[Capabilities] = dataclasses.replace(
+        VmProvider.capabilities, stop=True, images=True, preemption_notice=spot.NOTICE)
+
+    def __init__(self, account: Optional[Account] = None) -> None:
+        super().__init__(Ec2(account))
+
+    @classmethod
+    def configured(cls) -> bool:
+        """Return whether AWS is set up here."""
+        return clients.configured()
+
+    @classmethod
+    def region_names(cls) -> Sequence[str]:
+        """Return the names of all regions."""
+        return tuple(Ec2.regions.table)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""boto3's clients: made once per service and region, patient, their errors translated."""
+"""boto3's clients: one for each service and region, with time-outs, errors as FogErrors."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws import patience
-from fogros2.provider.aws.failures import AwsError, GONE, translated
+from fogros2.provider.aws.failures import AwsError, translated
 
 T = TypeVar('T')
 
 #: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
 ATTEMPTS = 8
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
-#: Seconds for which EC2 may not know an instance that it has just made.
+#: Seconds for which EC2 may not report a new instance.
 SETTLING = 60.0
-#: Variables and files that say that somebody has set AWS up on this computer.
+#: Variables and files that show that AWS is set up on this computer.
 _VARIABLES = (
     'AWS_ACCESS_KEY_ID', 'AWS_PROFILE', 'AWS_DEFAULT_PROFILE', 'AWS_WEB_IDENTITY_TOKEN_FILE',
     'AWS_CONTAINER_CREDENTIALS_RELATIVE_URI', 'AWS_CONTAINER_CREDENTIALS_FULL_URI')
@@ -31,7 +31,7 @@ _FILES = {'AWS_SHARED_CREDENTIALS_FILE': '~/.aws/credentials', 'AWS_CONFIG_FILE'
 
 
 def configured() -> bool:
-    """Return whether somebody has set AWS up here; files and variables alone are looked at."""
+    """Return whether AWS is set up here; read only files and variables."""
     if any(os.environ.get(name) for name in _VARIABLES):
         return True
     return any(Path(os.environ.get(variable) or usual).expanduser().is_file()
@@ -44,9 +44,9 @@ _accounts_lock = threading.Lock()
 
 def usual() -> Account:
     """
-    Return the account of this computer's user, the same to everybody in this process.
+    Return the account of this computer's user, the same for all callers in this process.
 
-    Making a session and its clients takes half a second, and a launch asks from many sides.
+    A session and its clients take half a second to create.
     """
     settings = tuple(sorted((name, value) for name, value in os.environ.items()
                             if name.startswith('AWS_') or name == 'HOME'))
@@ -68,36 +68,39 @@ class Account:
 
     def __init__(self, session: Optional[Any] = None) -> None:
         self._session = session
-        #: Instances that this process has made, and when (``time.monotonic``).
+        #: Instances that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
-        #: Security groups that this process has made and not changed since, by attempt: the id,
-        #: and the rule for SSH, as sent to EC2.
+        #: Security groups that this process has created and not changed since, by attempt: the
+        #: id, and the rule for SSH as sent to EC2.
         self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
-        #: Ids of the disks that go with instances that this process has seen run.
+        #: Ids of the disks that are deleted with instances that this process has seen run.
         self.disks: dict[str, set[str]] = {}
         self._clients: dict[tuple[str, str, bool], Any] = {}
-        # making clients of one session in several threads isn't safe; using them is
+        # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
         self._cancel: Optional[threading.Event] = None
+        self._hasty = False
+
+    def hasty(self) -> Account:
+        """Return this account with short time-outs and few attempts."""
+        other = copy.copy(self)
+        other._hasty = True
+        return other
 
     def until(self, cancel: Optional[threading.Event]) -> Account:
-        """
-        Return this account for one who makes calls for as long as nobody cancels.
-
-        Its calls end with Cancelled then; nothing on a way down may be done by it.
-        """
+        """Return this account with calls that raise Cancelled once ``cancel`` is set."""
         self.session()
         other = copy.copy(self)
         other._cancel = cancel
         return other
 
     def just_made(self, instance: str) -> bool:
-        """Return whether EC2 may not know an instance yet that this process has made."""
+        """Return whether EC2 may not report an instance yet that this process has created."""
         made = self.made.get(instance)
         return made is not None and time.monotonic() - made < SETTLING
 
     def apart(self) -> Account:
-        """Return this account with clients of its own, which no other's throttling slows down."""
+        """Return this account with its own clients, which the others' throttling does not slow."""
         self.session()
         other = copy.copy(self)
         other._clients = {}
@@ -107,7 +110,7 @@ class Account:
         """
         Return the boto3 session.
 
-        :raises PrerequisiteError: boto3 isn't installed, or its configuration can't be read.
+        :raises PrerequisiteError: boto3 is not installed, or its configuration is not readable.
         """
         with self._lock:
             if self._session is None:
@@ -127,7 +130,7 @@ class Account:
 
     def check_credentials(self) -> None:
         """
-        Look whether there are credentials; AWS isn't asked whether they are good.
+        Check that there are credentials, without a request to AWS.
 
         :raises PrerequisiteError: there are none.
         """
@@ -144,7 +147,7 @@ class Account:
         """
         Return the client of a service in a region.
 
-        :param hasty: for a question that somebody waits for: short deadlines, few attempts.
+        :param hasty: short time-outs and few attempts, because a user waits for the answer.
         """
         with self._lock:
             found = self._clients.get((service, region, hasty))
@@ -163,8 +166,7 @@ class Account:
             return found
 
     def call(
-        self, service: str, region: str, operation: str, what: str, *, hasty: bool = False,
-        **parameters: Any,
+        self, service: str, region: str, operation: str, what: str, **parameters: Any,
     ) -> Mapping[str, Any]:
         """
         Make one call and return its answer.
@@ -177,14 +179,14 @@ class Account:
             answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
             return answer
 
-        return self._ask(ask, service, region, what, hasty)
+        return self._ask(ask, service, region, what)
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
-        """Make a call of EC2 that deletes something; it may be gone already."""
+        """Make a call of EC2 that deletes something; it may be deleted already."""
         try:
             self.call('ec2', region, operation, what, **parameters)
         except AwsError as error:
-            if error.code not in GONE:
+            if not error.gone:
                 raise
 
     def pages(
@@ -199,10 +201,10 @@ class Account:
         yield from self._ask(ask, service, region, what)
 
     def _ask(
-        self, ask: Callable[[Any], T], service: str, region: str, what: str, hasty: bool = False,
+        self, ask: Callable[[Any], T], service: str, region: str, what: str,
     ) -> T:
         def asked() -> T:
-            client = self.client(service, region, hasty=hasty)
+            client = self.client(service, region, hasty=self._hasty)
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 

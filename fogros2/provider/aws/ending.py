@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a machine ends: the instance first, then what only it had, each seen to be gone."""
+"""Delete a machine: the instance first, then its group, key, addresses and disks."""
 
 from __future__ import annotations
 
@@ -9,63 +9,61 @@ from typing import Any, Optional
 from fogros2.provider import TAG_NAME
 from fogros2.provider.aws import instances, network
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError, code_of, GONE
-from fogros2.provider.aws.instances import MachineId, TAG_ATTEMPT, TAG_MADE
+from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.vm.cloud import own_name, TAG_ATTEMPT, TAG_MADE, VmId
 from fogros2.waiting import wait_until
 
-#: Seconds that an instance may take to end; usually it is half a minute.
-PATIENCE = 300.0
-#: Seconds after which a group without an instance gets none any more.
+#: Time-out in seconds for the end of an instance; usually it takes half a minute.
+TIMEOUT = 300.0
+#: Seconds after which a group without an instance is a leftover.
 SETTLED = 900.0
 
 
-def destroy(account: Account, machine: MachineId) -> None:
+def destroy(account: Account, machine: VmId) -> None:
     """
-    End an instance and everything that was made for it; returns when all is gone.
+    Delete an instance and everything that was created for it; return when all of it is gone.
 
-    What is gone already is no error, and what it left behind goes all the same. An instance that
-    doesn't carry the machine's tag isn't touched.
+    Idempotent. An instance without the machine's tag is not touched.
 
     :raises FogError: something could not be deleted.
     """
-    disks = account.disks.pop(machine.instance, set())
-    # what this process has made is ours without asking
-    if machine.instance in account.made or _there(account, machine, disks):
+    disks = account.disks.pop(machine.vm, set())
+    # no look-up is needed for what this process has created
+    if machine.vm in account.made or _there(account, machine, disks):
         if _terminate(account, machine):
-            # it takes EC2 half a minute and more
             wait_until(
-                lambda: not _there(account, machine, disks), timeout=PATIENCE, first=1.5,
+                lambda: not _there(account, machine, disks), timeout=TIMEOUT, first=1.5,
                 interval=3.0, longest=15.0, hint='ros2 fog delete again later',
-                what=f'{machine.instance} in {machine.region} to be terminated')
-    account.made.pop(machine.instance, None)
+                what=f'{machine.vm} in {machine.region} to be terminated')
+    account.made.pop(machine.vm, None)
     account.doors.pop(machine.attempt, None)
     sweep(account, machine.region, machine.attempt, gone=disks)
 
 
-def _terminate(account: Account, machine: MachineId) -> bool:
-    """Have an instance end; returns whether there is something to wait for."""
+def _terminate(account: Account, machine: VmId) -> bool:
+    """Terminate an instance; return whether its end has to be awaited."""
     def ask() -> Optional[list[Mapping[str, Any]]]:
         try:
             return list(account.call(
-                'ec2', machine.region, 'terminate_instances', f'ending {machine.instance}',
-                InstanceIds=[machine.instance])['TerminatingInstances'])
+                'ec2', machine.region, 'terminate_instances', f'ending {machine.vm}',
+                InstanceIds=[machine.vm])['TerminatingInstances'])
         except AwsError as error:
-            if code_of(error) not in GONE:
+            if not error.gone:
                 raise
-            # EC2 may not know one that was made a moment ago, and which would run on
-            return None if account.just_made(machine.instance) else []
+            # EC2 may not report a new instance yet, which would continue to run
+            return None if account.just_made(machine.vm) else []
 
-    told = wait_until(ask, timeout=PATIENCE, interval=1.0, longest=5.0,
-                      what=f'{machine.instance} in {machine.region} to be known')
+    told = wait_until(ask, timeout=TIMEOUT, interval=1.0, longest=5.0,
+                      what=f'{machine.vm} in {machine.region} to be known')
     return any(entry['CurrentState']['Name'] != 'terminated' for entry in told)
 
 
-def _there(account: Account, machine: MachineId, disks: set[str]) -> bool:
-    """Return whether an instance is there; adds the disks that go with it."""
-    # by filters: unlike an id that EC2 has forgotten, what they don't find is no error
+def _there(account: Account, machine: VmId, disks: set[str]) -> bool:
+    """Return whether an instance exists; add the disks that are deleted with it."""
+    # filters: an id that EC2 does not know would be an error
     found = instances.instances_in(account.call(
-        'ec2', machine.region, 'describe_instances', f'watching {machine.instance} end',
-        Filters=[{'Name': 'instance-id', 'Values': [machine.instance]},
+        'ec2', machine.region, 'describe_instances', f'watching {machine.vm} end',
+        Filters=[{'Name': 'instance-id', 'Values': [machine.vm]},
                  *instances.tag_filters({TAG_ATTEMPT: machine.attempt})])['Reservations'])
     disks |= {disk for instance in found for disk in instances.own_disks(instance)}
     return any(instance['State']['Name'] != 'terminated' for instance in found)
@@ -73,9 +71,9 @@ def _there(account: Account, machine: MachineId, disks: set[str]) -> bool:
 
 def sweep(account: Account, region: str, attempt: str, gone: Collection[str] = ()) -> None:
     """
-    Delete what an attempt made besides its instance: key, group, addresses, disks.
+    Delete what an attempt created besides its instance: key, group, addresses, disks.
 
-    :param gone: ids of what goes by itself, which EC2 tells of for some time.
+    :param gone: ids that EC2 still reports although they are being deleted.
     """
     drop_key(account, region, attempt)
     left = [str(entry['ResourceId']) for entry in account.pages(
@@ -84,9 +82,9 @@ def sweep(account: Account, region: str, attempt: str, gone: Collection[str] = (
                  {'Name': 'value', 'Values': [attempt]}])]
     groups = [each for each in left if each.startswith('sg-')]
     if groups:
-        network.delete_groups(account, region, groups, timeout=PATIENCE)
+        network.delete_groups(account, region, groups, timeout=TIMEOUT)
     else:
-        # EC2 reports tags a little late: the name is certain
+        # EC2 reports tags a little late; the name is reliable
         drop_groups(account, region, attempt)
     for address in left:
         if address.startswith('eipalloc-'):
@@ -107,19 +105,19 @@ def _drop_volumes(account: Account, region: str, attempt: str) -> None:
 
 
 def drop_key(account: Account, region: str, attempt: str) -> None:
-    """Delete the key of an attempt; there may be none."""
+    """Delete the key of an attempt, if it exists."""
     account.remove(region, 'delete_key_pair', 'deleting the login key',
-                  KeyName=instances.own_name(attempt))
+                  KeyName=own_name(attempt))
 
 
 def drop_groups(
     account: Account, region: str, attempt: str, *, known: Iterable[str] = (),
-    timeout: float = PATIENCE,
+    timeout: float = TIMEOUT,
 ) -> None:
     """
-    Delete the group of an attempt, as soon as nothing uses it; there may be none.
+    Delete the group of an attempt, if it exists, when no instance uses it.
 
-    :param known: its id, which EC2 may not tell of yet where it was just made; () to look for it.
+    :param known: its id, which EC2 may not report yet if it is new; () to look for it.
     """
     groups = list(known) or [
         str(group['GroupId']) for group in network.find_groups(account, region, attempt)]
@@ -127,7 +125,7 @@ def drop_groups(
 
 
 def end_instances(account: Account, region: str, attempt: str) -> None:
-    """Have the instances of an attempt end, without waiting; there may be none."""
+    """Terminate the instances of an attempt without waiting."""
     found = instances.instances_in(account.call(
         'ec2', region, 'describe_instances', 'looking for what was made', Filters=[
             *instances.tag_filters({TAG_ATTEMPT: attempt}),
@@ -139,11 +137,11 @@ def end_instances(account: Account, region: str, attempt: str) -> None:
 
 def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
     """
-    Return attempts of which only a group or a key is left, and the names of their machines.
+    Return attempts of which only a group or a key is left, with the machine's name.
 
-    A machine that ends by itself takes its disk and address along, but not these.
+    The end of a machine deletes its disk and address, but not these.
 
-    :param now: seconds since the epoch; what was made just before may get its instance still.
+    :param now: seconds since the epoch; a new group may still get its instance.
     """
     ours = [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}]
     entries = [

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What AWS answers when it refuses, as FogErrors: one table from its error codes to hints.
+Convert AWS's refusals to FogErrors: one table from error codes to hints.
 
 The codes are those of the EC2 API reference ("Error codes for the Amazon EC2 API") and of the
 common errors of all AWS services.
@@ -15,20 +15,21 @@ import re
 from typing import Any, NamedTuple, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
+from fogros2.provider.vm.cloud import CloudError
 
-#: There is no room for this machine in this zone; another zone may have it.
+#: No capacity in this zone; another zone may have some.
 NO_ROOM_IN_ZONE = frozenset({
     'InsufficientInstanceCapacity', 'InsufficientHostCapacity', 'InsufficientCapacity',
     'InsufficientFreeAddressesInSubnet', 'Unsupported', 'UnfulfillableCapacity',
     'SpotMaxPriceTooLow',
 })
-#: The account may have no more of this kind in this region; another kind or region may do.
+#: The account's quota in this region is used up; another type or region may have some.
 NO_ROOM_IN_REGION = frozenset({
     'VcpuLimitExceeded', 'InstanceLimitExceeded', 'MaxSpotInstanceCountExceeded',
     'SpotInstanceCountExceeded',
 })
 NO_ROOM = NO_ROOM_IN_ZONE | NO_ROOM_IN_REGION
-#: What was named isn't there (any more).
+#: The resource does not exist (any more).
 GONE = frozenset({
     'InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed', 'InvalidGroup.NotFound',
     'InvalidGroupId.Malformed', 'InvalidKeyPair.NotFound', 'InvalidAMIID.NotFound',
@@ -38,7 +39,7 @@ GONE = frozenset({
 
 
 class Failure(NamedTuple):
-    """What a code means: our words for it ('' keeps AWS's), what to do, what it counts as."""
+    """The meaning of a code: a reason ('' keeps AWS's own), a remedy, the kind of error."""
 
     reason: str
     hint: str
@@ -126,28 +127,26 @@ _FAILURES = {
     'ParameterNotFound': Failure(
         'AWS names no such image in this region', 'name one with ami_image='),
 }
-#: The policy of the credentials, or of their organisation, says no.
+#: The policy of the credentials, or of their organisation, does not allow the request.
 DENIED = ('UnauthorizedOperation', 'AccessDenied', 'AccessDeniedException',
           'UnauthorizedException')
 _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)')
 _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 
 
-#: Letters of AWS's own words that fit into one line.
+#: Maximum length of AWS's own text in a message.
 _LENGTH = 300
 
 
-class AwsError(ProviderError):
+class AwsError(CloudError):
     """AWS refused; ``code`` is its error code."""
 
     def __init__(self, message: str, hint: str = '', *, code: str = '') -> None:
-        super().__init__(message, hint)
+        super().__init__(
+            message, hint, gone=code in GONE, denied=code in DENIED,
+            full='zone' if code in NO_ROOM_IN_ZONE else
+            'region' if code in NO_ROOM_IN_REGION else '')
         self.code = code
-
-
-def code_of(error: BaseException) -> str:
-    """Return AWS's error code behind an error of ours, '' where there is none."""
-    return error.code if isinstance(error, AwsError) else ''
 
 
 @contextlib.contextmanager
@@ -155,10 +154,10 @@ def translated(
     what: str, region: str = '', *, decode: Optional[Callable[[str], str]] = None,
 ) -> Iterator[None]:
     """
-    Turn what boto3 raises in the block into FogErrors.
+    Convert the errors of boto3 in the block to FogErrors.
 
-    :param what: what the block does, such as 'creating the security group'.
-    :param decode: turns an encoded authorization failure into its JSON, '' where it can't.
+    :param what: action of the block, such as 'creating the security group'.
+    :param decode: converts an encoded authorization failure to its JSON, '' if it cannot.
     :raises PrerequisiteError: no credentials, bad ones, no route to AWS, a wrong clock.
     :raises AwsError: AWS refused.
     """
@@ -181,11 +180,11 @@ def refused(
     response: Any, operation: str, what: str, region: str,
     decode: Optional[Callable[[str], str]] = None,
 ) -> FogError:
-    """Return the error for an answer of AWS's that says no; ``response`` as botocore has it."""
+    """Return the error for a refusal; ``response`` as botocore has it."""
     error = _refusal(response, operation, what, region, decode)
     code = str((response.get('Error') or {}).get('Code', ''))
     status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
-    # a fault of AWS's own may have come after the deed
+    # after a fault of AWS, the request may have had its effect
     error.refused = status < 500 or code in NO_ROOM
     return error
 
@@ -215,11 +214,11 @@ def _refusal(
 
 
 def _plain(text: str) -> str:
-    """Return a message in one line; a proxy's or balancer's answer is a whole page."""
+    """Return a message in one line; the answer of a proxy is a whole page."""
     if text.lstrip().startswith('<'):
         text = re.sub(r'<[^>]*>', ' ', text)
     words = ' '.join(text.split())
-    # an encoded message is as long as it is, and not for people
+    # an encoded message must stay complete
     return words if _ENCODED.search(words) or len(words) <= _LENGTH else f'{words[:_LENGTH]}...'
 
 
@@ -229,8 +228,8 @@ def denied_action(
     """
     Return the action that a policy lacks, such as 'ec2:RunInstances'.
 
-    A call may need more than its own action (tags at creation, a role handed over): AWS says
-    which in plain words, or encoded for users who may ``sts:DecodeAuthorizationMessage``.
+    A call may need other actions too (tags at creation, a role). AWS names the action in plain
+    text, or encoded for users who may ``sts:DecodeAuthorizationMessage``.
     """
     encoded = _ENCODED.search(said)
     if encoded and decode:
@@ -245,7 +244,7 @@ def denied_action(
 
 
 def _unsent(error: BaseException, what: str, region: str) -> FogError:
-    """Return the error for a request that never got an answer."""
+    """Return the error for a request without an answer."""
     from botocore import exceptions as known
 
     where = f'{what} in {region}' if region else what

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which disk image a machine starts from, and the images that are baked of machines."""
+"""Choose the image that a machine starts from; bake, list and delete images of machines."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError, GONE
-from fogros2.provider.aws.instances import PROVIDER, tag_list, TAG_USER, tags_of
+from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.aws.instances import tag_list, tags_of
 from fogros2.provider.aws.options import Options
+from fogros2.provider.vm.cloud import TAG_USER, Vm
 
-#: On images and their snapshots: the name they were given.
+#: Tag of images and their snapshots with the name of the image.
 TAG_BAKED = 'fogros2-baked'
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
@@ -38,7 +39,7 @@ _ID = re.compile(r'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
 
 
 class Kind(NamedTuple):
-    """What has to be known of an instance type to choose its image."""
+    """The properties of an instance type that decide its image."""
 
     name: str
     arch: str
@@ -47,9 +48,7 @@ class Kind(NamedTuple):
 
 def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
     """
-    Return instance types as a region has them, in the order of ``names``.
-
-    Of several those that it lacks are left out: there is no room for them there.
+    Return the instance types that a region has, in the order of ``names``.
 
     :raises ConfigurationError: it has none of them.
     """
@@ -62,7 +61,7 @@ def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
         if error.code != 'InvalidInstanceType':
             raise
         if len(names) > 1:
-            # one that it lacks is an error for all of them
+            # one unknown type is an error for all of them
             alone = [_kinds_if_any(account, region, name) for name in names]
             some = [kind for each in alone for kind in each]
             if some:
@@ -91,10 +90,10 @@ def choose(
     account: Account, region: str, kind: Kind, options: Options, dependencies: str,
 ) -> Mapping[str, Any]:
     """
-    Return the image (as EC2 describes it) that a machine starts from.
+    Return the image (an entry of DescribeImages) that a machine starts from.
 
-    :param dependencies: of the launch; an image baked with the same is preferred.
-    :raises ConfigurationError: the image doesn't exist, or is for another processor.
+    :param dependencies: hash of the launch; an image that was baked with the same is preferred.
+    :raises ConfigurationError: the image does not exist, or is for another processor.
     """
     if kind.arch not in UBUNTU:
         raise ConfigurationError(f'machines of the type {kind.name} run no Ubuntu',
@@ -108,7 +107,7 @@ def choose(
     identity = account.call('ssm', region, 'get_parameter', f'asking for the image {parameter}',
                             Name=parameter)['Parameter']['Value']
     if not kind.nvidia:
-        # what else would be asked of it is known
+        # the other properties are known
         return {'ImageId': str(identity), 'RootDeviceName': ROOT_DEVICE,
                 'Architecture': kind.arch}
     return _named(account, region, kind, str(identity))
@@ -119,7 +118,7 @@ def _named(account: Account, region: str, kind: Kind, identity: str) -> Mapping[
         found = account.call('ec2', region, 'describe_images', f'looking for the image {identity}',
                              ImageIds=[identity])['Images']
     except AwsError as error:
-        if error.code not in GONE:
+        if not error.gone:
             raise
         raise ConfigurationError(str(error.args[0]), error.hint) from error
     if not found:
@@ -139,7 +138,7 @@ def _named(account: Account, region: str, kind: Kind, identity: str) -> Mapping[
 def _baked(
     account: Account, region: str, kind: Kind, options: Options, dependencies: str,
 ) -> Optional[Mapping[str, Any]]:
-    """Return the newest image of ours with the same dependencies, None for none."""
+    """Return the newest image of FogROS2 with the same dependencies, or None."""
     found = account.call(
         'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
         Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
@@ -151,33 +150,29 @@ def _baked(
     return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
 
 
-def bake(
-    account: Account, region: str, instance: Mapping[str, Any], name: str, dependencies: str,
-) -> str:
+def bake(account: Account, vm: Vm, name: str, dependencies: str) -> str:
     """
-    Have EC2 make an image of an instance, without rebooting it, and return our id of it.
+    Make an image of an instance without a reboot, and return its id.
 
-    What was written in the last half minute may be missing, unless the machine was told to
-    ``sync``: its nodes run on.
+    Files of the last half minute may be missing, unless ``sync`` ran on the machine before.
     """
-    own = tags_of(instance)
-    tags = {'Name': name, TAG_BAKED: name, TAG_USER: own.get(TAG_USER, ''),
+    tags = {'Name': name, TAG_BAKED: name, TAG_USER: vm.tags.get(TAG_USER, ''),
             TAG_DEPENDENCIES: dependencies}
     listed = tag_list({key: value for key, value in tags.items() if value})
-    # names are taken once in a region: the second image of a name has another second
+    # names are unique in a region
     stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
     plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
     answer = account.call(
-        'ec2', region, 'create_image', f"making the image '{name}'",
-        InstanceId=instance['InstanceId'], Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
+        'ec2', vm.region, 'create_image', f"making the image '{name}'",
+        InstanceId=vm.id, Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
         Description=f'FogROS2: {plain}',
         TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
                            {'ResourceType': 'snapshot', 'Tags': listed}])
-    return f'aws:{region}/{answer["ImageId"]}'
+    return f'aws:{vm.region}/{answer["ImageId"]}'
 
 
 def images_in(account: Account, region: str) -> Iterator[Image]:
-    """Yield the images that were baked in a region."""
+    """Yield the images of FogROS2 in a region."""
     for entry in account.pages(
             'ec2', region, 'describe_images', 'Images', 'looking for images', Owners=['self'],
             Filters=[{'Name': 'tag-key', 'Values': [TAG_BAKED]}]):
@@ -186,7 +181,7 @@ def images_in(account: Account, region: str) -> Iterator[Image]:
                  for mapping in entry.get('BlockDeviceMappings') or ()]
         state = str(entry.get('State', ''))
         yield Image(
-            f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), PROVIDER, region,
+            f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), 'aws', region,
             created=_when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
             state=_STATES.get(state, state), dependencies=tags.get(TAG_DEPENDENCIES, ''),
             tags=tags)
@@ -202,9 +197,9 @@ def _when(text: Optional[str]) -> Optional[float]:
 
 def delete(account: Account, image_id: str) -> None:
     """
-    Delete an image and its snapshots, those as well that an earlier attempt left.
+    Delete an image and its snapshots, also those that an earlier attempt left.
 
-    :raises MachineNotFound: the id is none of ours.
+    :raises MachineNotFound: the id is not an image's.
     """
     parts = _ID.fullmatch(image_id)
     if parts is None:
@@ -219,7 +214,7 @@ def delete(account: Account, image_id: str) -> None:
     if found and TAG_BAKED not in tags_of(found[0]):
         raise ProviderError(f'{identity} in {region} is no image of FogROS2',
                             'ros2 fog image list shows those that are')
-    # EC2 writes the image's id into the description of each snapshot that it makes for one
+    # EC2 writes the image's id into the description of its snapshots
     snapshots |= {str(entry['SnapshotId']) for entry in account.pages(
         'ec2', region, 'describe_snapshots', 'Snapshots', what, OwnerIds=['self'],
         Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},

@@ -1,99 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Who reaches a machine: its own security group, and where this robot's connections come from.
+A machine's own security group: the firewall that decides who reaches it.
 
-A group per machine, not per launch: the SSH port of one is closed when its VPN carries while
-another's is still needed, and it can be deleted with its machine whatever the others do.
+Each machine has its own group. So a launch can close the SSH port of one machine while it needs
+another's, and the group can be deleted with its machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-import contextlib
-import ipaddress
-import os
-import socket
-import threading
-import time
 from typing import Any
-import urllib.request
 
 from fogros2.errors import ConfigurationError, ProviderError
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError, code_of, GONE
-from fogros2.provider.aws.instances import own_name, tag_list, TAG_SSH_FROM, tags_of
-from fogros2.provider.aws.options import cidr
+from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.aws.instances import tag_list, tags_of
+from fogros2.provider.vm.cloud import own_name, TAG_SSH_FROM
+from fogros2.provider.vm.options import cidr
 from fogros2.waiting import wait_until
 
-#: Names this robot's address (or network) as machines see it, so that nobody is asked.
-ADDRESS_VARIABLE = 'FOGROS2_ROBOT_ADDRESS'
-#: Who tells the address from which we come; AWS's own service unless the variable names another.
-CHECKIP, CHECKIP_VARIABLE = 'https://checkip.amazonaws.com', 'FOGROS2_AWS_CHECKIP'
-#: Seconds for which an address is taken as it is, so that machines of one launch ask once.
-ADDRESS_AGE = 5.0
 SSH = 22
-#: An address of AWS's, and any port.
-FAR_IPV6 = ('2600:1f18::1', 22)
-#: Whom WireGuard's port is open to: robots roam, machines dial each other, and it answers nobody
-#: whose key it doesn't know.
+#: Sources of WireGuard's port: robots and machines roam, and WireGuard answers only known keys.
 ANYONE = {'IpRanges': [{'CidrIp': '0.0.0.0/0'}], 'Ipv6Ranges': [{'CidrIpv6': '::/0'}]}
-
-
-class RobotAddress:
-    """The address that this computer's connections come from, asked for at most every 5 s."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._known = ('', '', 0.0)
-
-    def __call__(self) -> str:
-        """
-        Return it in CIDR form.
-
-        :raises ConfigurationError: the variable that names it makes no sense.
-        :raises ProviderError: nobody tells.
-        """
-        told = os.environ.get(ADDRESS_VARIABLE, '')
-        if told:
-            return cidr(told)
-        url = os.environ.get(CHECKIP_VARIABLE, CHECKIP)
-        with self._lock:
-            address, asked, when = self._known
-            if asked != url or time.monotonic() - when > ADDRESS_AGE:
-                address = self._ask(url)
-                self._known = (address, url, time.monotonic())
-            return address
-
-    def with_ipv6(self, networks: Iterable[str]) -> list[str]:
-        """Return networks, and where this computer was found among them its IPv6 address too."""
-        named = list(networks)
-        own = own_ipv6() if self._known[0] in named else ''
-        return [*named, *([own] if own else [])]
-
-    def _ask(self, url: str) -> str:
-        hint = f'{ADDRESS_VARIABLE}=... names it'
-        try:
-            with urllib.request.urlopen(url, timeout=5.0) as answer:
-                said = answer.read(100).decode('ascii', 'replace').strip()
-            return cidr(str(ipaddress.ip_address(said)))
-        except OSError as error:
-            own = own_ipv6()
-            if own:
-                return own  # a computer without IPv4 reaches nobody who has that alone
-            raise ProviderError(
-                f"{url} does not tell this robot's public address: {error}", hint) from error
-        except ValueError as error:
-            raise ProviderError(f"{url} told no address but '{said[:40]}'", hint) from error
-
-
-def own_ipv6() -> str:
-    """Return the address (CIDR) of this computer's IPv6 connections, '' without; sends nothing."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
-        probe.connect(FAR_IPV6)  # the system chooses a way, and the address that goes with it
-        address = ipaddress.IPv6Address(probe.getsockname()[0])
-        if address.is_global:
-            return f'{address}/128'
-    return ''
 
 
 def rule(protocol: str, port: int, sources: Iterable[str]) -> dict[str, Any]:
@@ -120,15 +48,15 @@ def create_group(
     tags: Mapping[str, str],
 ) -> str:
     """
-    Make a machine's security group and return its id; one of an earlier attempt is taken on.
+    Create a machine's security group and return its id; reuse that of an earlier attempt.
 
     :param vpc: id; '' for the default VPC.
     """
-    place: dict[str, Any] = {'VpcId': vpc} if vpc else {}
+    where: dict[str, Any] = {'VpcId': vpc} if vpc else {}
     try:
         return str(account.call(
             'ec2', region, 'create_security_group', f"making the security group of '{name}'",
-            GroupName=own_name(attempt), Description=f'FogROS2 machine {name}', **place,
+            GroupName=own_name(attempt), Description=f'FogROS2 machine {name}', **where,
             TagSpecifications=[{'ResourceType': 'security-group', 'Tags': tag_list(tags)}],
         )['GroupId'])
     except AwsError as error:
@@ -142,7 +70,7 @@ def open_group(
     sources: Sequence[str],
 ) -> None:
     """
-    Open the ports of a new group: the VPN's, and that of SSH for those who may log in.
+    Open the ports of a new group: the VPN's, and SSH for ``sources``.
 
     :param sources: networks that reach its SSH port.
     """
@@ -171,9 +99,9 @@ def delete_groups(
     account: Account, region: str, groups: Iterable[str], *, timeout: float = 120.0,
 ) -> None:
     """
-    Delete groups; waits until nothing uses them, as an instance does until it is gone.
+    Delete groups; wait until no instance uses them.
 
-    :raises DeadlineExceeded: something uses one still.
+    :raises DeadlineExceeded: an instance still uses a group.
     """
     for group in groups:
         def deleted(group: str = group) -> bool:
@@ -183,7 +111,7 @@ def delete_groups(
             except AwsError as error:
                 if error.code in ('DependencyViolation', 'InvalidGroup.InUse'):
                     return False
-                if code_of(error) not in GONE:
+                if not error.gone:
                     raise
             return True
         wait_until(deleted, timeout=timeout, interval=1.0, longest=5.0,
@@ -195,22 +123,22 @@ def allow(
     account: Account, region: str, attempt: str, port: int, sources: Sequence[str],
 ) -> None:
     """
-    Let ``sources`` reach a TCP port, they alone; none closes it.
+    Let only ``sources`` reach a TCP port; none closes it.
 
-    What the launch file named with ``ssh_from=`` is let in together with anybody else.
+    The networks of ``ssh_from=`` are admitted together with the others.
 
     :raises ProviderError: the machine has no group (any more).
     """
     door = account.doors.pop(attempt, None)
     if door is not None and not sources and port == SSH:
-        # the first change of what this process has made: nothing has to be asked
+        # the first change of a group that this process has created: no look-up is needed
         try:
             account.call('ec2', region, 'revoke_security_group_ingress', f'closing port {port}',
                          GroupId=door[0], IpPermissions=[door[1]])
             return
         except AwsError as error:
             if error.code != 'InvalidPermission.NotFound':
-                raise  # somebody else has changed it meanwhile
+                raise  # another program has changed it
     groups = find_groups(account, region, attempt)
     if not groups:
         raise ProviderError(f'the machine in {region} has no security group any more',

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How long a call to AWS may take: again where that helps, and no longer than a launch wants it.
+Limit the time of a call to AWS: retry if that helps, and stop when the launch ends.
 
-boto3 repeats throttled calls by itself, with pauses of up to 20 s that nothing ends. So who makes
-a call for a launch waits for it beside the launch's cancel, and what is left of it sends nothing.
+boto3 retries throttled calls with pauses of up to 20 s that nothing can end. So the call runs in
+its own thread, and the caller waits for the call or the cancel. An abandoned call sends no more.
 """
 
 from __future__ import annotations
@@ -18,35 +18,34 @@ from fogros2.waiting import cancellable
 
 T = TypeVar('T')
 
-#: AWS took a request for one too many, and did nothing.
+#: AWS refused a request because of its rate, and did nothing.
 THROTTLED = frozenset({
     'RequestLimitExceeded', 'Throttling', 'ThrottlingException', 'RequestThrottled',
     'EC2ThrottledException', 'TooManyRequestsException'})
-#: Attempts of a call to which no answer comes at all.
+#: Attempts of a call without any answer.
 UNANSWERED = 2
-#: Seconds that a request on its way gets to be answered: it may be making something.
+#: Seconds to wait for the answer to a sent request, which may create something.
 ON_ITS_WAY = 4.0
 _here = threading.local()
 
 
 class _Call:
-    """A call under way, from the side of its thread."""
+    """The state of a call in its thread."""
 
     def __init__(self, cancel: threading.Event) -> None:
         self.cancel = cancel
-        #: Whether a request is on its way now, and whether one may have done what it asks for.
+        #: Whether a request has no answer yet, and whether one may have had its effect.
         self.sent = self.unsure = False
 
 
 def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) -> T:
     """
-    Return what ``work`` returns, in a thread of its own that is left alone once ``cancel`` is set.
+    Run ``work`` in its own thread, and abandon it once ``cancel`` is set; return its result.
 
-    A request that is on its way at that moment is waited for a little, and its answer returned:
-    it may have made something.
+    A request without an answer gets a few seconds more, because it may have created something.
 
-    :param cancel: None to wait for the work, however long it takes.
-    :raises Cancelled: ``cancel`` was set first; ``refused`` is set where AWS has done nothing.
+    :param cancel: None to wait for the end of the work.
+    :raises Cancelled: ``cancel`` was set; ``refused`` is True if AWS has done nothing.
     """
     if cancel is None:
         return work()
@@ -65,9 +64,9 @@ def unless(cancel: Optional[threading.Event], work: Callable[[], T], what: str) 
 
 
 def teach(client: Any) -> None:
-    """Have a boto3 client obey its caller's cancel, and not ask in vain."""
+    """Let a boto3 client observe its caller's cancel, and retry only if that helps."""
     service = client.meta.service_model.service_id.hyphenize()
-    # last: what limits the rate waits in such a handler as well
+    # last: the rate limit also waits in such a handler
     client.meta.events.register_last('before-send', _sending)
     client.meta.events.register_first(f'needs-retry.{service}', _answered)
 
@@ -84,11 +83,10 @@ def _answered(
     response: Any, attempts: int, caught_exception: Optional[BaseException], **_: Any,
 ) -> None:
     """
-    Keep botocore from asking again where that doesn't help; called before its own decision.
+    Keep botocore from useless retries; called before its own decision.
 
-    Throttling takes patience; but without a way to AWS a user would wait for minutes to hear of
-    it. And EC2 says with status 500, which botocore takes for a fault that passes in a moment,
-    that it has no machine left: the next zone may have.
+    Without a network, a user would wait for minutes. And EC2 reports missing capacity with status
+    500, which botocore treats as a temporary fault; the next zone may have capacity.
     """
     call: Optional[_Call] = getattr(_here, 'call', None)
     http = response[0] if response else None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an instance finds out that AWS takes it back."""
+"""The command that reads a spot instance's preemption notice on the instance."""
 
-# Runs on the machine every few seconds; asks AWS's metadata service there, with a token. By a
-# plain socket: the library for it takes five times as long to load as this to run.
+# Runs every few seconds; reads AWS's metadata service with a token. It uses a socket, because an
+# HTTP library takes five times as long to load as this takes to run.
 _PROGRAM = """\
 import socket, sys
 def ask(method, path, head):
@@ -21,5 +21,5 @@ try:
 except OSError:
     sys.exit(1)
 """
-#: The command line whose success is the notice, and whose output says when.
+#: Its success is the notice, and its output has the time.
 NOTICE = ('python3', '-ISc', _PROGRAM, '169.254.169.254', '80')

@@ -1,5 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pods as machines: a Job each, which owns the pod and its Service and ends both by deadline."""
+"""
+Run machines as pods: a Job for each, which owns the pod and its Service, and ends both in time.
+
+``options`` parses what a launch file asks for, ``names`` has names, ids and tags. ``boot`` is the
+first process of a pod, ``manifests`` describes Job, pod and Service. ``hints`` explains refusals,
+``pods`` reads the state of Jobs and pods, ``start`` waits for a pod. ``exposure`` and ``ways``
+find how UDP reaches the pod, ``publishing`` opens TCP ports, ``ending`` deletes everything.
+``image`` builds images.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +23,22 @@ from fogros2.errors import (
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
-    ProviderError,
 )
 from fogros2.kubernetes_client import Api, ApiError, items, path, selector
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Provider, TAG_ON_EXIT
+from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
+from fogros2.provider.kubernetes.hints import refused
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.start import Start
 
 _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
-#: Seconds for which an API server is waited for before anything has begun.
+#: Time-out of an API server that does not answer at the start, in seconds.
 _FIRST = 5.0
 #: Label of every node.
 _ARCHITECTURE = 'kubernetes.io/arch'
-#: Seconds for which rights that were there, and pods that were let in, are not tried again.
+#: Seconds for which rights and admissions are not checked again.
 _SURE = 30.0
 
 
@@ -38,43 +46,42 @@ class KubernetesProvider(Provider):
     """Pods of the cluster that the kubeconfig names."""
 
     name: ClassVar[str] = 'kubernetes'
-    #: Not within a pod that may do no more than WireGuard takes.
-    runs_containers = False
-    shell_kind: ClassVar[str] = 'kubernetes'
-    application_port: ClassVar[int] = manifests.APPLICATION_PORT
-    look_interval: ClassVar[float] = 1.0
-    notice: ClassVar[tuple[str, ...]] = boot.NOTICE_COMMAND
+    #: A pod has only the rights that WireGuard needs.
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        shell_kind='kubernetes', containers=False, application_port=manifests.APPLICATION_PORT,
+        preemption_notice=boot.NOTICE_COMMAND)
+    poll_interval: ClassVar[float] = 1.0
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._reviewing = threading.Lock()
         self._trying = threading.Lock()
-        #: When pods of a kind were last let in, by where and what they ask for.
+        #: When the cluster last admitted a pod, by its namespace and what it asks for.
         self._admitted: dict[str, float] = {}
-        #: When it was found that this user has all rights, by context and namespace.
+        #: When this user last had all rights, by context and namespace.
         self._reviewed: dict[tuple[str, str], float] = {}
-        #: Contexts and namespaces that launch files have named.
+        #: Contexts and namespaces in launch files.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
-        #: Jobs as they were made here, so that nobody has to ask for them.
+        #: Jobs that this process created, which saves requests.
         self._made: dict[str, dict[str, Any]] = {}
         self._services: dict[str, Optional[dict[str, Any]]] = {}
-        #: Uid of the pod that was found at first: another one of the same Job isn't the machine.
+        #: Uid of the first pod; a later pod of the same Job is not the machine.
         self._pods: dict[str, str] = {}
 
     @classmethod
     def configured(cls) -> bool:
-        """Return whether there is a kubeconfig, or this is a pod that may use the API."""
+        """Return whether there is a kubeconfig, or this pod may use the API."""
         return kubernetes_client.configured()
 
     def answers(self) -> str:
-        """Return the API server's version and the namespace that is used."""
+        """Return the API server's version and the used namespace."""
         api = kubernetes_client.connect()
-        version = api.request('GET', '/version', patience=_FIRST)
+        version = api.request('GET', '/version', timeout=_FIRST)
         return f"{api.server} answers, {version.get('gitVersion')}, namespace '{api.namespace}'"
 
     def check(self, spec: MachineSpec) -> None:
-        """Look at the options, and ask the cluster what this user may do there."""
+        """Check the options, and this user's rights in the cluster."""
         options = Options.parse(spec.options)
         if spec.on_exit == 'stop':
             raise ConfigurationError(
@@ -85,16 +92,16 @@ class KubernetesProvider(Provider):
         self._check_rights(api, namespace)
 
     def _check_rights(self, api: Api, namespace: str) -> None:
-        """Ask once for the machines of a launch what this user may do."""
+        """Check this user's rights, once for all machines of a launch."""
         with self._reviewing:
             when = self._reviewed.get((api.context, namespace))
             if when is not None and time.monotonic() - when < _SURE:
                 return
             review = api.request(
-                'POST', _REVIEW, {'spec': {'namespace': namespace}}, patience=_FIRST)
+                'POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
             status = review.get('status') or {}
             lacking = hints.missing_rights(status.get('resourceRules') or ())
-            # a cluster whose authorizer can't list all rules says so, and its refusals come later
+            # If the authorizer cannot list all rules, the requests themselves show what lacks.
             if lacking and not status.get('incomplete'):
                 raise PrerequisiteError(
                     f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
@@ -102,23 +109,23 @@ class KubernetesProvider(Provider):
             self._reviewed[api.context, namespace] = time.monotonic()
 
     def architecture(self, spec: MachineSpec) -> str:
-        """Return what ``node_selector`` says, or what all nodes have that carry its labels."""
+        """Return the architecture in ``node_selector``, or of all nodes with its labels."""
         options = Options.parse(spec.options)
         api, _ = self._place(options)
         found = {options.node_selector.get(_ARCHITECTURE, '')}
         if found == {''}:
-            # by the rights of most users, nodes can't be listed
+            # Most users may not list nodes.
             with contextlib.suppress(ApiError):
                 nodes = items(api.request(
                     'GET', path('nodes'), labelSelector=selector(options.node_selector),
-                    patience=_FIRST, cancel=self.cancel))
+                    timeout=_FIRST, cancel=self.cancel))
                 found = {str((node['metadata'].get('labels') or {}).get(_ARCHITECTURE, ''))
                          for node in nodes}
         (arch,) = found if len(found) == 1 else ('',)
         return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(arch, '')
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Try the pod's admission, then make the Job and what leads UDP to it."""
+        """Check the pod's admission by a dry run, then create the Job and its Service."""
         options = Options.parse(spec.options)
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
@@ -126,15 +133,15 @@ class KubernetesProvider(Provider):
         try:
             self._try_admission(api, namespace, spec, request, options)
         except ApiError as error:
-            # the first attempt with this token may have used the quota up
+            # The first attempt with this token may have used the quota.
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
-                raise _refused(error, f"the pod of '{spec.name}'", namespace) from error
+                raise refused(error, f"the pod of '{spec.name}'", namespace) from error
         job = existing or self._make_job(api, namespace, spec, request, options)
         machine_id = str(MachineId(namespace, str(job['metadata']['name']),
                                    str(job['metadata']['uid']), api.context))
         try:
-            service = ways.make(api, namespace, spec, request, options, job)
+            service = ways.make(api, namespace, spec, request, options, job, self.cancel)
         except BaseException:
             self.destroy(machine_id)
             raise
@@ -146,13 +153,13 @@ class KubernetesProvider(Provider):
         self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
         options: Options,
     ) -> None:
-        """Try whether the pod would be let in, once for those that differ by their names alone."""
+        """Check the pod's admission, once for all pods that differ only by their names."""
         kind = f'{api.context} {namespace} {request.dependencies} {options}'
         with self._trying:
             if time.monotonic() - self._admitted.get(kind, -_SURE) < _SURE:
                 return
             api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
-                        dryRun='All', cancel=request.cancel)
+                        dryRun='All', cancel=self.cancel)
             self._admitted[kind] = time.monotonic()
 
     def _make_job(
@@ -161,10 +168,10 @@ class KubernetesProvider(Provider):
     ) -> dict[str, Any]:
         try:
             return api.request('POST', path('jobs', namespace),
-                               manifests.job(spec, request, options), cancel=request.cancel)
+                               manifests.job(spec, request, options), cancel=self.cancel)
         except ApiError as error:
             if error.reason != 'AlreadyExists':
-                raise _refused(error, f"the Job of '{spec.name}'", namespace) from error
+                raise refused(error, f"the Job of '{spec.name}'", namespace) from error
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
                 raise NameTaken(
@@ -175,20 +182,19 @@ class KubernetesProvider(Provider):
     def _existing(
         self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
     ) -> Optional[dict[str, Any]]:
-        """Return the Job that an earlier attempt with this token has made."""
+        """Return the Job that an earlier attempt with this token created."""
         with contextlib.suppress(ApiError):
             found = api.request('GET', path('jobs', namespace, names.job_name(spec.name)),
-                                cancel=request.cancel)
+                                cancel=self.cancel)
             if names.annotation(found, names.ATTEMPT) == request.token:
                 return found
         return None
 
-    def reachable(
-        self, machine_id: str, *, name: str, timeout: float, cancel: threading.Event,
-    ) -> Machine:
-        """Watch the pod until it runs, then find the way that UDP takes to it."""
+    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
+        """Wait until the pod runs, then find how UDP reaches it."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)
+        cancel = self.cancel or threading.Event()
         begin = time.monotonic()
         job = self._made.get(machine_id) or self._job(api, where)
         pod = Start(api, where, job, name=name).wait(timeout=timeout, cancel=cancel)
@@ -199,17 +205,17 @@ class KubernetesProvider(Provider):
             exposure = ways.find(
                 api, where, job, pod, service=self._services.get(machine_id), cancel=cancel,
                 timeout=max(1.0, timeout - (time.monotonic() - begin)))
-            change.update(manifests.exposure_patch({names.EXPOSURE: str(exposure)}))
+            change['metadata'] = {'annotations': {names.EXPOSURE: str(exposure)}}
             job = merged(job, change)
         if change and names.tags_of(job).get(TAG_ON_EXIT) == 'keep':
-            # for launches to come; the others know it
+            # Later launches read it.
             with _translated(f"the Job of '{name}'", where.namespace):
                 job = api.request(
                     'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
         return self._machine(api, where, job, pod)
 
     def _again(self, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the change by which a machine that was kept lives for another lifetime."""
+        """Return the change that gives a kept machine another lifetime."""
         lifetime = self._lifetimes.get(str(job['metadata']['name']))
         begun = (job.get('status') or {}).get('startTime')
         if machine_id in self._made or lifetime is None or not begun:
@@ -218,7 +224,7 @@ class KubernetesProvider(Provider):
         return {'spec': {'activeDeadlineSeconds': int(age + lifetime) + 1}}
 
     def describe(self, machine_id: str) -> Machine:
-        """Return what the cluster knows of a machine now."""
+        """Return the state of a machine, from the cluster."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)
         job = self._job(api, where)
@@ -229,7 +235,7 @@ class KubernetesProvider(Provider):
         return self._machine(api, where, job, pod)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
-        """Yield the Jobs that carry all of ``tags``, in all namespaces if that is allowed."""
+        """Yield the Jobs with all of ``tags``, in all namespaces if the user may list them."""
         contexts = {'', *(context for context, _ in self._places)}
         seen: set[str] = set()
         for context in sorted(contexts):
@@ -262,10 +268,10 @@ class KubernetesProvider(Provider):
                 yield namespace, list(items(self._ask(api, 'jobs', namespace, labels)))
 
     def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
-        return api.request('GET', path(kind, namespace), labelSelector=labels, patience=_FIRST)
+        return api.request('GET', path(kind, namespace), labelSelector=labels, timeout=_FIRST)
 
     def destroy(self, machine_id: str) -> None:
-        """Delete the Job; returns when it, its pod and its Service are gone."""
+        """Delete the Job; return when Job, pod and Service are deleted."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)
         for known in (self._made, self._services, self._pods):
@@ -273,7 +279,7 @@ class KubernetesProvider(Provider):
         with _translated(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
 
-    def publish(
+    def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],
     ) -> tuple[str, int]:
         """Make a Service for a TCP port, or remove it; loads what it takes when asked alone."""
@@ -286,9 +292,9 @@ class KubernetesProvider(Provider):
         pod = pods.pod_of(self._job(api, where), self._pods_of(api, where))
         if pod is None:
             raise MachineNotFound(f"the pod of '{where.job}' is gone")
-        return publishing.publish(api, where, machine, pod, port, sources, self.cancel)
+        return publishing.open_port(api, where, machine, pod, port, sources, self.cancel)
 
-    # -- what all of them need ------------------------------------------------------------------
+    # -- shared by the methods above ------------------------------------------------------------
 
     def _place(self, options: Options) -> tuple[Api, str]:
         api = kubernetes_client.connect(options.context)
@@ -303,7 +309,7 @@ class KubernetesProvider(Provider):
         except ApiError as error:
             if error.status == 404:
                 raise MachineNotFound(f"'{where.job}' does not exist any more") from error
-            raise _refused(error, f"reading '{where.job}'", where.namespace) from error
+            raise refused(error, f"reading '{where.job}'", where.namespace) from error
         if job['metadata']['uid'] != where.uid:
             raise MachineNotFound(f"'{where.job}' does not exist any more")
         return job
@@ -334,15 +340,15 @@ class KubernetesProvider(Provider):
             shell=shell, vpn_host=address if exposure is None else exposure.host,
             vpn_port=0 if exposure is None else exposure.port,
             robot_host=ways.robot_host(api, job),
-            inner_network=f'kubernetes {api.server}', inner_host=address,
-            place=f'{where.context}/{where.namespace}'.lstrip('/'), kind=kind_of(job),
+            private_network=f'kubernetes {api.server}', private_ip=address,
+            region=f'{where.context}/{where.namespace}'.lstrip('/'), kind=kind_of(job),
             image=str(container_of(job)['image']),
             tags=tags, end_command=boot.END_COMMAND,
             note='' if exposure is None else exposure.words())
 
 
 def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a Job with other annotations, as the cluster would return it."""
+    """Return a Job with changed annotations, as the cluster would return it."""
     meta = job['metadata']
     notes = {**(meta.get('annotations') or {}),
              **((change.get('metadata') or {}).get('annotations') or {})}
@@ -350,23 +356,17 @@ def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def container_of(job: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the first container of a machine's pod, as the Job describes it."""
+    """Return the first container of a machine's pod, from its Job."""
     container: Mapping[str, Any] = job['spec']['template']['spec']['containers'][0]
     return container
 
 
 def kind_of(job: Mapping[str, Any]) -> str:
-    """Return what a machine is in a few words: what it may use, and its image."""
+    """Describe a machine in a few words: its resource limits and its image."""
     container = container_of(job)
     limits = (container.get('resources') or {}).get('limits') or {}
     words = [f'{value} {name}' for name, value in sorted(limits.items())]
     return ', '.join([*words, str(container['image']).rpartition('/')[2]])
-
-
-def _refused(error: ApiError, what: str, namespace: str) -> ProviderError:
-    message = str(error.args[0])
-    return ProviderError(f'the cluster refused {what}: {message}',
-                         error.hint or hints.of_refusal(message, namespace))
 
 
 @contextlib.contextmanager
@@ -374,4 +374,4 @@ def _translated(what: str, namespace: str) -> Iterator[None]:
     try:
         yield
     except ApiError as error:
-        raise _refused(error, what, namespace) from error
+        raise refused(error, what, namespace) from error

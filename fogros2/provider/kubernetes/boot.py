@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a pod runs as its first process.
+The first process of a pod.
 
-It makes the login user, answers the robot's question whether UDP gets through, and ends the pod
-when nobody guards it: when no agent has come in time, or one has died without leaving. An agent
-that leaves as it was told (a machine that is kept) takes its folder with it; the Job's deadline
-ends such a pod.
+It creates the login user, answers the robot's probes for UDP, and is the pod's watchdog: it ends
+the pod if no agent starts in time, or if an agent dies. An agent that a launch stops (for a
+machine that is kept) deletes its folder; then the Job's deadline ends the pod.
 """
 
 from __future__ import annotations
 
-#: Written when the cluster is about to take the pod away.
+#: File with the preemption notice: the cluster is about to end the pod.
 NOTICE = '/run/fogros2-notice'
-#: The agent's command that ends the machine. SIGTERM is the cluster's word for it, and leaves the
-#: nodes some time; this one doesn't.
+#: The agent's command that ends the machine at once. SIGTERM, which the cluster sends, leaves the
+#: nodes some time.
 END_COMMAND = ('sh', '-c', 'kill -s USR1 1')
-#: Exits with 0 once the cluster has said that it takes the pod away.
+#: Exits with 0 after the preemption notice.
 NOTICE_COMMAND = ('cat', NOTICE)
-#: Seconds that a pod is given to move its nodes when the cluster takes it away.
+#: Seconds that a pod has to move its nodes when the cluster ends it.
 GRACE = 30
-#: Uid of the login user where the image has none of its name; free in Debian's and Ubuntu's.
+#: Uid of the login user if the image does not have it; unused in Debian and Ubuntu.
 UID = 1729
 
-#: Answers each datagram that begins with the word it was given, until an agent comes, which will
-#: need the port for the VPN.
+#: Answers each datagram that begins with its word, until an agent starts, which needs the port for
+#: the VPN.
 ECHO = """\
 import os, socket, sys, time
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -39,7 +38,7 @@ while time.monotonic() < last and not os.listdir('/run/fogros2'):
         pass
 """
 
-#: TCP port at which a pod with a second container shows that its first one lives.
+#: TCP port for the liveness probe of a pod's second container.
 ALIVE_PORT = 7398
 ALIVE = f"""\
 import socket
@@ -49,25 +48,25 @@ while True:
 """
 
 SCRIPT = r"""
-user=$1 patience=$2 port=$3 word=$4 listen=$5 echo=$6 alive=$7
+user=$1 timeout=$2 port=$3 word=$4 listen=$5 echo=$6 alive=$7
 agents=/run/fogros2 notice=/run/fogros2-notice grace=@GRACE@ uid=@UID@
-# without a process of its own: this is asked each second, in each pod of a node
+# without a new process, because each pod of a node calls this each second
 clock() { read -r now _ </proc/uptime; now=${now%.*}; }
 ended() { trap '' TERM USR1; echo "$1"; kill -s TERM -1 2>/dev/null; exit "$2"; }
-guarded() {
+find_agent() {
     state=none
     for folder in "$agents"/*/; do
         [ -d "$folder" ] || continue
         state=orphaned
         if read -r pid <"$folder/agent.pid" && [ -d "/proc/$pid" ]; then
-            state=guarded
+            state=agent
             return
         fi
     done 2>/dev/null
 }
 taken() {
-    guarded
-    [ "$state" = guarded ] || ended 'ended by the cluster' 0
+    find_agent
+    [ "$state" = agent ] || ended 'ended by the cluster' 0
     [ "$last" = never ] || return
     clock
     last=$((now + grace))
@@ -97,22 +96,22 @@ fi
 clock
 since=$now before=none
 while :; do
-    guarded
+    find_agent
     clock
     case $state in
-    guarded)
-        since=$now before=guarded ;;
+    agent)
+        since=$now before=agent ;;
     orphaned)
         [ "$since" != never ] || since=$now
         before=orphaned ;;
     none)
-        # one that was here has left as it was told
+        # the launch has stopped the agent
         [ "$before" = none ] || since=never ;;
     esac
-    if [ "$since" != never ] && [ $((now - since)) -ge "$patience" ]; then
-        ended "no agent guards this pod for $patience s" 3
+    if [ "$since" != never ] && [ $((now - since)) -ge "$timeout" ]; then
+        ended "no agent runs in this pod for $timeout s" 3
     fi
-    if [ "$last" != never ] && { [ "$now" -ge "$last" ] || [ "$state" != guarded ]; }; then
+    if [ "$last" != never ] && { [ "$now" -ge "$last" ] || [ "$state" != agent ]; }; then
         ended 'ended by the cluster' 0
     fi
     sleep 1 & wait $!
@@ -121,16 +120,16 @@ done
 
 
 def arguments(
-    user: str, patience: float, port: int, word: str, listen: float, *, alive: bool = False,
+    user: str, timeout: float, port: int, word: str, listen: float, *, alive: bool = False,
 ) -> list[str]:
     """
     Return the pod's command.
 
-    :param patience: seconds for which nobody need guard the pod.
-    :param port: UDP port on which the robot's question is answered, 0 for none.
-    :param word: what a question begins with; others get no answer.
-    :param listen: seconds for which questions are answered at the most.
+    :param timeout: seconds for which the pod waits for an agent.
+    :param port: UDP port for the robot's probes, 0 for none.
+    :param word: first word of the probes; others are not answered.
+    :param listen: seconds for which probes are answered.
     :param alive: whether another container of the pod probes this one.
     """
-    return ['/bin/sh', '-c', SCRIPT, 'fogros2', user, str(max(1, round(patience))), str(port),
+    return ['/bin/sh', '-c', SCRIPT, 'fogros2', user, str(max(1, round(timeout))), str(port),
             word, f'{listen:g}', ECHO, ALIVE if alive else '']

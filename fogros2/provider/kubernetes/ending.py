@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ending a machine: its Job, which takes pod and Service along, and waiting until all are gone."""
+"""Delete a machine's Job, which owns pod and Service, and wait until all are deleted."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from fogros2.kubernetes_client import Api, ApiError, items, path, selector
 from fogros2.provider.kubernetes import boot, names, pods
 from fogros2.provider.kubernetes.names import MachineId
 
-#: Seconds that a pod is given when the robot ends it: its nodes have ended before.
+#: Grace period of a pod that the robot deletes, in seconds: its nodes have ended before.
 GRACE = 1
-#: Seconds in which everything of a machine has to be gone.
+#: Time-out of the deletion, in seconds.
 GONE = 120.0
-#: Seconds after which a pod is looked for that the Job has made at the last moment.
+#: Seconds after which to look for a pod that the Job created at the last moment.
 AGAIN = 1.5
 
 
 def end(api: Api, where: MachineId) -> None:
     """
-    Delete a machine's Job; return when it, its pod and its Service are gone; idempotent.
+    Delete a machine's Job; return when Job, pod and Service are deleted; idempotent.
 
-    :raises ApiError: the cluster refuses.
-    :raises DeadlineExceeded: something stays.
+    :raises ApiError: the cluster refused.
+    :raises DeadlineExceeded: something was not deleted in time.
     """
     target = path('jobs', where.namespace, where.job)
     try:
@@ -35,7 +35,7 @@ def end(api: Api, where: MachineId) -> None:
             'kind': 'DeleteOptions', 'apiVersion': 'v1', 'propagationPolicy': 'Foreground',
             'preconditions': {'uid': where.uid}}, doubt=kubernetes_client.DOUBT)
     except ApiError as error:
-        # gone, or gone and another of the name in its place
+        # The Job does not exist, or another Job has its name.
         if error.status in (404, 409):
             return
         raise
@@ -67,15 +67,15 @@ def end(api: Api, where: MachineId) -> None:
 
 def _end_pods(api: Api, where: MachineId) -> None:
     """
-    End the pods of a Job that is being deleted, quicker than the cluster would.
+    End the pods of a Job that is being deleted, faster than the cluster does.
 
-    Not those of another Job that has the name by now: clusters label pods with their Job's uid.
+    The label with the Job's uid excludes the pods of a later Job with the same name.
     """
     target = path('pods', where.namespace)
     labels = selector({names.MACHINE: where.job, names.JOB_UID: where.uid})
 
     def delete(grace: int) -> list[dict[str, Any]]:
-        # without a say the pod has the time that it gets when the cluster takes it away
+        # By default, a pod gets the time to move its nodes.
         return list(items(api.request('DELETE', target, {
             'kind': 'DeleteOptions', 'apiVersion': 'v1', 'gracePeriodSeconds': grace},
             labelSelector=labels)))
@@ -100,14 +100,14 @@ def _end_pods(api: Api, where: MachineId) -> None:
         api.follow(target, look, again=again, timeout=GONE, labelSelector=labels,
                    what=f"the pod of '{where.job}' to end")
     if found:
-        # nothing runs in it any more; the node would take seconds to tidy up first
+        # Nothing runs in the pods; the node would need seconds to clean up.
         delete(0)
 
 
 def _tell(api: Api, pod: Mapping[str, Any]) -> None:
-    """Have a pod end itself: it may be in the time it was given to move its nodes."""
+    """Ask a pod to end itself: it may be waiting for its nodes to move."""
     meta = pod['metadata']
-    # where it doesn't hear us, the node ends it
+    # If the request does not reach the pod, the node ends it.
     with contextlib.suppress(ProviderError):
         api.execute(path('pods', str(meta['namespace']), str(meta['name']), 'exec'),
                     names.CONTAINER, boot.END_COMMAND, timeout=2.0)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How WireGuard's UDP gets from the robot to a pod.
+Find how WireGuard's UDP gets from the robot to a pod.
 
-A load balancer, a port of the nodes, or, where neither lets UDP through, the pod dials the robot.
-WireGuard answers nobody it doesn't know, so the pod answers a question of ours on that port until
-its agent comes: what answers is known to work.
+By a load balancer, by a port of the nodes, or, if neither lets UDP through, the pod connects to
+the robot. WireGuard does not answer unknown peers, so until its agent starts, the pod answers
+probes on that port: an address that answers is known to work.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from urllib.parse import urlsplit
 
 from fogros2.errors import Cancelled
 
-#: Seconds between two questions.
+#: Seconds between two probes.
 INTERVAL = 0.1
-#: Questions to one place that may still be answered.
+#: Number of probes to one address that may still be answered.
 ROUNDS = 10
-#: Seconds in which a load balancer has to be there, and to answer: clouds take minutes.
+#: Time-out of a load balancer's creation and first answer, in seconds: clouds need minutes.
 LOAD_BALANCER = 180.0
-#: The same where it is made within the cluster: some of those who could are switched off.
+#: The same for load balancers that the cluster itself makes, which may be switched off.
 LOAD_BALANCER_INSIDE = 60.0
-#: Seconds in which a port of a node that is going to answer does.
+#: Time-out of a node port's first answer, in seconds.
 NODE_PORT = 6.0
 
-#: Names of API servers that tell whose cluster it is, and that it makes load balancers.
+#: Host names of API servers of clouds that make load balancers.
 _SERVERS = {r'\.eks\.amazonaws\.com(\.cn)?$': 'EKS', r'\.azmk8s\.io$': 'AKS',
             r'\.gke\.goog$': 'GKE', r'\.k8s\.ondigitalocean\.com$': 'DigitalOcean'}
-#: Ends of API groups that tell the same, and of what makes them in clusters of one's own.
+#: Suffixes of API groups of these clouds, and of load balancers for other clusters.
 _GROUPS = {'metallb.io': 'MetalLB', 'purelb.io': 'PureLB', 'loxilb.io': 'LoxiLB',
            'gke.io': 'GKE', 'k8s.aws': 'EKS', 'amazonaws.com': 'EKS', 'azmk8s.io': 'AKS',
            'k3s.cattle.io': 'k3s'}
-#: Those who make them without a cloud.
+#: Load balancers without a cloud.
 _INSIDE = ('MetalLB', 'PureLB', 'LoxiLB', 'k3s')
 
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
     """
-    The way that was found.
+    How UDP reaches a pod.
 
     :param kind: one of ``options.EXPOSURES``.
-    :param host: where the robot reaches the pod, '' where the pod dials the robot.
-    :param port: UDP port there, 0 for the VPN's own.
-    :param why: in a few words, for people.
+    :param host: address of the pod for the robot, '' if the pod connects to the robot.
+    :param port: UDP port, 0 for the VPN's own.
+    :param why: the reason, for people.
     """
 
     kind: str
@@ -65,12 +65,12 @@ class Exposure:
         return f'{self.kind} {self.host or "-"} {self.port} {self.why}'
 
     def words(self) -> str:
-        """Return which way was taken and why, for people."""
+        """Describe the exposure and its reason, for people."""
         return f'UDP by {self.kind}: {self.why}' if self.why else f'UDP by {self.kind}'
 
     @classmethod
     def parse(cls, text: str) -> Optional[Exposure]:
-        """Return what ``str`` has written down, None if it is no such text."""
+        """Parse the result of ``str``; return None for another text."""
         words = text.split(' ', 3)
         if len(words) < 3 or not words[2].isdigit():
             return None
@@ -80,12 +80,12 @@ class Exposure:
 
 def load_balancers(server: str, groups: Iterable[str] = ()) -> str:
     """
-    Return who makes load balancers in a cluster, '' if nobody is known to.
+    Return the name of what makes load balancers in a cluster, '' if nothing is known to.
 
-    Asking for one where nobody makes any means waiting in vain.
+    Without it, a Service of type LoadBalancer would never get an address.
 
-    :param server: URL of its API server.
-    :param groups: the API groups it has.
+    :param server: URL of the API server.
+    :param groups: API groups of the cluster.
     """
     host = urlsplit(server).hostname or ''
     for pattern, name in _SERVERS.items():
@@ -95,25 +95,25 @@ def load_balancers(server: str, groups: Iterable[str] = ()) -> str:
                  if group == end or group.endswith(f'.{end}')), '')
 
 
-def patience(maker: str) -> float:
-    """Return the seconds for which a load balancer is waited for, by who makes it."""
+def timeout(maker: str) -> float:
+    """Return the time-out of a load balancer in seconds, by what makes it."""
     return LOAD_BALANCER_INSIDE if maker in _INSIDE else LOAD_BALANCER
 
 
 def ingress(service: Mapping[str, Any]) -> list[str]:
-    """Return the addresses and names of a load balancer, once it has some."""
+    """Return the addresses and host names of a load balancer; none before it is ready."""
     found = ((service.get('status') or {}).get('loadBalancer') or {}).get('ingress') or ()
     return [str(each.get('ip') or each.get('hostname')) for each in found
             if each.get('ip') or each.get('hostname')]
 
 
 def node_port(service: Mapping[str, Any]) -> int:
-    """Return the port of the nodes that leads to the pod, 0 if there is none."""
+    """Return the node port of a Service, 0 if it has none."""
     return int(service['spec']['ports'][0].get('nodePort') or 0)
 
 
 def node_addresses(node: Mapping[str, Any]) -> list[str]:
-    """Return a node's addresses, those for outside first."""
+    """Return a node's addresses, external ones first."""
     found = (node.get('status') or {}).get('addresses') or ()
     order = ('ExternalIP', 'InternalIP')
     return [str(each['address']) for kind in order for each in found if each['type'] == kind]
@@ -126,7 +126,7 @@ def first_to_answer(
     """
     Return the first of several (host, port) at which the pod answers, None if none does.
 
-    :param word: what the pod listens for.
+    :param word: first word of the probes; the pod answers no others.
     :raises Cancelled: ``cancel`` was set.
     """
     question = word.encode() + b' ' + secrets.token_hex(8).encode()
@@ -137,14 +137,14 @@ def first_to_answer(
         while known and time.monotonic() < deadline:
             if cancel is not None and cancel.is_set():
                 raise Cancelled('looking for a way into the cluster')
-            # From a port of its own each time: the node remembers what became of the first
-            # datagram of a pair of ports, and that may have been before it knew the pod.
+            # Each probe has a new source port: a node forwards all datagrams of a connection as
+            # the first one, which it may have received before it knew the pod.
             for place in known:
                 with contextlib.suppress(OSError):
                     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                     links[link] = place
                     link.setblocking(False)
-                    link.connect(place)  # another's datagram isn't taken for an answer
+                    link.connect(place)  # receive datagrams only from this address
                     link.send(question)
             begin = time.monotonic()
             while (left := begin + INTERVAL - time.monotonic()) > 0:
@@ -154,7 +154,7 @@ def first_to_answer(
                     with contextlib.suppress(OSError):
                         if link.recv(512) == question:
                             return place
-                    # refused, by a node that isn't ready
+                    # A node that is not ready refused the datagram.
                     del links[link]
                     link.close()
             for link in list(links)[:-ROUNDS * len(known)]:
@@ -167,7 +167,7 @@ def first_to_answer(
 
 
 def _resolved(places: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return places by address, without those whose name nobody knows (yet)."""
+    """Return places by address, without unknown host names."""
     found = []
     for host, port in places:
         with contextlib.suppress(OSError):
@@ -177,7 +177,7 @@ def _resolved(places: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
 
 
 def own_address(server: str) -> str:
-    """Return the address from which this computer speaks with an API server, '' if it can't."""
+    """Return this computer's address on the way to an API server, '' if there is no route."""
     parts = urlsplit(server)
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.connect((parts.hostname or '', parts.port or 443))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cluster's refusals mean, and what to do about them; pure."""
+"""Explain a cluster's refusals, with remedies; pure."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import re
 from typing import Any
 
+from fogros2.errors import ProviderError
+from fogros2.kubernetes_client import ApiError
+
 #: API group, resource, verbs.
 Right = tuple[str, str, tuple[str, ...]]
-#: What a robot has to be allowed, as in deploy/kubernetes/role.yaml.
+#: The rights that a robot needs, as in deploy/kubernetes/role.yaml.
 RIGHTS: tuple[Right, ...] = (
     ('batch', 'jobs', ('create', 'get', 'list', 'watch', 'patch', 'delete')),
     ('', 'pods', ('create', 'get', 'list', 'watch', 'deletecollection')),
@@ -25,7 +28,7 @@ _FORBIDDEN = re.compile(
 
 def of_refusal(message: str, namespace: str) -> str:
     """
-    Return the remedy for what the API server, or one of its admission plugins, said.
+    Return the remedy for a refusal by the API server or by an admission plugin.
 
     >>> of_refusal('pods "x" is forbidden: violates PodSecurity "baseline:latest"', 'robots')[:21]
     'a VPN takes NET_ADMIN'
@@ -65,13 +68,24 @@ def of_refusal(message: str, namespace: str) -> str:
     return ''
 
 
+def refused(error: ApiError, what: str, namespace: str) -> ProviderError:
+    """
+    Return the error for a refusal by the API server, with the remedy.
+
+    :param what: completes 'the cluster refused ...'.
+    """
+    message = str(error.args[0])
+    return ProviderError(f'the cluster refused {what}: {message}',
+                         error.hint or of_refusal(message, namespace))
+
+
 def missing_rights(
     rules: Iterable[Mapping[str, Any]], rights: Sequence[Right] = RIGHTS,
 ) -> list[str]:
     """
-    Return what a user may not do though a robot needs it, such as 'create pods/exec'.
+    Return the rights that a robot needs and a user lacks, such as 'create pods/exec'.
 
-    :param rules: ``resourceRules`` of a SelfSubjectRulesReview's answer.
+    :param rules: ``resourceRules`` of the answer to a SelfSubjectRulesReview.
     """
     allowed = [rule for rule in rules if not rule.get('resourceNames')]
 
@@ -89,11 +103,11 @@ def missing_rights(
             if not may(group, resource, verb)]
 
 
-def of_scheduling(message: str, gpu_resource: str = 'nvidia.com/gpu') -> str:
-    """Return the remedy for a pod that fits on no node."""
+def of_scheduling(message: str) -> str:
+    """Return the remedy for a pod that fits no node."""
     hints = []
-    if f'Insufficient {gpu_resource}' in message:
-        hints.append(f'no node has enough free {gpu_resource}: is its device plugin installed, '
+    if gpu := re.search(r'Insufficient (\S+/\w+)', message):
+        hints.append(f'no node has enough free {gpu[1]}: is its device plugin installed, '
                      'or another gpu_resource= right?')
     if re.search(r'Insufficient (cpu|memory|pods|ephemeral)', message):
         hints.append('ask for less (mcpu=, mb=), or add a node')
@@ -105,7 +119,7 @@ def of_scheduling(message: str, gpu_resource: str = 'nvidia.com/gpu') -> str:
 
 
 def of_image(reason: str, message: str, image: str) -> str:
-    """Return the remedy for an image that can't be had, or a container that can't begin."""
+    """Return the remedy for an image that cannot be pulled, or a container that cannot start."""
     text = message.lower()
     if reason == 'InvalidImageName':
         return f"container_image='{image}' is no image's name"

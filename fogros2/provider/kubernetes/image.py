@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Images for pods: a pod's disk can't be kept, so the image that saves installing is built here.
+Build images for pods that contain what a launch would install: a pod's disk cannot be kept.
 
-``recipe`` decides, by value; ``write`` and ``build`` act. The tag is the hash of what is in it, so
-a launch file that names ``container_image='REGISTRY/fogros2:{dependencies}'`` takes the one that
-fits.
+``recipe`` decides; ``write`` and ``build`` act. The tag is the hash of the image's content, so
+``container_image='REGISTRY/fogros2:{dependencies}'`` names the image for a launch.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from fogros2.model import Command
 from fogros2.provider.kubernetes.boot import UID
 from fogros2.provider.kubernetes.options import IMAGE
 
-#: Programs that build and push images, in the order in which they are looked for, each with its
-#: Debian package.
+#: Programs that build and push images, in order of preference, with their Debian packages.
 ENGINES = {'podman': 'podman', 'docker': 'docker.io', 'buildah': 'buildah'}
 NAME = 'fogros2'
 CONTAINERFILE = 'Containerfile'
@@ -38,11 +36,11 @@ _WORD = re.compile(r'[A-Za-z0-9][A-Za-z0-9.+:_-]*')
 @dataclasses.dataclass(frozen=True)
 class Recipe:
     """
-    How an image is built.
+    How to build an image.
 
-    :param reference: its name, registry and tag included.
-    :param base: the image that it begins with.
-    :param files: texts by name, the Containerfile among them: all that goes into the build.
+    :param reference: its name with registry and tag.
+    :param base: the base image.
+    :param files: names and contents of all files of the build, with the Containerfile.
     """
 
     reference: str
@@ -57,13 +55,13 @@ def recipe(
     """
     Return how to build the image for a robot's machines.
 
-    :param registry: where it goes, such as 'registry.example/robots'.
-    :param dependencies: hash of what is in it, its tag.
-    :param packages: for apt.
-    :param keys: for rosdep: what the workspace's packages depend on.
-    :param base: image to begin with.
-    :param user: the login user; see the option of this name.
-    :raises ConfigurationError: a value can't be what it should.
+    :param registry: such as 'registry.example/robots'.
+    :param dependencies: hash of the image's content, its tag.
+    :param packages: Debian packages.
+    :param keys: rosdep keys of the workspace's dependencies.
+    :param base: base image.
+    :param user: login user; see the option of this name.
+    :raises ConfigurationError: a value is invalid.
     """
     if not _REGISTRY.fullmatch(registry):
         raise ConfigurationError(f"'{registry}' can't be a registry",
@@ -104,13 +102,13 @@ def _containerfile(
             '        --from-paths /tmp/fogros2 --ignore-src -y \\\n'
             '    && rm -rf /tmp/fogros2 /var/lib/apt/lists/*']
     if user != 'root':
-        # here already, so that the first launch needn't make it
+        # The first launch then need not create the user.
         lines.append(f'RUN grep -q "^{user}:" /etc/passwd || useradd -m -u {UID} {user}')
     return '\n'.join(lines) + '\n'
 
 
 def _manifest(keys: Sequence[str]) -> str:
-    """Return a package that depends on what the workspace does, for rosdep to read."""
+    """Return a package.xml with the workspace's dependencies, for rosdep."""
     depends = '\n'.join(f'  <depend>{escape(key)}</depend>' for key in sorted(set(keys)))
     return ('<?xml version="1.0"?>\n<package format="3">\n  <name>fogros2_machine</name>\n'
             "  <version>0.0.0</version>\n  <description>A workspace's needs</description>\n"
@@ -122,7 +120,7 @@ def write(what: Recipe, folder: Path) -> Path:
     """
     Write a recipe's files, and return the Containerfile's path.
 
-    :raises PrerequisiteError: they can't be written.
+    :raises PrerequisiteError: the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -136,11 +134,11 @@ def write(what: Recipe, folder: Path) -> Path:
 
 def engine(wanted: str = 'auto') -> str:
     """
-    Return the program that builds images here.
+    Return the program that builds images on this computer.
 
-    :param wanted: one of ``ENGINES``, or 'auto' for the first that is there.
-    :raises ConfigurationError: there is none of this name.
-    :raises PrerequisiteError: it isn't installed.
+    :param wanted: one of ``ENGINES``, or 'auto' for the first that is installed.
+    :raises ConfigurationError: no engine has this name.
+    :raises PrerequisiteError: the engine is not installed.
     """
     if wanted not in ('auto', *ENGINES):
         raise ConfigurationError(f"'{wanted}' builds no images",
@@ -155,9 +153,8 @@ def engine(wanted: str = 'auto') -> str:
 
 
 def commands(what: Recipe, folder: Path, program: str, *, push: bool = True) -> list[Command]:
-    """Return what builds an image and, with ``push``, sends it to its registry."""
+    """Return the commands that build an image and, with ``push``, send it to its registry."""
     file = str(folder / CONTAINERFILE)
-    # podman and docker share their words, buildah has the same but for a 'from' of its own
     build = Command((program, 'build', '-t', what.reference, '-f', file, str(folder)),
                     what=f'building {what.reference}')
     if not push:
@@ -173,11 +170,11 @@ def build(
     """
     Write, build and push an image; return its reference, for ``container_image=``.
 
-    :param folder: for the Containerfile, which stays there to be read and changed.
-    :param program: what ``engine`` returned.
-    :param timeout: seconds each of the steps may take.
-    :param on_output: gets the lines that the program prints.
-    :raises ProviderError: it can't be built, or the registry doesn't take it.
+    :param folder: folder for the Containerfile, which stays there.
+    :param program: result of ``engine``.
+    :param timeout: time-out of each step in seconds.
+    :param on_output: callback for each line of the program's output.
+    :raises ProviderError: the build failed, or the registry refused the image.
     """
     write(what, folder)
     for command in commands(what, folder, program, push=push):
@@ -193,13 +190,13 @@ def build(
 
 
 def _login() -> dict[str, str]:
-    """Return where the user's own logins to registries are; nothing is asked or kept here."""
+    """Return the variables with the paths of the user's logins to registries."""
     return {name: os.environ[name] for name in ('REGISTRY_AUTH_FILE', 'DOCKER_CONFIG')
             if os.environ.get(name)}
 
 
 def _reason(said: str) -> str:
-    """Return the last error among a program's words: those before are of tries that it made."""
+    """Return the last error of a program's output; earlier ones belong to its retries."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     errors = [line for line in lines if re.match(r'error\b', line, re.I)]
     return (errors or lines or ['it says nothing'])[-1]
@@ -207,9 +204,9 @@ def _reason(said: str) -> str:
 
 def _hint(said: str, image: str, program: str, step: str) -> str:
     """
-    Return what to do about a failure.
+    Return the remedy for a failure.
 
-    :param image: what was to be had from its registry, or brought there.
+    :param image: the image that the program pulled or pushed.
     :param step: 'build' or 'push'.
     """
     registry = image.partition('/')[0] if re.match(r'[^/]*[.:][^/]*/|localhost/', image) \

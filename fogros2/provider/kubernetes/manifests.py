@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifests of a machine: a Job, its pod, a Service; pure."""
+"""Describe a machine's Job, its pod and its Services; pure."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.kubernetes import boot, names
 from fogros2.provider.kubernetes.options import Options
 
-#: Seconds after which the cluster removes a machine that has ended, with all that is its.
+#: Seconds after which the cluster deletes a machine that has ended, with all that it owns.
 TTL = 60
-#: Seconds for which a pod waits for its launch, on top of what pulling the image takes.
+#: Seconds for which a pod waits for its launch, after its image was pulled.
 BOOT = 600.0
-#: Seconds for which a pod answers the question whether UDP gets through.
+#: Seconds for which a pod answers probes for UDP.
 LISTEN = 180.0
-#: Port at which images of web applications serve HTTP.
+#: Port on which images of web applications serve HTTP.
 APPLICATION_PORT = 8080
-#: What a server of files may use, of the kinds of which the machine's own container has a limit.
+#: Limits of the application, a file server, if the machine's container has limits of that kind.
 _APPLICATION_LIMITS = {'cpu': '100m', 'memory': '128Mi'}
 
 
 def job(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:
     """
-    Return the Job of a machine, which owns whatever else is made for it.
+    Return the Job of a machine, which owns all its other objects.
 
-    Its deadline is the machine's lifetime, and its time to live takes pods and services along,
-    whatever became of the robot.
+    Its deadline is the machine's lifetime. After its time to live, the cluster deletes it with its
+    pods and Services, even without the robot.
     """
     own = metadata(spec, request)
     return {
@@ -53,12 +53,12 @@ def metadata(spec: MachineSpec, request: CreateRequest) -> dict[str, Any]:
     """Return the labels and annotations of a pod."""
     return {
         'labels': names.labels(spec.name, request.tags),
-        # an autoscaler that tidies up doesn't move a robot's nodes for it
+        # An autoscaler must not move the pod to free its node.
         'annotations': {'cluster-autoscaler.kubernetes.io/safe-to-evict': 'false'}}
 
 
 def pod(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:
-    """Return the pod as the Job will ask for it, to find out beforehand whether it may."""
+    """Return the pod that the Job will create, for a dry run of its admission."""
     return {
         'apiVersion': 'v1', 'kind': 'Pod',
         'metadata': {'generateName': f'{names.job_name(spec.name)}-', **metadata(spec, request)},
@@ -66,7 +66,7 @@ def pod(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str
 
 
 def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:
-    """Return what the pod runs, with no right beyond NET_ADMIN and no token of the cluster's."""
+    """Return the pod's specification, without rights but NET_ADMIN, and without API token."""
     port = 0 if options.expose in ('pod_dials_robot', 'pod_ip') else request.vpn_port
     container: dict[str, Any] = {
         'name': names.CONTAINER, 'image': image_for(options, request.dependencies),
@@ -76,7 +76,7 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
             alive=bool(request.application)),
         'env': [{'name': name, 'value': value} for name, value in options.env.items()],
         'securityContext': {
-            # an image may have another user; an interface takes root with NET_ADMIN
+            # Images may set another user; a VPN interface needs root with NET_ADMIN.
             'runAsUser': 0, 'privileged': False, 'capabilities': {'add': ['NET_ADMIN']}},
     }
     if port:
@@ -109,7 +109,7 @@ def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
     """
     Return the container of a web application.
 
-    Its probe asks the machine's container, so that it ends with that one, and the pod with both.
+    Its liveness probe connects to the machine's container, so both containers end together.
 
     :param beside: limits of the machine's container.
     """
@@ -117,7 +117,7 @@ def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
         'name': names.APPLICATION, 'image': image, 'imagePullPolicy': 'IfNotPresent',
         'ports': [{'name': 'application', 'containerPort': APPLICATION_PORT}],
         'securityContext': {
-            # Lichtblick's server is a file with this one capability: without, it doesn't start
+            # The file of Lichtblick's server has this capability, and does not start without it.
             'privileged': False, 'allowPrivilegeEscalation': False,
             'capabilities': {'drop': ['ALL'], 'add': ['NET_BIND_SERVICE']}},
         'livenessProbe': {'tcpSocket': {'port': boot.ALIVE_PORT}, 'periodSeconds': 5}}
@@ -128,7 +128,7 @@ def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
 
 
 def image_for(options: Options, dependencies: str) -> str:
-    """Return the pod's image; ``{dependencies}`` in its name stands for what a launch needs."""
+    """Return the pod's image; replace ``{dependencies}`` by the hash of a launch's needs."""
     return options.container_image.replace('{dependencies}', dependencies or 'latest')
 
 
@@ -144,7 +144,7 @@ def _resources(options: Options) -> dict[str, str]:
 
 
 def _preferring(zone: str) -> dict[str, Any]:
-    """Return the wish for a zone: one that the cluster doesn't have keeps nothing from running."""
+    """Return the preference of a zone; the pod also runs in a cluster without that zone."""
     return {'nodeAffinity': {'preferredDuringSchedulingIgnoredDuringExecution': [{
         'weight': 100, 'preference': {'matchExpressions': [{
             'key': 'topology.kubernetes.io/zone', 'operator': 'In', 'values': [zone]}]}}]}}
@@ -154,35 +154,35 @@ def service(
     kind: str, spec: MachineSpec, request: CreateRequest, options: Options, uid: str,
 ) -> dict[str, Any]:
     """
-    Return the Service that leads UDP to the machine's VPN; a TCP one would be another's.
+    Return the Service of the machine's VPN, for UDP.
 
     :param kind: 'LoadBalancer' or 'NodePort'.
-    :param uid: of the Job, which owns it.
+    :param uid: uid of the Job, which owns the Service.
     """
     name = names.job_name(spec.name)
+    return owned_service(
+        name, kind, name, uid, 'UDP', request.vpn_port,
+        labels=names.labels(spec.name, request.tags), annotations=options.annotations)
+
+
+def owned_service(
+    name: str, kind: str, job: str, uid: str, protocol: str, port: int, *,
+    labels: Mapping[str, str], annotations: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return a Service for one port of a machine, which the machine's Job owns."""
     return {
         'apiVersion': 'v1', 'kind': 'Service',
         'metadata': {
-            'name': name, 'labels': names.labels(spec.name, request.tags),
-            'annotations': dict(options.annotations),
+            'name': name, 'labels': dict(labels), 'annotations': dict(annotations),
             'ownerReferences': [{
-                'apiVersion': 'batch/v1', 'kind': 'Job', 'name': name, 'uid': uid,
+                'apiVersion': 'batch/v1', 'kind': 'Job', 'name': job, 'uid': uid,
                 'controller': True, 'blockOwnerDeletion': True}]},
         'spec': {
-            'type': kind, 'selector': {names.MACHINE: name},
-            'ports': [{'name': 'vpn', 'protocol': 'UDP', 'port': request.vpn_port,
-                       'targetPort': request.vpn_port}]}}
+            'type': kind, 'selector': {names.MACHINE: job},
+            'ports': [{'name': protocol.lower(), 'protocol': protocol, 'port': port,
+                       'targetPort': port}]}}
 
 
 def word(token: str) -> str:
-    """
-    Return what the question whether UDP gets through begins with.
-
-    The token itself stays where it is needed.
-    """
+    """Return the first word of probes for UDP: a hash, because the token is secret."""
     return hashlib.sha256(f'fogros2 udp {token}'.encode()).hexdigest()[:32]
-
-
-def exposure_patch(values: Mapping[str, str]) -> dict[str, Any]:
-    """Return the change of a Job that writes annotations down."""
-    return {'metadata': {'annotations': dict(values)}}

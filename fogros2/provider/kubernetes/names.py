@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a machine is called in a cluster, and how its tags are kept there; pure."""
+"""Names, labels and annotations of a machine's objects in a cluster; pure."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any
 
 from fogros2.errors import MachineNotFound
 
-#: On everything of ours.
+#: Label of all our objects.
 MANAGED = {'app.kubernetes.io/managed-by': 'fogros2'}
-#: Label that leads from a machine to its pods and services.
+#: Label with the name of the Job, on its pods and Services.
 MACHINE = 'fogros2-machine'
-#: Label that the cluster gives each pod of a Job: its uid.
+#: Label with the uid of the Job, which the cluster sets on its pods.
 JOB_UID = 'controller-uid'
 #: Annotations of the Job.
 ATTEMPT = 'fogros2-token'
 TAGS = 'fogros2-tags'
-#: How the VPN gets to the pod, written down once it is known.
+#: How the VPN reaches the pod, once it is known.
 EXPOSURE = 'fogros2-exposure'
 VPN_PORT = 'fogros2-vpn-port'
 LOGIN = 'fogros2-login'
-#: What the launch file said of the way, and of the robot's address for pods that dial it.
+#: Options of the launch file: how the VPN reaches the pod, and the robot's address for pods.
 EXPOSE = 'fogros2-expose'
 ROBOT_HOST = 'fogros2-robot-host'
-#: The container of a pod that is the machine, and the web application beside it.
+#: Names of a pod's containers: the machine, and the web application.
 CONTAINER = 'machine'
 APPLICATION = 'application'
 
@@ -37,7 +37,7 @@ _LABEL_VALUE = re.compile(r'([A-Za-z0-9]([A-Za-z0-9._-]{0,61}[A-Za-z0-9])?)?')
 @dataclasses.dataclass(frozen=True)
 class MachineId:
     """
-    Where a machine is: its Job, told from others of the same name by its uid.
+    The id of a machine: its Job; the uid distinguishes it from other Jobs with the same name.
 
     >>> MachineId.parse('robots/fogros2-talker/1b2c@arn:aws:eks:eu-north-1:1:cluster/x').context
     'arn:aws:eks:eu-north-1:1:cluster/x'
@@ -54,9 +54,9 @@ class MachineId:
     @classmethod
     def parse(cls, text: str) -> MachineId:
         """
-        Return what an id names.
+        Parse an id.
 
-        :raises MachineNotFound: it is none of ours.
+        :raises MachineNotFound: it is no id of this provider.
         """
         match = re.fullmatch(r'([a-z0-9-]+)/(fogros2-[a-z0-9-]+)/([0-9a-f-]+)@(.*)', text)
         if not match:
@@ -65,25 +65,25 @@ class MachineId:
 
 
 def job_name(machine: str) -> str:
-    """Return the name of a machine's Job; one per namespace, so the API server keeps watch."""
-    # a label takes 63, and the Job's pod adds six
+    """Return the name of a machine's Job; the API server refuses a second Job of that name."""
+    # A label has up to 63 characters, and the name of the Job's pod has six more.
     return f'fogros2-{machine.lower()}'[:57].rstrip('-')
 
 
 def labels(machine: str, tags: Mapping[str, str]) -> dict[str, str]:
-    """Return the labels of everything of a machine: the tags that can be labels, and ours."""
+    """Return the labels of a machine's objects: our own, and the tags that can be labels."""
     fit = {key: value for key, value in tags.items() if _LABEL_VALUE.fullmatch(value)}
     return {**fit, **MANAGED, MACHINE: job_name(machine)}
 
 
 def wanted(tags: Mapping[str, str]) -> dict[str, str]:
-    """Return the labels to look for; a value that can't be a label is compared afterwards."""
+    """Return the labels to search for; tags that cannot be labels are compared afterwards."""
     return {**MANAGED,
             **{key: value for key, value in tags.items() if _LABEL_VALUE.fullmatch(value)}}
 
 
 def tags_of(job: Mapping[str, Any]) -> dict[str, str]:
-    """Return the tags that a Job was made with."""
+    """Return the tags of a Job."""
     try:
         found = json.loads(annotation(job, TAGS) or '{}')
     except ValueError:
@@ -93,10 +93,10 @@ def tags_of(job: Mapping[str, Any]) -> dict[str, str]:
 
 
 def annotation(thing: Mapping[str, Any], name: str) -> str:
-    """Return an annotation of an object, '' if it has none of that name."""
+    """Return an annotation of an object, '' if the object does not have it."""
     return str((thing['metadata'].get('annotations') or {}).get(name, ''))
 
 
 def endpoint_host(namespace: str, pod: str, context: str) -> str:
-    """Return what an endpoint of kind 'kubernetes' has for a host."""
+    """Return the host of an endpoint of kind 'kubernetes'."""
     return f'{namespace}/{pod}@{context}'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a launch file may ask of a pod; pure."""
+"""Parse the options of a Kubernetes machine; pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fogros2.errors import ConfigurationError
 from fogros2.provider.options import convert, parsed
 
 IMAGE = 'docker.io/library/ros:jazzy-ros-base'
-#: How the robot's VPN gets to a pod, in the order in which 'auto' tries them.
+#: How the robot's VPN reaches a pod, in the order of 'auto'.
 EXPOSURES = ('load_balancer', 'node_port', 'pod_dials_robot', 'pod_ip')
 
 _LABEL = re.compile(r'[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?')
@@ -22,27 +22,27 @@ _TOLERATION = ('key', 'operator', 'value', 'effect', 'tolerationSeconds')
 @dataclasses.dataclass(frozen=True)
 class Options:
     """
-    What a launch file may ask of a pod.
+    The options of a Kubernetes machine in a launch file.
 
-    :param container_image: has Python 3.10 and ``sh`` at least; ``{dependencies}`` in it stands
-        for the hash of what the launch needs, the tag that ``image.recipe`` gives.
-    :param namespace: '' for the context's own.
-    :param context: of the kubeconfig; '' for the current one.
-    :param zone: the pod runs there if it can.
-    :param mcpu: thousandths of a CPU, as request and as limit; 0 for no say.
-    :param mb: MiB of memory, as request and as limit; 0 for no say.
-    :param gpus: devices of the kind ``gpu_resource``.
-    :param node_selector: labels that the node has to carry.
+    :param container_image: image with Python 3.10 and ``sh``; ``{dependencies}`` in its name is
+        replaced by the hash of the launch's needs, the tag of ``image.recipe``.
+    :param namespace: '' for the context's namespace.
+    :param context: context of the kubeconfig; '' for the current one.
+    :param zone: preferred zone of the pod.
+    :param mcpu: thousandths of a CPU, as request and limit; 0 for none.
+    :param mb: MiB of memory, as request and limit; 0 for none.
+    :param gpus: number of devices of the kind ``gpu_resource``.
+    :param node_selector: required labels of the node.
     :param tolerations: as in a pod's specification.
     :param runtime_class: such as 'nvidia'.
     :param image_pull_secrets: names of secrets in the namespace.
-    :param service_account: whose rights the pod's admission is judged by; its token stays away.
+    :param service_account: service account for the pod's admission; the pod gets no token.
     :param expose: one of ``EXPOSURES``, or 'auto'.
-    :param robot_host: address at which pods reach the robot, for pods that have to dial it; ''
-        for the one that its connection to the API server comes from.
-    :param user: login user, made where the image has none of this name.
-    :param env: variables of every login.
-    :param annotations: for the Service, such as a cloud's wishes for a load balancer.
+    :param robot_host: the robot's address for pods that connect to it; '' for the robot's address
+        on the way to the API server.
+    :param user: login user, created if the image does not have it.
+    :param env: environment variables of every login.
+    :param annotations: of the Service, such as a cloud's settings for load balancers.
     """
 
     container_image: str = IMAGE
@@ -69,7 +69,7 @@ class Options:
         """
         Return the options of a spec.
 
-        :raises ConfigurationError: one is unknown (with the nearest name) or makes no sense.
+        :raises ConfigurationError: an option is unknown (with the nearest name) or invalid.
         """
         options = parsed(cls, given, 'a Kubernetes machine', _converted)
         _check_values(options)

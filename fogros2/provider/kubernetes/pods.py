@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a Job and its pod tell of a machine; pure."""
+"""Read the state of a machine from its Job, its pod and their events; pure."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, Optional
 from fogros2.model import MachineState
 from fogros2.provider.kubernetes import hints, names
 
-#: What a container waits for that it will wait for in vain.
+#: Reasons of a waiting container that will never run.
 _HOPELESS = ('InvalidImageName', 'ErrImageNeverPull', 'CreateContainerConfigError',
              'CreateContainerError', 'RunContainerError', 'ErrInvalidImageName')
 _PULL = ('ErrImagePull', 'ImagePullBackOff', 'RegistryUnavailable', 'ImageInspectError')
-#: Answers of a registry that another try won't change.
+#: Answers of a registry that a retry will not change.
 _FINAL = re.compile(r'not ?found|manifest unknown|unauthorized|denied|forbidden|no match for '
                     r'platform|no matching manifest|does not exist|invalid reference', re.I)
 
@@ -24,9 +24,9 @@ _FINAL = re.compile(r'not ?found|manifest unknown|unauthorized|denied|forbidden|
 @dataclasses.dataclass(frozen=True)
 class Trouble:
     """
-    Why a pod doesn't run.
+    Why a pod does not run.
 
-    :param final: waiting won't help.
+    :param final: whether waiting cannot help.
     """
 
     what: str
@@ -34,17 +34,17 @@ class Trouble:
     final: bool = False
 
     def less_than(self, before: Trouble) -> bool:
-        """Return whether this says less than what was said before: only that it goes on."""
+        """Return whether this only repeats an earlier problem, with less detail."""
         return self.what.startswith('ImagePullBackOff') and before.what.startswith('ErrImagePull')
 
 
 def timestamp(text: str) -> float:
-    """Return a time of the API's in seconds since the epoch."""
+    """Return a time of the API in seconds since the epoch."""
     return datetime.datetime.fromisoformat(text.replace('Z', '+00:00')).timestamp()
 
 
 def pod_of(job: Mapping[str, Any], pods: Iterable[Mapping[str, Any]]) -> Optional[dict[str, Any]]:
-    """Return the first pod of a Job: a later one is another computer, with nothing of ours."""
+    """Return the first pod of a Job: a later pod has none of the machine's state."""
     uid = job['metadata']['uid']
     own = [dict(pod) for pod in pods
            if any(owner.get('uid') == uid
@@ -53,13 +53,13 @@ def pod_of(job: Mapping[str, Any], pods: Iterable[Mapping[str, Any]]) -> Optiona
 
 
 def state_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> MachineState:
-    """Return where a machine is in its life."""
+    """Return the state of a machine."""
     if job['metadata'].get('deletionTimestamp') or any(
             condition['type'] in ('Complete', 'Failed') and condition['status'] == 'True'
             for condition in (job.get('status') or {}).get('conditions') or ()):
         return MachineState.STOPPING
     if pod is None:
-        # a Job that ran before has lost its pod to an eviction
+        # The pod of a Job that ran before was evicted.
         lost = (job.get('status') or {}).get('active') == 0 and \
             (job.get('status') or {}).get('failed')
         return MachineState.STOPPING if lost else MachineState.PENDING
@@ -71,15 +71,15 @@ def state_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> Machin
 
 
 def is_running(pod: Mapping[str, Any]) -> bool:
-    """Return whether the machine of a pod runs; the application beside it may come later."""
+    """Return whether the machine's container runs; the application may start later."""
     return (pod.get('status') or {}).get('phase') in ('Pending', 'Running') \
         and _machine_has(pod, 'running')
 
 
 def has_ended(pod: Mapping[str, Any]) -> bool:
-    """Return whether nothing of a pod runs any more, or has yet."""
+    """Return whether the machine's container does not run, or has ended."""
     phase = (pod.get('status') or {}).get('phase')
-    # the application, which nobody needs then, may run for a moment longer
+    # The application may run a little longer.
     return not _machine_has(pod, 'running') and (
         phase in ('Pending', 'Succeeded', 'Failed') or _machine_has(pod, 'terminated'))
 
@@ -89,13 +89,13 @@ def _machine_has(pod: Mapping[str, Any], state: str) -> bool:
 
 
 def _machine(pod: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the statuses of a pod's containers without that of the application."""
+    """Return the statuses of a pod's containers, without the application's."""
     return [each for each in (pod.get('status') or {}).get('containerStatuses') or ()
             if each.get('name') != names.APPLICATION]
 
 
 def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
-    """Return why a machine has ended, in the cluster's words."""
+    """Return why a machine has ended, as the cluster reports it."""
     for condition in (job.get('status') or {}).get('conditions') or ():
         if condition['type'] == 'Failed' and condition['status'] == 'True' \
                 and condition.get('reason') == 'DeadlineExceeded':
@@ -115,16 +115,13 @@ def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
         else 'its pod has ended'
 
 
-def trouble_of(
-    pod: Mapping[str, Any], *, gpu_resource: str = 'nvidia.com/gpu',
-) -> Optional[Trouble]:
-    """Return what keeps a pod from running, None if nothing does but time."""
+def trouble_of(pod: Mapping[str, Any]) -> Optional[Trouble]:
+    """Return why a pod does not run, None if it is starting normally."""
     status = pod.get('status') or {}
     for condition in status.get('conditions') or ():
         if condition['type'] == 'PodScheduled' and condition['status'] == 'False':
             message = str(condition.get('message') or condition.get('reason') or '')
-            return Trouble(f'FailedScheduling: {message}',
-                           hints.of_scheduling(message, gpu_resource))
+            return Trouble(f'FailedScheduling: {message}', hints.of_scheduling(message))
     for each in _machine(pod):
         waiting = (each.get('state') or {}).get('waiting') or {}
         reason, message = str(waiting.get('reason', '')), str(waiting.get('message', ''))
@@ -137,9 +134,9 @@ def trouble_of(
 
 def trouble_in(events: Sequence[Mapping[str, Any]]) -> Optional[Trouble]:
     """
-    Return what events of a Job or pod tell that the pod itself doesn't.
+    Return a problem that only the events of a Job or pod show.
 
-    :param events: those about the Job and its pod, in any order.
+    :param events: events of the Job and its pod, in any order.
     """
     for event in events:
         reason, message = str(event.get('reason', '')), str(event.get('message', ''))
@@ -156,5 +153,5 @@ def trouble_in(events: Sequence[Mapping[str, Any]]) -> Optional[Trouble]:
 
 
 def scales_up(events: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether the cluster is getting another node for the pod."""
+    """Return whether the cluster is adding a node for the pod."""
     return any(event.get('reason') == 'TriggeredScaleUp' for event in events)

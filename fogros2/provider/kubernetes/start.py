@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting for a pod to run: one watch, and a verdict on what keeps it from running."""
+"""Wait for a pod to run, by one watch; decide whether a problem is final."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from fogros2.provider.kubernetes import hints, names, pods
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.pods import Trouble
 
-#: Seconds for which something may be in the way that time can mend: a node that is just being
-#: freed, a registry that doesn't answer at first.
+#: Seconds to wait for the end of a problem that may be temporary: a node that is being freed, a
+#: registry that does not answer at first.
 PATIENCE = 15.0
-#: Seconds after which the events are asked why there is no pod, or one that doesn't begin.
+#: Seconds after which the events are read, if there is no pod or the pod does not start.
 QUIET = 5.0
 
 
 class Start:
     """
-    The time from a Job to its running pod.
+    Wait for the pod of a new Job.
 
-    :param name: the machine's, for messages.
+    :param name: the machine's name, for messages.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class Start:
         """
         Return the pod as soon as its container runs.
 
-        :raises ProviderError: it can't, with the event's text.
-        :raises DeadlineExceeded: it doesn't, with what is in the way.
+        :raises ProviderError: the pod cannot run; with the event's text.
+        :raises DeadlineExceeded: the pod did not run in time.
         """
         self._cancel = cancel
         try:
@@ -58,9 +58,8 @@ class Start:
                 what=f"the pod of '{self._name}' to run",
                 labelSelector=selector({names.MACHINE: self._where.job}))
         except ApiError as error:
-            raise ProviderError(
-                f'the cluster refused to let the pods be watched: {error.args[0]}',
-                hints.of_refusal(str(error.args[0]), self._where.namespace)) from error
+            raise hints.refused(
+                error, 'to let the pods be watched', self._where.namespace) from error
         except DeadlineExceeded as error:
             if self._trouble is None:
                 raise
@@ -68,7 +67,7 @@ class Start:
 
     def _look(self, event: str, pod: dict[str, Any]) -> Optional[dict[str, Any]]:
         if pods.pod_of(self._job, [pod]) is None:
-            return None  # of another Job that had the name
+            return None  # the pod of an earlier Job with the name
         if event == 'DELETED' or pods.state_of(self._job, pod) is MachineState.STOPPING:
             raise ProviderError(
                 f"'{self._name}' ended while it was coming up: {pods.end_of(self._job, pod)}",
@@ -76,13 +75,8 @@ class Start:
         if pods.is_running(pod):
             return pod
         self._pod = pod
-        gpus = [name for name in self._limits() if '/' in name]
-        self._note(pods.trouble_of(pod, gpu_resource=gpus[0] if gpus else 'nvidia.com/gpu'))
+        self._note(pods.trouble_of(pod))
         return None
-
-    def _limits(self) -> Mapping[str, Any]:
-        container = self._job['spec']['template']['spec']['containers'][0]
-        return (container.get('resources') or {}).get('limits') or {}
 
     def _note(self, trouble: Optional[Trouble]) -> None:
         if trouble is not None and trouble.final:
@@ -98,7 +92,7 @@ class Start:
                              trouble.hint)
 
     def _again(self) -> None:
-        """Look whether the Job is there still, when a watch was lost."""
+        """Check that the Job still exists, after a watch was lost."""
         try:
             self._api.request('GET', path('jobs', self._where.namespace, self._where.job),
                               cancel=self._cancel)
@@ -112,7 +106,7 @@ class Start:
         now = time.monotonic()
         late = self._trouble is not None and now - self._since >= PATIENCE
         if now >= self._next_events and (late or self._trouble is None):
-            # seldom: a watch would report the events of all pods
+            # Polled rarely, because a watch would report the events of all pods.
             self._next_events = now + 4 * QUIET
             self._events()
         if late and self._trouble is not None and not self._scales_up:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making the Service that a machine's VPN is reached by, and finding out whether it works."""
+"""Create the Service of a machine's VPN, and find out whether UDP gets through."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.waiting import wait_until
 
-#: Seconds in which a cluster takes away what belonged to a Job that is gone.
+#: Time-out of the deletion of an earlier Job's Service, in seconds.
 TAKEN = 20.0
 
 
 def make(
     api: Api, namespace: str, spec: MachineSpec, request: CreateRequest, options: Options,
-    job: Mapping[str, Any],
+    job: Mapping[str, Any], cancel: Optional[threading.Event] = None,
 ) -> Optional[dict[str, Any]]:
     """
-    Make the Service that ``options.expose`` takes and return it; the Job owns it.
+    Create and return the Service for ``options.expose``, which the Job owns.
 
-    Where the way is ours to choose, a cluster that allows no Service is no obstacle.
+    With 'auto', return None if the cluster allows no Service.
 
     :raises ProviderError: the cluster refused.
     """
-    kind = _service_kind(api, options.expose, request.cancel)
+    kind = _service_kind(api, options.expose, cancel)
     if not kind:
         return None
     uid = str(job['metadata']['uid'])
@@ -42,24 +42,22 @@ def make(
 
     def attempt() -> Optional[dict[str, Any]]:
         try:
-            return api.request('POST', target, body, cancel=request.cancel)
+            return api.request('POST', target, body, cancel=cancel)
         except ApiError as error:
             if error.reason != 'AlreadyExists':
                 raise
-        there = _read(api, f"{target}/{body['metadata']['name']}", request.cancel)
-        # an earlier attempt's, or of a Job that had the name before: the cluster takes that one
-        # away with its Job, but not at once
+        there = _read(api, f"{target}/{body['metadata']['name']}", cancel)
+        # It belongs to an earlier attempt, or to an earlier Job with the name, with which the
+        # cluster will delete it soon.
         return there if there is not None and owned(there, uid) else None
 
     try:
-        return wait_until(attempt, timeout=TAKEN, cancel=request.cancel, interval=0.2,
+        return wait_until(attempt, timeout=TAKEN, cancel=cancel, interval=0.2,
                           what=f"the Service of an earlier '{spec.name}' to be gone")
     except ApiError as error:
         if options.expose == 'auto':
             return None
-        raise ProviderError(
-            f"the cluster refused the Service of '{spec.name}': {error.args[0]}",
-            hints.of_refusal(str(error.args[0]), namespace)) from error
+        raise hints.refused(error, f"the Service of '{spec.name}'", namespace) from error
     except DeadlineExceeded as error:
         if options.expose == 'auto':
             return None
@@ -70,7 +68,7 @@ def make(
 
 
 def owned(thing: Mapping[str, Any], uid: str) -> bool:
-    """Return whether an object belongs to the Job that has a uid, and stays."""
+    """Return whether the Job with a uid owns an object that is not being deleted."""
     meta = thing['metadata']
     return not meta.get('deletionTimestamp') and any(
         owner.get('uid') == uid for owner in meta.get('ownerReferences') or ())
@@ -94,12 +92,12 @@ def _service_kind(api: Api, expose: str, cancel: Optional[threading.Event]) -> s
     return {'load_balancer': 'LoadBalancer', 'node_port': 'NodePort'}.get(expose, '')
 
 
-#: Who makes load balancers, by API server.
+#: What makes load balancers, by API server.
 _makers: dict[str, str] = {}
 
 
 def maker(api: Api, cancel: Optional[threading.Event] = None) -> str:
-    """Return who makes load balancers in a cluster, '' if nobody is known to; asked once."""
+    """Return what makes load balancers in a cluster, see ``exposure.load_balancers``."""
     if (known := _makers.get(api.server)) is not None:
         return known
     found = exposure.load_balancers(api.server)
@@ -110,8 +108,35 @@ def maker(api: Api, cancel: Optional[threading.Event] = None) -> str:
     return found
 
 
+def load_balancer(
+    api: Api, namespace: str, service: str, timeout: float, cancel: Optional[threading.Event],
+) -> list[str]:
+    """
+    Wait for a Service's load balancer, and return its addresses and host names.
+
+    :raises DeadlineExceeded: it was not ready after ``timeout`` seconds.
+    """
+    return api.follow(
+        path('services', namespace), lambda event, found: exposure.ingress(found) or None,
+        timeout=timeout, cancel=cancel, what='a load balancer',
+        fieldSelector=f'metadata.name={service}')
+
+
+def node_hosts(
+    api: Api, pod: Mapping[str, Any], cancel: Optional[threading.Event],
+) -> list[str]:
+    """Return the addresses of a pod's node, external ones first."""
+    found: list[str] = []
+    name = str(pod['spec'].get('nodeName') or '')
+    # Most robots may not read nodes; then the address in the pod's status remains.
+    with contextlib.suppress(ApiError, Unreachable):
+        found = exposure.node_addresses(api.request(
+            'GET', path('nodes', '', name), timeout=2.0, cancel=cancel))
+    return list(dict.fromkeys([*found, str(pod['status'].get('hostIP') or '')]))
+
+
 def known(job: Mapping[str, Any]) -> Optional[Exposure]:
-    """Return the way that was found before, None if none has been yet."""
+    """Return the exposure that was found before, None if there is none yet."""
     return Exposure.parse(names.annotation(job, names.EXPOSURE))
 
 
@@ -125,11 +150,10 @@ def find(
     service: Optional[Mapping[str, Any]], timeout: float, cancel: threading.Event,
 ) -> Exposure:
     """
-    Return the way that UDP takes to a pod that runs.
+    Return how UDP reaches a running pod.
 
-    :param service: what ``make`` returned, None where that isn't known any more.
-
-    :raises ProviderError: the one that was asked for doesn't work.
+    :param service: result of ``make``, None if it is unknown.
+    :raises ProviderError: the requested exposure does not work.
     """
     asked = names.annotation(job, names.EXPOSE)
     if asked == 'pod_ip':
@@ -140,13 +164,12 @@ def find(
     try:
         return search.run(asked, service or search.service(), timeout)
     except ApiError as error:
-        raise ProviderError(
-            f"the Service of '{where.job}' can't be read: {error.args[0]}",
-            hints.of_refusal(str(error.args[0]), where.namespace)) from error
+        raise hints.refused(
+            error, f"reading the Service of '{where.job}'", where.namespace) from error
 
 
 class _Search:
-    """The ways in their order, each with its deadline; what didn't work says why the next."""
+    """Try the exposures in their order, each with a time-out; collect the failures."""
 
     def __init__(
         self, api: Api, where: MachineId, job: Mapping[str, Any], pod: Mapping[str, Any],
@@ -164,11 +187,11 @@ class _Search:
     def run(
         self, asked: str, service: Optional[Mapping[str, Any]], timeout: float,
     ) -> Exposure:
-        """Try them."""
+        """Return the first exposure that works."""
         deadline = time.monotonic() + timeout
         if service is not None and service['spec']['type'] == 'LoadBalancer':
-            patience = min(exposure.patience(maker(self._api, self._cancel)), timeout * 0.8)
-            if (found := self._load_balancer(patience)) is not None:
+            limit = min(exposure.timeout(maker(self._api, self._cancel)), timeout * 0.8)
+            if (found := self._load_balancer(limit)) is not None:
                 return found
         if service is not None and asked in ('auto', 'node_port'):
             left = max(1.0, min(exposure.NODE_PORT, deadline - time.monotonic()))
@@ -191,19 +214,16 @@ class _Search:
             return None
         return found
 
-    def _load_balancer(self, patience: float) -> Optional[Exposure]:
+    def _load_balancer(self, timeout: float) -> Optional[Exposure]:
         begin = time.monotonic()
         try:
-            hosts: list[str] = self._api.follow(
-                path('services', self._where.namespace),
-                lambda event, service: exposure.ingress(service) or None,
-                timeout=patience, cancel=self._cancel, what='a load balancer',
-                fieldSelector=f'metadata.name={self._where.job}')
+            hosts = load_balancer(
+                self._api, self._where.namespace, self._where.job, timeout, self._cancel)
         except DeadlineExceeded:
-            self._failed.append(f'no load balancer came in {patience:.0f} s')
+            self._failed.append(f'no load balancer came in {timeout:.0f} s')
             return None
-        while (left := patience - (time.monotonic() - begin)) > 0:
-            # a name may be unknown for minutes: looked up anew each time
+        while (left := timeout - (time.monotonic() - begin)) > 0:
+            # A host name may be unknown for minutes, so resolve it each time.
             answer = exposure.first_to_answer(
                 [(host, self._port) for host in hosts], self._word, timeout=min(5.0, left),
                 cancel=self._cancel)
@@ -213,32 +233,23 @@ class _Search:
         self._failed.append(f'the load balancer {hosts[0]} lets no UDP through')
         return None
 
-    def _node_port(self, service: Mapping[str, Any], patience: float) -> Optional[Exposure]:
+    def _node_port(self, service: Mapping[str, Any], timeout: float) -> Optional[Exposure]:
         port = exposure.node_port(service)
         if not port:
             self._failed.append('the Service has no port on the nodes')
             return None
         hosts = [str(self._pod['status'].get('hostIP') or '')]
         answer = exposure.first_to_answer(
-            [(hosts[0], port)], self._word, timeout=min(1.0, patience), cancel=self._cancel)
+            [(hosts[0], port)], self._word, timeout=min(1.0, timeout), cancel=self._cancel)
         if answer is None:
-            # the address that the pod tells is the node's inner one
-            hosts = list(dict.fromkeys([*self._node(), *hosts]))
+            # The pod reports the private IP of its node.
+            hosts = node_hosts(self._api, self._pod, self._cancel)
             answer = exposure.first_to_answer(
-                [(host, port) for host in hosts], self._word, timeout=patience,
+                [(host, port) for host in hosts], self._word, timeout=timeout,
                 cancel=self._cancel)
         if answer is None:
             self._failed.append(f"port {port} of the node ({', '.join(hosts)}) answers nothing in "
-                                f'{patience:.0f} s')
+                                f'{timeout:.0f} s')
             return None
         why = '; '.join([*self._failed, f'the node {answer[0]} answers'])
         return Exposure('node_port', answer[0], port, why)
-
-    def _node(self) -> list[str]:
-        """Return the addresses of the pod's node; its own is known where nodes can't be read."""
-        name = str(self._pod['spec'].get('nodeName') or '')
-        with contextlib.suppress(ApiError, Unreachable):
-            # most robots may not, which isn't worth the wait for another answer
-            return exposure.node_addresses(self._api.request(
-                'GET', path('nodes', '', name), patience=2.0, cancel=self._cancel))
-        return []

@@ -200,7 +200,8 @@ class LaunchLogger(logging.getLoggerClass()):  # type: ignore[misc]
 def reset() -> None:
     """Take handlers and levels from all loggers made so far, and forget the configuration."""
     for logger in LaunchLogger.all_loggers:
-        logger.setLevel(logging.NOTSET)
+        if logger.level:  # setLevel() clears the caches of all loggers, which takes long
+            logger.setLevel(logging.NOTSET)
         logger.handlers.clear()
     launch_config.reset()
     logging.setLoggerClass(LaunchLogger)

@@ -59,7 +59,7 @@ def test_what_stays_is_said_in_one_line(robot, box, name):
     assert all(found.state == 'terminated' for found in box.instances())
 
 
-def test_what_can_be_known_before_is_said_before_anything_is_made(robot, box, name):
+def test_known_problems_are_reported_before_creation(robot, box, name):
     box.publish('ami-0aaaaaaaaaaaaaaaa', region='us-east-1')
     launches = {
         'xx-nowhere-1': (['region:=xx-nowhere-1'], {}),

@@ -51,7 +51,7 @@ def doors(robot):
             for rule in group['IpPermissions'] if rule['IpProtocol'] == 'tcp']
 
 
-def test_the_security_group_lets_in_who_was_allowed_until_the_launch_ends(robot, box, name):
+def test_security_group_admits_viewers_until_the_launch_ends(robot, box, name):
     run = robot.launch(robot.write('monitor.launch.py', LAUNCH_FILE.format(name=name)))
     run.wait_for('the certificate has the SHA-256')
     run.wait_for(f'with its token: ros2 fog monitor {name} --share')

@@ -140,7 +140,7 @@ def started(kubernetes, binaries):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="other users' processes are root's to look at")
-def test_nothing_is_left_of_the_cluster_of_a_test_that_was_killed(started):
+def test_killed_test_leaves_nothing_of_its_cluster(started):
     child, folder = started
     space = process_namespace(folder)
     own = processes(space)

@@ -38,7 +38,7 @@ def run(name, **options):
     machine_id = provider.create(spec, request_for(spec))
     try:
         return provider, machine_id, provider.reachable(
-            machine_id, name=name, timeout=60.0, cancel=threading.Event())
+            machine_id, name=name, timeout=60.0)
     except BaseException:
         provider.destroy(machine_id)
         raise
@@ -147,7 +147,7 @@ def test_the_way_is_the_one_that_was_asked_for(place):
             assert (machine.vpn_port > 0) is (expose == 'node_port')
             assert machine.robot_host
             if expose == 'pod_ip':
-                assert machine.vpn_host == machine.inner_host
+                assert machine.vpn_host == machine.private_ip
 
 
 def test_a_load_balancer_is_waited_for(place, client):
@@ -213,7 +213,7 @@ def in_the_way(place, client):
             client.ask('DELETE', path)
 
 
-def test_a_service_of_somebody_else_is_not_taken_for_the_machine_s(
+def test_foreign_service_is_not_taken_for_the_machines(
         place, client, in_the_way, monkeypatch):
     monkeypatch.setattr('fogros2.provider.kubernetes.ways.TAKEN', 0.5)
     path = in_the_way('twin')

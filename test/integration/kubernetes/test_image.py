@@ -11,7 +11,6 @@ import shutil
 import socket
 import subprocess
 import tarfile
-import threading
 
 import bcrypt
 import pytest
@@ -133,7 +132,7 @@ def test_an_image_is_built_and_pushed_and_a_pod_runs_it(builder, namespace):
     machine_id = provider.create(
         spec, dataclasses.replace(request_for(spec), dependencies=tag))
     try:
-        provider.reachable(machine_id, name='built', timeout=60.0, cancel=threading.Event())
+        provider.reachable(machine_id, name='built', timeout=60.0)
         (pod,) = namespace.all('pods')
         status, = pod['status']['containerStatuses']
         assert status['image'] == reference and 'running' in status['state']

@@ -286,7 +286,7 @@ def test_nodes_of_an_evicted_pod_go_on_on_the_robot(launch, namespace):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_an_api_server_that_restarts_is_waited_for(launch, namespace, kubernetes):
+def test_restart_of_the_api_server_is_waited_for(launch, namespace, kubernetes):
     run = launch("talker(pod('patient'))", 'listener()')
     wait_until(lambda: namespace.all('jobs') or None, timeout=60.0, what='the Job')
     kubernetes.stop('kube-apiserver')
@@ -365,6 +365,6 @@ def test_twenty_pods_of_one_launch(launch, namespace):
     assert namespace.left() == []
 
 
-def test_a_killed_robot_s_pod_and_services_are_gone_by_their_deadline(killed):
+def test_pod_and_services_of_a_killed_robot_end_in_time(killed):
     space, when = killed
     space.gone(timeout=max(5.0, when + 30.0 + TTL + 15.0 - time.monotonic()))

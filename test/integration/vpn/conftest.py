@@ -125,7 +125,7 @@ class Lab:
         self.dds = CycloneDds()
         self.interfaces = {
             'robot': VpnInterface(f'{self.mark}r', ROBOT, NETWORK, PORT,
-                                  str(folder / 'r/vpn.key'), guarded=True),
+                                  str(folder / 'r/vpn.key'), firewall=True),
             'machine': VpnInterface(f'{self.mark}m', MACHINE, NETWORK, PORT,
                                     str(folder / 'm/vpn.key'))}
         self.children: list[Child] = []
@@ -229,7 +229,7 @@ class Lab:
         self.do(host, self.vpn.repair(self.interfaces[host], self.peers()[host]))
 
     def alive(self, host: str) -> bool:
-        command = self.vpn.alive(self.interfaces[host])
+        command = self.vpn.health_check(self.interfaces[host])
         return self.run(host, command, check=False).returncode == 0
 
     def peers(self) -> dict[str, list[Peer]]:

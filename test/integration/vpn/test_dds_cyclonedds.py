@@ -55,7 +55,7 @@ def pause(seconds: float) -> tuple[float, float]:
     return begin, time.monotonic()
 
 
-def test_messages_cross_where_the_machine_has_a_network_that_overlaps(lab: Lab) -> None:
+def test_messages_cross_with_an_overlapping_machine_network(lab: Lab) -> None:
     lab.link('machine', 'own0', '198.18.7.200/24', 'lan', 'own0', '198.18.7.201/24')
     lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
     lab.connect()
@@ -165,7 +165,7 @@ def test_an_interface_that_is_taken_away_harms_no_node(vpn: Lab) -> None:
     heals(robot, machine, since)
 
 
-def test_nothing_but_announcements_crosses_unless_it_is_read_there(vpn: Lab) -> None:
+def test_unread_topics_send_only_announcements_across(vpn: Lab) -> None:
     idle = 20_000.0
     camera = vpn.node('robot', 'to:/camera', '--size', '50000')
     beside = vpn.node('robot', 'from:/camera')

@@ -220,7 +220,7 @@ def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
     assert sorted(reached()) == sorted(targets)
 
 
-def test_the_failure_of_a_step_is_told(lab: Lab) -> None:
+def test_failure_of_a_step_is_reported(lab: Lab) -> None:
     interface = dataclasses.replace(lab.interfaces['machine'], network='198.18.7.0/99')
     lab.run('machine', lab.vpn.keys(interface))
     with pytest.raises(CommandError, match='set the VPN interface .* up failed'):
@@ -243,7 +243,7 @@ def test_a_machine_whose_own_network_overlaps_has_both(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize('taken', [ROBOT, MACHINE])
-def test_a_machine_that_has_an_address_of_the_vpn_says_so(lab: Lab, taken: str) -> None:
+def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab, taken: str) -> None:
     lab.link('machine', 'own0', f'{taken}/24', 'lan', 'own0', '198.18.7.201/24')
     lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
     with pytest.raises(CommandError, match=f'in use already: local {taken} dev own0'):

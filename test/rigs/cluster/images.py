@@ -26,10 +26,11 @@ import tempfile
 import threading
 from typing import Any, Optional
 
-from fogros2 import bootstrap, plan, process, wheels
+from fogros2 import plan, process
 from fogros2.errors import PrerequisiteError
+from fogros2.host import bootstrap, wheels
 from fogros2.model import Command, MachineSpec, Result, SyncReport
-from fogros2.provider import debian_root
+from fogros2.provider.container import debian_root
 from fogros2.provider.kubernetes.options import IMAGE
 from rigs.cluster import ros, services
 from rigs.cluster.node_process import run_node

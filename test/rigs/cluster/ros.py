@@ -15,7 +15,8 @@ import re
 import shutil
 from typing import Optional
 
-from fogros2 import host, process
+from fogros2 import process
+from fogros2.host import inspection as host
 from fogros2.model import Command
 
 #: Where an image of ROS has it.

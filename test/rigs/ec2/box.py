@@ -17,7 +17,7 @@ from typing import Any, Optional
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.provider import container_root
+from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.ec2.network import ROBOT, ROBOT_ELSEWHERE, ROUTER
 

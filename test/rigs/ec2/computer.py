@@ -22,8 +22,9 @@ from typing import Any, Optional
 from fogros2 import process
 from fogros2.errors import CommandError, FogError
 from fogros2.model import Command
-from fogros2.provider import container_engine, container_root
-from fogros2.provider.container_engine import Engine
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container import root as container_root
+from fogros2.provider.container.engine import Engine
 from rigs.ec2 import guest
 
 #: Roots of all boxes; the file systems of /tmp and /run may not take an overlay's layer.

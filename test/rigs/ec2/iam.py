@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from fogros2.provider.aws.images import TAG_BAKED
-from fogros2.provider.aws.instances import TAG_ATTEMPT
+from fogros2.provider.vm.cloud import TAG_ATTEMPT
 
 #: Asked of what anybody has.
 LOOK = (

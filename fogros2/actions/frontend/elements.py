@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Add machines, cloud nodes, cloud groups and streams to launch files of XML and YAML.
+
+launch imports this module for every such file (``launch.frontend.launch_extension``), so the
+parsers are imported only when needed. doc/launch_xml_yaml.md describes all elements.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from launch.frontend import expose_action
+
+if TYPE_CHECKING:
+    from launch.frontend import Entity, Parser
+
+    from fogros2.actions.frontend.entity import Parsed
+
+
+def _expose(name: str) -> None:
+    def parse(entity: Entity, parser: Parser) -> Parsed:
+        from fogros2.actions.frontend import parsing
+        parsed: Parsed = getattr(parsing, name)(entity, parser)
+        return parsed
+
+    expose_action(name)(parse)
+
+
+for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'fogros_launch'):
+    _expose(_name)

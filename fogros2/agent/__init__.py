@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The agent on a cloud machine: starts the nodes, keeps their log, ends the machine in time.
+
+It runs on Python 3.10 or newer with only the standard library, before anything is installed. It
+travels as one file, ``agent.py``, which :func:`fogros2.agent_client.program.joined` makes of the
+modules, in this order:
+
+- ``protocol``: the requests, and the checks of configurations;
+- ``journal``: the events on disk;
+- ``loop``: one thread that serves sockets and timers, and blocks on none of them;
+- ``watchdog``: when the machine has to end, and heartbeats;
+- ``processes``: commands as root, health checks and watches;
+- ``nodes``: the launch process that runs the nodes;
+- ``server``: clients, their requests, and the command line.
+
+A module may import the standard library, the modules before it, and types of ``fogros2.events``.
+"""
+
+#: The modules in reading order; the joined file has them in this order.
+MODULES = ('protocol', 'journal', 'loop', 'watchdog', 'processes', 'nodes', 'server')

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of the agent: as the login user or as root, their end, and periodic commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import os
+import pwd
+import signal
+import subprocess
+import sys
+
+from fogros2.agent.loop import Loop, Timer
+from fogros2.agent.protocol import Refused, say, words
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any, Optional
+
+    from fogros2.agent.protocol import Json
+    from fogros2.events import AgentEvent, HealthCheck
+
+#: Time-outs in seconds of commands, and of the commands of health checks and watches.
+COMMAND_TIMEOUT, CHECK_TIMEOUT = 30.0, 10.0
+#: (seconds, signal): when processes that the launch process left behind get each signal.
+SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
+SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
+#: Events that a watch may send, and maximum bytes of the command's output in them.
+WATCHED = ('notice',)
+REASON = 2000
+#: The variable that marks the descendants of the launch process.
+MARK = 'FOGROS2_AGENT_MARK'
+
+
+class Identity:
+    """
+    The login user, as whom the agent acts, and root, where the agent was started as root.
+
+    An agent that was started as root runs with the login user's effective identity, so that root
+    never opens a file that the user could have replaced. It becomes root again only for commands
+    that need it.
+
+    :raises Refused: no such user, or the agent cannot act as that user.
+    """
+
+    def __init__(self, user: str) -> None:
+        try:
+            self.account = pwd.getpwnam(user) if user else pwd.getpwuid(os.getuid())
+        except KeyError as error:
+            raise Refused(f"there is no user '{user or os.getuid()}' on this machine") from error
+        self.privileged = os.getuid() == 0
+        if not self.privileged and os.getuid() != self.account.pw_uid:
+            raise Refused(f"only root can run nodes as '{user}'", f"run the agent as '{user}'")
+
+    def assume(self) -> None:
+        """Act as the login user."""
+        if self.privileged:
+            os.setegid(self.account.pw_gid)
+            os.seteuid(self.account.pw_uid)
+
+    @contextlib.contextmanager
+    def root(self) -> Iterator[None]:
+        """Become root during the block, if the agent was started as root."""
+        if self.privileged:
+            os.seteuid(0)
+            os.setegid(0)
+        try:
+            yield
+        finally:
+            self.assume()
+
+
+def search_path() -> str:
+    """Return PATH, extended by the folders of system programs."""
+    known = os.environ.get('PATH', os.defpath).split(':')
+    more = ('/usr/local/bin', '/usr/bin', '/bin', '/usr/local/sbin', '/usr/sbin', '/sbin')
+    return ':'.join(known + [folder for folder in more if folder not in known])
+
+
+def marked(mark: str) -> list[int]:
+    """Return all descendants of the agent's launch process, found by their environment."""
+    wanted = f'{MARK}={mark}'.encode()
+    found = []
+    for name in os.listdir('/proc'):
+        if name.isdigit() and int(name) != os.getpid():
+            with contextlib.suppress(OSError), open(f'/proc/{name}/environ', 'rb') as stream:
+                if wanted in stream.read().split(b'\0'):
+                    found.append(int(name))
+    return found
+
+
+def remove_tree(path: str) -> None:
+    """Remove a folder with its content; skip what cannot be removed."""
+    import shutil  # only here, because it takes a megabyte of memory
+    shutil.rmtree(path, ignore_errors=True)
+
+
+class Processes:
+    """Start processes in the background, and end them."""
+
+    def __init__(self, loop: Loop, identity: Identity) -> None:
+        self.loop = loop
+        self.identity = identity
+        #: Called with the exit status of a child process.
+        self.children: dict[int, Callable[[int], None]] = {}
+
+    def reap(self) -> None:
+        """Collect the exit status of each child that has ended."""
+        # as process 1 of a container, the agent inherits all orphans
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            call = self.children.pop(pid, None)
+            if call is not None:
+                call(os.waitstatus_to_exitcode(status))
+
+    def start(self, argv: list[str], exited: Callable[[int], None], **options: Any) -> int:
+        """
+        Start a process as root, if possible, in a session of its own; return its pid.
+
+        :param options: as for ``subprocess.Popen``.
+        """
+        with self.identity.root():
+            child = subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, start_new_session=True, **options)
+        child.returncode = 0  # ``reap`` collects the status
+        self.children[child.pid] = exited
+        return child.pid
+
+    def kill(self, group: int, number: int) -> None:
+        """Send a signal to a process group."""
+        with self.identity.root(), contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(group, number)
+
+    def spawn(
+        self, argv: list[str], then: Callable[[int], None], *, timeout: float = COMMAND_TIMEOUT,
+        output: int = -1,
+    ) -> None:
+        """
+        Run a command, as root if possible; pass its exit status to ``then`` (127: not found).
+
+        Its output goes to the agent's own log, standard output to the descriptor ``output``.
+        """
+        def expire() -> None:
+            say(f'{argv[0]} took longer than {timeout:g} s')
+            self.kill(pid, signal.SIGKILL)
+
+        def exited(status: int) -> None:
+            timer.at = None
+            then(status)
+
+        own_log = sys.stderr.fileno()
+        try:
+            pid = self.start(
+                argv, exited, stdout=own_log if output < 0 else output, stderr=own_log,
+                cwd='/', env={**os.environ, 'PATH': search_path()})
+        except (OSError, ValueError) as error:
+            say(f'{argv[0] if argv else "an empty command"}: {error}')
+            self.loop.at(0.0, lambda: then(127))
+            return
+        timer = self.loop.at(timeout, expire)
+
+    def spawn_all(self, commands: list[list[str]], then: Callable[[bool], None]) -> None:
+        """Run all commands as root in order; tell ``then`` whether all succeeded."""
+        def step(index: int, good: bool) -> None:
+            if index == len(commands):
+                then(good)
+                return
+            self.spawn(commands[index], lambda status: step(index + 1, good and status == 0))
+        step(0, True)
+
+    def sweep(self, mark: str, then: Callable[[int], None], *, quickly: bool) -> None:
+        """End processes that the launch process left; pass the last signal sent to ``then``."""
+        begin = self.loop.clock()
+        steps = list(SWEEP_QUICKLY if quickly else SWEEP)
+        last = signal.SIGKILL
+
+        def look() -> None:
+            nonlocal last
+            left, age = marked(mark), self.loop.clock() - begin
+            if not left or age > SWEEP[-1][0] + 2.0:
+                then(last)
+                return
+            while steps and age >= steps[0][0]:
+                last = steps.pop(0)[1]
+                for pid in left:
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.kill(pid, last)
+            self.loop.at(0.02, look)
+        look()
+
+
+class Kept:
+    """A health check: a command that checks, commands that repair, and commands for the end."""
+
+    def __init__(self, request: Json) -> None:
+        self.alive = words(request.get('alive', []))
+        self.repair = [words(argv) for argv in request.get('repair', [])]
+        self.down = [words(argv) for argv in request.get('down', [])]
+        self.interval = max(0.05, float(request.get('interval', 1.0)))
+        self.repairs = 0
+        self.failures = 0
+        self.ok = True
+        self.since = 0.0
+        self.timer: Optional[Timer] = None
+
+
+class Checks:
+    """
+    Periodic commands: health checks with repair, and watches that wait for a command's success.
+
+    :param emit: sends an event to the robot.
+    """
+
+    def __init__(self, processes: Processes, emit: Callable[[AgentEvent], None]) -> None:
+        self.processes = processes
+        self.loop = processes.loop
+        self.emit = emit
+        self.kept: dict[str, Kept] = {}
+        self.watched: dict[str, object] = {}
+
+    def keep(self, request: Json) -> None:
+        """Start a health check, or replace the one with the same ``what``."""
+        what, kept = str(request['what']), Kept(request)
+        former = self.kept.get(what)
+        if former is not None and former.timer is not None:
+            former.timer.at = None
+        self.kept[what] = kept
+        if kept.alive:
+            self._check(what, kept)
+
+    def _check(self, what: str, kept: Kept) -> None:
+        """Run a health check, repair on failure, and schedule the next check."""
+        def later() -> None:
+            pause = min(30.0, kept.interval * 2 ** min(kept.failures, 10))
+            kept.timer = self.loop.at(pause, lambda: self._check(what, kept))
+
+        def checked(status: int) -> None:
+            if self.kept.get(what) is not kept:
+                return
+            if status == 0:
+                kept.ok, kept.failures = True, 0
+                later()
+                return
+            if kept.ok:
+                say(f'{what} is down')
+                kept.ok, kept.since = False, self.loop.clock()
+            self.processes.spawn_all(kept.repair, repaired)
+
+        def repaired(good: bool) -> None:
+            kept.failures = 0 if good else kept.failures + 1
+            if good:
+                kept.repairs += 1
+                kept.ok = True
+                self.emit({'event': 'vpn_repaired', 'what': what,
+                           'seconds': self.loop.clock() - kept.since})
+            later()
+
+        self.processes.spawn(kept.alive, checked, timeout=CHECK_TIMEOUT)
+
+    def watch(self, request: Json) -> None:
+        """
+        Start a watch, or replace the one with the same ``what``.
+
+        :raises Refused: there is no such watch.
+        """
+        what, argv = str(request['what']), words(request['argv'])
+        interval = max(0.05, float(request.get('interval', 5.0)))
+        if what not in WATCHED or not argv:
+            raise Refused(f"there is no watch for '{what}'", ', '.join(WATCHED))
+        watch = self.watched[what] = object()
+
+        def look() -> None:
+            if self.watched.get(what) is watch:
+                output = os.memfd_create('watch', os.MFD_CLOEXEC)
+                self.processes.spawn(
+                    argv, lambda status: ran(status, output), timeout=CHECK_TIMEOUT,
+                    output=output)
+
+        def ran(status: int, output: int) -> None:
+            reason = os.pread(output, REASON, 0).decode(errors='replace').strip()
+            os.close(output)
+            if self.watched.get(what) is not watch:
+                return
+            if status == 0:
+                del self.watched[what]
+                say(f'{what}: {reason}')
+                self.emit({'event': 'notice', 'reason': reason})
+            else:
+                self.loop.at(interval, look)
+
+        look()
+
+    def status(self) -> list[HealthCheck]:
+        """Return the state of each health check."""
+        return [{'what': what, 'ok': kept.ok, 'repairs': kept.repairs}
+                for what, kept in self.kept.items()]
+
+    def take_down(self, then: Callable[[], None]) -> None:
+        """End all checks, run the ``down`` commands of health checks, then call ``then``."""
+        commands = [argv for kept in self.kept.values() for argv in kept.down]
+        self.kept.clear()
+        self.watched.clear()
+        self.processes.spawn_all(commands, lambda good: then())

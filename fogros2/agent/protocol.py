@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The agent's protocol: JSON objects, one per line.
+
+A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": true, ...}`` or
+``{"id": 1, "ok": false, "error", "hint", "kind"}``. Replies and events are in ``fogros2.events``.
+
+``configure``  any key of ``CONFIG``; restarts the lifetime and, with ``heartbeat``, the watchdog.
+               With another ``launch`` than before, the former launch's nodes stop first, and
+               what was kept for that launch ends. Refused (kind ``busy``) while the former launch
+               sets the machine up or sends heartbeats, unless ``force`` names the former launch,
+               which the robot knows to be dead.
+               With ``again`` it claims nothing: refused (kind ``released``) unless its ``launch``
+               still has the machine; the request may have been delayed until after a release.
+``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
+               health check with repair
+``watch``      ``what``, ``argv``, run as root every ``interval`` (s, default 5). When it exits
+               with 0, the agent sends one event named ``what``, with the output as ``reason``,
+               and ends the watch.
+``launch``     start the process that will run the nodes, ahead of time
+``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored
+``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
+``signal``     ``node``, ``signal``: 'SIGINT'
+``status``     the agent's state; ``ping`` is cheaper and returns nothing
+``log``        ``from`` seq: replies ``first`` and ``next`` (seqs that exist), then sends all
+               events from there on; ``lost`` counts events that rotation has deleted
+``release``    stop the nodes, take down what was kept, disarm the heartbeat, reply when done;
+               with ``exit`` true the agent then exits. Does nothing if another launch has taken
+               the machine over from ``launch``.
+
+Heartbeats are UDP datagrams from the robot's VPN address, a JSON object with ``launch``. The agent
+sends each back with ``clock`` added: the machine's time in seconds since the epoch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import sys
+import time
+
+TYPE_CHECKING = False  # importing typing takes a megabyte of memory
+if TYPE_CHECKING:
+    from typing import Any
+
+    Json = dict[str, Any]
+
+MAX_LINE = 16 << 20
+#: Bytes of one generation of the journal; two are kept.
+LOG_BYTES = 64 << 20
+
+#: Keys of the configuration: accepted types and default value.
+CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
+    'machine': ((str,), ''),
+    'launch': ((str,), ''),
+    'directory': ((str,), ''),
+    'user': ((str,), ''),
+    'on_exit': ((str,), 'delete'),
+    'lifetime': ((int, float), 8 * 3600.0),
+    'robot_timeout': ((int, float), 120.0),
+    'boot_timeout': ((int, float), 1800.0),
+    'end_command': ((list,), []),
+    'heartbeat': ((dict, type(None)), None),
+    'environment': ((dict,), {}),
+    'setup': ((list,), []),
+    'ros_command': ((list,), []),
+    'log_bytes': ((int,), LOG_BYTES),
+}
+
+
+class Refused(Exception):
+    """A request that was refused: message, hint, kind."""
+
+    def __init__(self, message: str, hint: str = '', kind: str = '') -> None:
+        super().__init__(message)
+        self.answer = {'error': message, 'hint': hint, 'kind': kind}
+
+
+def dump(data: Any) -> bytes:
+    """Return one line of JSON."""
+    return json.dumps(data, separators=(',', ':')).encode() + b'\n'
+
+
+def say(text: str) -> None:
+    """Write a line to the agent's own log (standard error)."""
+    with contextlib.suppress(OSError):
+        print(time.strftime('%Y-%m-%dT%H:%M:%S'), text, file=sys.stderr, flush=True)
+
+
+def words(argv: Any) -> list[str]:
+    """
+    Check that a value is a command line; return it.
+
+    :raises Refused: it is not a list of strings.
+    """
+    if not isinstance(argv, list) or not all(isinstance(w, str) and '\0' not in w for w in argv):
+        raise Refused(f'{json.dumps(argv)[:80]} is no list of words')
+    return argv
+
+
+def checked(new: Json) -> Json:
+    """
+    Check the types and values of a configuration; drop unknown keys.
+
+    :raises Refused: a value has the wrong type or is invalid.
+    """
+    known: Json = {key: value for key, value in new.items() if key in CONFIG}
+    for key, value in known.items():
+        if not isinstance(value, CONFIG[key][0]) or isinstance(value, bool):
+            raise Refused(f"'{key}' can't be {json.dumps(value)[:80]}")
+        if isinstance(value, (int, float)) and not 0 < value < 1e10:
+            raise Refused(f"'{key}' has to be above 0, not {value}")
+        if isinstance(value, list):
+            words(value)
+    if known.get('on_exit', 'delete') not in ('delete', 'stop', 'keep'):
+        raise Refused(f"'on_exit' can't be '{known['on_exit']}'", 'delete, stop or keep')
+    for key, value in known.get('environment', {}).items():
+        if not isinstance(value, str) or '=' in key or '\0' in key + value or not key:
+            raise Refused(f"'environment' can't set {key!r}")
+    heartbeat = known.get('heartbeat')
+    if heartbeat:
+        try:
+            socket.inet_aton(heartbeat['bind'])
+            socket.inet_aton(heartbeat['peer'])
+            if not 0 < heartbeat['port'] < 65536:
+                raise ValueError('port')
+        except (KeyError, OSError, TypeError, ValueError) as error:
+            raise Refused("'heartbeat' needs bind and peer, addresses, and a port") from error
+    return known

@@ -1,0 +1,659 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The agent's clients, their requests, and its command line.
+
+    agent.py serve --config FILE [--detach]    run the agent
+    agent.py connect --directory DIR           relay stdin and stdout to a running agent
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import fcntl
+import json
+import os
+import selectors
+import signal
+import socket
+import stat
+import sys
+import threading
+import time
+
+from fogros2.agent.journal import BLOCK, Journal
+from fogros2.agent.loop import Channel, Loop
+from fogros2.agent.nodes import Nodes
+from fogros2.agent.processes import Checks, Identity, Processes, remove_tree
+from fogros2.agent.protocol import checked, CONFIG, dump, MAX_LINE, Refused, say
+from fogros2.agent.watchdog import Heartbeats, Watchdog
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any, Optional
+
+    from fogros2.agent.protocol import Json
+    from fogros2.events import AgentEvent, Configured, Empty, Launched, StartedNodes, Status
+
+#: The number of connections; with more, the connection that was idle for longest is closed.
+CLIENTS = 64
+#: Seconds between attempts to end the machine.
+RETRY_END = 30.0
+#: Settings that a restarted agent takes over from its predecessor.
+RESUMED = (
+    'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
+    'ros_command')
+
+
+class Client(Channel):
+    """A connection: receives requests, sends replies and events."""
+
+    def __init__(self, agent: Agent, connection: socket.socket) -> None:
+        super().__init__(agent.loop, connection, self._requests)
+        self.agent = agent
+        #: The journal's position of the next event to send; None until the client wants events.
+        self.position: Optional[int] = None
+        #: The number of replies that are not available yet.
+        self.awaiting = 0
+        self.active = agent.loop.clock()
+
+    def _requests(self, lines: list[bytes]) -> None:
+        self.active = self.loop.clock()
+        for line in lines:
+            if self in self.agent.clients:
+                self.agent.request(self, line)
+        if len(self.received) > MAX_LINE:
+            self.received.clear()
+            self.ended = True
+            self.reply(None, {'error': f'a request is longer than {MAX_LINE} bytes'})
+        if self.ended:
+            self.position = None
+
+    def reply(self, number: Any, answer: Any) -> None:
+        """Send a reply; one with ``error`` in it is a failure."""
+        self.send(dump({'id': number, 'ok': 'error' not in answer, **answer}))
+
+    def reply_later(self, number: Any) -> Callable[[Any], None]:
+        """Return a function that sends the reply when it is available."""
+        self.awaiting += 1
+
+        def reply(answer: Any) -> None:
+            self.awaiting -= 1
+            self.reply(number, answer)
+        return reply
+
+    def send(self, data: bytes = b'') -> None:
+        """Send data, then events; the journal is the queue of the events."""
+        if self not in self.agent.clients:
+            return
+        self.out += data
+        self.more = self.position is not None
+        while self.more and len(self.out) < BLOCK:
+            assert self.position is not None
+            events, self.position = self.agent.journal.read(self.position)
+            self.out += events
+            self.more = bool(events)
+        super().send()
+        if self.ended and not self.out and not self.awaiting:
+            self.close()
+
+    def broken(self) -> None:
+        """Close a connection whose other end is gone."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        if self in self.agent.clients:
+            self.agent.clients.remove(self)
+            super().close()
+
+
+class Agent:
+    """
+    The agent of a machine: its configuration, which launch has it, and its end.
+
+    :param config: see ``CONFIG``.
+    """
+
+    def __init__(self, config: Json) -> None:
+        self.config = {key: default for key, (_, default) in CONFIG.items()}
+        self.config.update(checked(config))
+        self.identity = Identity(self.config['user'])
+        account = self.identity.account
+        directory = self.config['directory']
+        if directory.startswith('~/'):
+            directory = os.path.join(account.pw_dir, directory[2:])
+        self.directory = os.path.normpath(directory)
+        if not os.path.isabs(self.directory) or self.directory in ('/', account.pw_dir):
+            # the agent deletes its content in the end, so it must belong to the agent alone
+            raise Refused(f"the agent can't have the directory '{self.directory}'")
+        self.config.update(user=account.pw_name, directory=self.directory)
+        self.loop = Loop()
+        self.processes = Processes(self.loop, self.identity)
+        self.checks = Checks(self.processes, self.emit)
+        self.nodes = Nodes(self.processes, self.directory, self.config, self.write)
+        self.watchdog = Watchdog(self.config, self.loop.clock())
+        self.heartbeats = Heartbeats(self.loop, self.config, self.watchdog)
+        self.clients: list[Client] = []
+        self.ending = self.done = False
+        #: Whether a launch has taken the machine over from the launch that created it.
+        self.adopted = False
+        #: The launch that will have the machine when the former launch's nodes have ended.
+        self.claimed = ''
+        #: Whether no launch has the machine; late requests of the former launch start nothing.
+        self.released = False
+        self.since = time.time()
+
+    # -- the directory ------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """
+        Create the directory, lock it, and open the socket in it.
+
+        :raises Refused: the directory is not writable, or another agent uses it.
+        """
+        try:
+            self.identity.assume()
+            try:
+                self._make_directory()
+            except PermissionError:
+                with self.identity.root():
+                    self._make_directory()
+            folder = os.stat(self.directory, follow_symlinks=False)
+            if not stat.S_ISDIR(folder.st_mode) or \
+                    folder.st_uid != self.identity.account.pw_uid:
+                raise Refused(f'{self.directory} belongs to somebody else')
+            os.chmod(self.directory, 0o700)
+            self.lock = os.open(
+                self.path('agent.pid'),
+                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                other = os.pread(self.lock, 20, 0).decode().strip()
+                raise Refused(
+                    f'another agent (process {other}) serves {self.directory}',
+                    'connect to it', 'running') from None
+            self._resume()
+            self.journal = Journal(self.directory, self.config['log_bytes'])
+            self.listener = self._listen()
+        except OSError as error:
+            raise Refused(f"{self.directory} can't be used: {error.strerror or error}") from error
+
+    def _make_directory(self) -> None:
+        os.makedirs(os.path.dirname(self.directory), mode=0o755, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(self.directory, 0o700)
+            # change the owner only of a new directory, and never through a symbolic link
+            folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            account = self.identity.account
+            os.fchown(folder, account.pw_uid, account.pw_gid)
+            os.close(folder)
+
+    def _listen(self) -> socket.socket:
+        path = self.path('agent.sock')
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)  # left by a former agent: this one holds the lock
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        mask = os.umask(0o177)
+        # a Unix socket address has at most 107 bytes; the directory's path may be longer
+        folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            listener.bind(f'/proc/self/fd/{folder}/agent.sock')
+        finally:
+            os.umask(mask)
+            os.close(folder)
+        listener.listen(2 * CLIENTS)
+        return listener
+
+    def path(self, name: str) -> str:
+        """Return the path of a file in the agent's directory."""
+        return os.path.join(self.directory, name)
+
+    def _resume(self) -> None:
+        """Take over the configuration of an agent that died in this directory."""
+        try:
+            with open(self.path('config.json')) as stream:
+                saved = checked(json.load(stream))
+        except (AttributeError, OSError, Refused, ValueError):
+            return
+        if saved.get('machine') == self.config['machine']:
+            # the user could have written the file: take nothing that root would execute
+            self.config.update({key: saved[key] for key in RESUMED if key in saved})
+            self._restart_watchdog()
+            if not self.config['launch'] and self.config['on_exit'] == 'keep':
+                self.watchdog.disarm()  # a kept machine expects no launch
+                self.released = True
+
+    def save(self) -> None:
+        """Write the pid for people, and the configuration for a restarted agent."""
+        try:
+            os.ftruncate(self.lock, 0)
+            os.pwrite(self.lock, f'{os.getpid()}\n'.encode(), 0)
+            aside = self.path('config.json.new')
+            fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
+            with os.fdopen(fd, 'w') as stream:
+                json.dump(self.config, stream)
+            os.replace(aside, self.path('config.json'))
+        except OSError as error:
+            say(f"the configuration can't be kept: {error}")
+
+    # -- running ------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Serve until the agent ends."""
+        alarm, wake = socket.socketpair()
+        alarm.setblocking(False)
+        wake.setblocking(False)
+        signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+        # a handler, because children would inherit an ignored SIGHUP
+        for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda number, frame: None)
+        self.loop.select(
+            alarm, selectors.EVENT_READ, lambda mask: self._on_signals(alarm.recv(4096)))
+        self.loop.select(self.listener, selectors.EVENT_READ, self._accept)
+        self.save()
+        try:
+            self.heartbeats.open()
+        except Refused as error:
+            say(str(error))
+        self.nodes.trim_log()
+        if self.journal.next > 1:
+            # the nodes ended with the agent that died here, and nothing has reported it
+            self.emit({'event': 'launch_exited', 'returncode': -int(signal.SIGKILL), 'said': ''})
+        while not self.done:
+            until = self.loop.clock() + 60.0
+            if not self.ending:
+                self._watch()
+                until = self.watchdog.deadlines()[0][0]
+            self.loop.turn(until)
+        for client in list(self.clients):
+            client.close()
+
+    def _on_signals(self, numbers: bytes) -> None:
+        if signal.SIGCHLD in numbers:
+            self.processes.reap()
+        if signal.SIGTERM in numbers or signal.SIGINT in numbers:
+            if self.ending and self.nodes.stopping:
+                self.done = True  # the second signal ends the agent at once
+            say('asked to end')
+            if not self.ending:
+                self.emit({'event': 'ending', 'reason': 'asked to end by a signal'})
+            self.ending = True
+            self.loop.at(1.8, self._leave)
+            self.nodes.stop_all(lambda: self.checks.take_down(self._leave), quickly=True)
+
+    def emit(self, event: AgentEvent) -> None:
+        """Append an event to the journal, and send it to the clients that follow."""
+        self.write([dump(event)[1:]])
+
+    def write(self, lines: list[bytes]) -> None:
+        """Append events as ``Journal.append`` does, and send them to the clients that follow."""
+        self.journal.append(lines)
+        for client in list(self.clients):
+            if client.position is not None and not client.out:
+                client.send()
+
+    def _accept(self, mask: int) -> None:
+        try:
+            connection, _ = self.listener.accept()
+        except OSError:
+            return
+        if len(self.clients) >= CLIENTS:
+            # connections whose network is gone accumulate here
+            min(self.clients, key=lambda client: client.active).close()
+        self.clients.append(Client(self, connection))
+
+    def request(self, client: Client, line: bytes) -> None:
+        """Serve a request."""
+        number = None
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise Refused('a request is a JSON object')
+            number, command = request.get('id'), request.get('command')
+            handler = HANDLERS.get(command) if isinstance(command, str) else None
+            if handler is None:
+                raise Refused(f'no such command: {json.dumps(command)[:80]}',
+                              f"there are: {', '.join(sorted(HANDLERS))}", 'unknown')
+            answer = handler(self, client, request)
+        except Refused as error:
+            answer = error.answer
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            what = f'{error} is missing' if isinstance(error, KeyError) else str(error)
+            answer = {'error': f'malformed request: {what[:200]}', 'kind': 'malformed'}
+        except OSError as error:
+            answer = {'error': f'{error.filename or "the machine"}: {error.strerror or error}'}
+        if answer is not None:
+            client.reply(number, answer)
+
+    # -- requests -----------------------------------------------------------------------------
+
+    def do_configure(self, client: Client, request: Json) -> Optional[Configured]:
+        """Change settings; a new launch takes the machine over."""
+        new = checked(request)
+        for fixed in ('directory', 'user', 'log_bytes'):
+            new.pop(fixed, None)
+        if self.ending:
+            raise Refused('this machine is ending', 'launch again', 'ending')
+        owner = self.config['launch']  # '' after a reboot: no owner until a launch comes
+        taken_over = new.get('launch', owner) != owner
+        if taken_over and request.get('again'):
+            raise Refused(f"launch '{new['launch']}' doesn't have this machine any more",
+                          kind='released')
+        heard_at = self.watchdog.heard_at
+        if taken_over and owner and heard_at is not None and request.get('force') != owner:
+            raise Refused(
+                f"this machine belongs to launch '{owner}', whose last sign of life is "
+                f'{self.loop.clock() - heard_at:.0f} s old',
+                'end that launch, or choose another name', 'busy')
+        running = self.nodes.launch is not None
+        outdated = running and not self.nodes.running and any(
+            new.get(key, self.config[key]) != self.config[key]
+            for key in ('setup', 'ros_command', 'environment'))
+        occupied = taken_over and (running or self.checks.kept or self.checks.watched)
+        if not (self.nodes.stopping or outdated or occupied):
+            return self._configure(new, taken_over)
+        if taken_over:
+            self.claimed = new['launch']
+        reply = client.reply_later(request.get('id'))
+
+        def stopped() -> None:
+            try:
+                if taken_over and self.claimed != new['launch']:
+                    raise Refused('the machine was released meanwhile', kind='released')
+                reply(self._configure(new, taken_over))
+            except Refused as error:
+                reply(error.answer)
+
+        # the former launch's VPN uses the port that the new launch needs
+        self.nodes.stop_all(
+            (lambda: self.checks.take_down(stopped)) if taken_over else stopped)
+        return None
+
+    def _configure(self, new: Json, taken_over: bool) -> Configured:
+        if taken_over:
+            self.claimed = ''
+            self.adopted = True
+            self.nodes.states.clear()
+            new.setdefault('heartbeat', None)
+        self.released = self.released and not new.get('launch')
+        self.config.update(new)
+        if taken_over:
+            self.watchdog.disarm()
+            self.watchdog.boot_from = self.loop.clock()
+        self._restart_watchdog()
+        self.save()
+        self.heartbeats.open()
+        return {'machine': self.config['machine'], 'next': self.journal.next}
+
+    def _restart_watchdog(self) -> None:
+        self.watchdog.configured(self.loop.clock(), heartbeat=bool(self.config['heartbeat']))
+
+    def _check_held(self) -> None:
+        """
+        Refuse to start anything for a launch that has released the machine: a late request.
+
+        :raises Refused: no launch has the machine, or the agent is ending.
+        """
+        if self.released:
+            raise Refused('no launch has this machine any more', kind='released')
+        if self.ending:
+            raise Refused('the agent is stopping its nodes', kind='ending')
+
+    def do_keep(self, client: Client, request: Json) -> Empty:
+        """Start a health check, or replace the one with the same ``what``."""
+        self._check_held()
+        self.checks.keep(request)
+        return {}
+
+    def do_watch(self, client: Client, request: Json) -> Empty:
+        """Start a watch, or replace the one with the same ``what``."""
+        self._check_held()
+        self.checks.watch(request)
+        return {}
+
+    def do_launch(self, client: Client, request: Json) -> Launched:
+        """Start the launch process, if it does not run."""
+        self._check_held()
+        return {'pid': self.nodes.start_launch().pid}
+
+    def do_start(self, client: Client, request: Json) -> StartedNodes:
+        """Start nodes."""
+        specs = request['nodes']
+        self._check_held()
+        return {'known': self.nodes.start(specs)}
+
+    def do_stop(self, client: Client, request: Json) -> Empty:
+        """Stop nodes."""
+        self.nodes.stop(request.get('nodes'))
+        return {}
+
+    def do_signal(self, client: Client, request: Json) -> Empty:
+        """Send a node a signal."""
+        self.nodes.signal(str(request['node']), str(request['signal']))
+        return {}
+
+    def do_status(self, client: Client, request: Json) -> Status:
+        """Return the agent's state."""
+        with open('/proc/self/statm') as stream:
+            rss = int(stream.read().split()[1]) * os.sysconf('SC_PAGE_SIZE') // 1024
+        config, now, dog = self.config, self.loop.clock(), self.watchdog
+        launch = self.nodes.launch
+        return {
+            'machine': config['machine'], 'launch': config['launch'], 'pid': os.getpid(),
+            'user': config['user'], 'directory': self.directory, 'since': self.since,
+            'on_exit': config['on_exit'], 'robot_timeout': config['robot_timeout'],
+            'lifetime_left': dog.lifetime_from + config['lifetime'] - now,
+            'heartbeat_age': None if dog.beat_at is None else now - dog.beat_at,
+            'ending': self.ending,
+            'launch_running': launch is not None and not launch.stopping,
+            'nodes': list(self.nodes.states.values()), 'kept': self.checks.status(),
+            'rss_kb': rss, 'first': self.journal.first, 'next': self.journal.next,
+        }
+
+    def do_ping(self, client: Client, request: Json) -> Empty:
+        """Reply, as a sign of life."""
+        return {}
+
+    def do_log(self, client: Client, request: Json) -> None:
+        """Send the events from a seq on."""
+        begin, journal = max(1, int(request.get('from') or 1)), self.journal
+        client.reply(request.get('id'), {
+            'first': journal.first, 'next': journal.next, 'lost': max(0, journal.first - begin)})
+        client.position = journal.find(begin)
+        client.send()
+
+    def do_release(self, client: Client, request: Json) -> None:
+        """Stop the nodes of a launch and release the machine."""
+        asked, has = request.get('launch'), self.claimed or self.config['launch']
+        if asked and has and asked != has:
+            client.reply(request.get('id'), {})
+            return
+        self.config.update(checked({'on_exit': request.get('on_exit', self.config['on_exit'])}))
+        self.claimed = ''
+        self.released = True
+        self.watchdog.disarm()
+        self.config.update(heartbeat=None, launch='')
+        self.heartbeats.open()
+        self.save()
+        reply = client.reply_later(request.get('id'))
+
+        def stopped() -> None:
+            if request.get('exit'):
+                reply({})
+                self.checks.take_down(self._leave_for_good)
+            else:
+                # end the health check first: it would recreate the VPN interface
+                self.checks.take_down(lambda: reply({}))
+
+        if request.get('exit'):
+            self._hurry()
+        self.nodes.stop_all(stopped)
+
+    # -- the end ------------------------------------------------------------------------------
+
+    def _watch(self) -> None:
+        """Stop the nodes or end the machine when a deadline of the watchdog has passed."""
+        reason = self.watchdog.due(self.loop.clock())
+        if reason is None:
+            return
+        # 'no launch came' ends a machine whose first launch died, but not an adopted machine
+        gone = reason == 'robot gone' or (reason == 'no launch came' and self.adopted)
+        stay = gone and self.config['on_exit'] == 'keep'
+        ends = 'end the machine' if self.config['end_command'] else 'leave'
+        action = 'stop the nodes' if stay else ends
+        say(f'{reason}: {action}')
+        self.emit({'event': 'watchdog', 'reason': reason, 'action': action})
+        self.watchdog.disarm()
+        if stay:
+            self.nodes.stop_all(lambda: None)
+        else:
+            self._hurry()
+            self.nodes.stop_all(self._end_machine)
+
+    def _hurry(self) -> None:
+        """Start nothing more, and give processes that a launch process left little time."""
+        self.ending = self.nodes.quickly = True
+
+    def _end_machine(self) -> None:
+        """End the machine, retrying until it works; exit where there is no end command."""
+        command = self.config['end_command']
+        if not command:
+            self.checks.take_down(self._leave_for_good)
+            return
+
+        def ended(status: int) -> None:
+            if status != 0:
+                self.emit({'event': 'end_failed', 'returncode': status})
+            if os.getpid() == 1:
+                self.done = True  # the container ends with this process
+            self.loop.at(RETRY_END, self._end_machine)
+        self.processes.spawn(command, ended, timeout=60.0)
+
+    def _leave(self) -> None:
+        """Exit, and leave the journal and the configuration to a restarted agent."""
+        self.done = True
+        for name in ('agent.sock', 'agent.pid'):
+            with contextlib.suppress(OSError):
+                os.unlink(self.path(name))
+
+    def _leave_for_good(self) -> None:
+        """Exit, and remove the directory; the last agent removes the folder of all agents."""
+        self.done = True
+        remove_tree(self.directory)
+        parent = os.path.dirname(self.directory)
+        for folder in (self.directory, parent):
+            if folder is not parent or os.path.basename(parent) == 'fogros2':
+                with self.identity.root(), contextlib.suppress(OSError):
+                    os.rmdir(folder)
+
+
+HANDLERS: dict[str, Callable[[Agent, Client, Json], Any]] = {
+    name[3:]: getattr(Agent, name) for name in vars(Agent) if name.startswith('do_')}
+
+
+def detach() -> int:
+    """
+    Become a daemon; the parent prints a line about the start, and exits.
+
+    Returns the daemon's descriptor for that line.
+    """
+    reader, writer = os.pipe()
+    if os.fork():
+        os.close(writer)
+        with os.fdopen(reader, 'rb') as stream:
+            line = stream.read()
+        sys.stdout.buffer.write(line or dump({'error': 'the agent died while starting'}))
+        sys.stdout.flush()
+        os._exit(0 if b'"ready":true' in line else 1)
+    os.close(reader)
+    os.setsid()
+    null = os.open(os.devnull, os.O_RDWR)
+    for fd in (0, 1, 2):
+        os.dup2(null, fd)
+    return writer
+
+
+def read(path: str) -> Json:
+    """
+    Return the configuration in a file.
+
+    :raises Refused: the file cannot be read, or names no directory.
+    """
+    try:
+        with open(path) as stream:
+            config = json.load(stream)
+    except (OSError, ValueError) as error:
+        raise Refused(f"the configuration {path} can't be read: {error}") from error
+    if not isinstance(config, dict) or not config.get('directory'):
+        raise Refused(f"the configuration {path} names no 'directory'")
+    return config
+
+
+def serve(config_path: str, *, daemon: bool) -> int:
+    """Run the agent with a configuration file; return the exit status."""
+    answer = detach() if daemon else -1
+    try:
+        agent = Agent(read(config_path))
+        agent.open()
+    except Refused as error:
+        if daemon:
+            os.write(answer, dump(error.answer))
+        else:
+            say(str(error))
+        return 1
+    if daemon:
+        log = os.open(agent.path('agent.log'),
+                      os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o600)
+        os.dup2(log, 2)
+        os.close(log)
+        os.write(answer, dump({'ready': True, 'socket': agent.path('agent.sock'),
+                               'pid': os.getpid()}))
+        os.close(answer)
+    agent.run()
+    return 0
+
+
+def connect(directory: str) -> int:
+    """Relay stdin and stdout to the agent of a directory; return the exit status."""
+    directory = os.path.expanduser(directory)
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        link.connect(f'/proc/self/fd/{folder}/agent.sock')
+        os.close(folder)
+    except OSError as error:
+        sys.stdout.buffer.write(dump({
+            'error': f'no agent serves {directory}: {error.strerror}', 'kind': 'absent'}))
+        return 3
+
+    def send() -> None:
+        with contextlib.suppress(OSError):
+            while data := os.read(0, BLOCK):
+                link.sendall(data)
+            link.shutdown(socket.SHUT_WR)  # the agent still answers pending requests
+
+    threading.Thread(target=send, daemon=True).start()
+    with contextlib.suppress(OSError, KeyboardInterrupt):
+        while data := link.recv(BLOCK):
+            while data:
+                data = data[os.write(1, data):]
+    return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Run a command line; return the exit status."""
+    daemon = '--detach' in arguments
+    rest = [word for word in arguments if word != '--detach']
+    if len(rest) == 3 and rest[:2] == ['serve', '--config']:
+        return serve(rest[2], daemon=daemon)
+    if len(rest) == 3 and rest[:2] == ['connect', '--directory']:
+        return connect(rest[2])
+    sys.stderr.write('usage: agent.py serve --config FILE [--detach]\n'
+                     '       agent.py connect --directory DIR\n')
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When the machine has to end: the lifetime, the boot time-out, and missing heartbeats."""
+
+from __future__ import annotations
+
+import json
+import selectors
+import socket
+import time
+
+from fogros2.agent.loop import Loop
+from fogros2.agent.protocol import dump, Refused
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Optional
+
+    from fogros2.agent.protocol import Json
+
+#: Linux: allow to bind to an address that does not exist yet.
+IP_FREEBIND = 15
+
+
+class Watchdog:
+    """
+    Decide when a machine has to release its nodes; the caller passes the time in seconds.
+
+    ``boot_timeout`` applies until a heartbeat is configured, then ``robot_timeout``.
+    """
+
+    def __init__(self, config: Json, now: float) -> None:
+        self.config = config
+        self.lifetime_from = now
+        self.boot_from: Optional[float] = now
+        self.beat_at: Optional[float] = None
+
+    def configured(self, now: float, *, heartbeat: bool) -> None:
+        """Restart the lifetime and the heartbeat's deadline: a launch has configured the agent."""
+        self.lifetime_from = now
+        if heartbeat:
+            self.boot_from, self.beat_at = None, now
+        elif self.boot_from is not None:
+            self.boot_from = now
+
+    def beat(self, now: float) -> None:
+        """Note a heartbeat; ignored after ``disarm``."""
+        if self.beat_at is not None:
+            self.beat_at = now
+
+    def disarm(self) -> None:
+        """Expect no heartbeat: the launch has ended or is known to be gone; keep the lifetime."""
+        self.boot_from = self.beat_at = None
+
+    @property
+    def heard_at(self) -> Optional[float]:
+        """When the current launch was last heard, None without a launch."""
+        return self.boot_from if self.beat_at is None else self.beat_at
+
+    def deadlines(self) -> list[tuple[float, str]]:
+        """Return (time, reason as in the event) of each deadline, soonest first."""
+        found = [(self.lifetime_from + self.config['lifetime'], 'lifetime')]
+        if self.boot_from is not None:
+            found.append((self.boot_from + self.config['boot_timeout'], 'no launch came'))
+        if self.beat_at is not None:
+            found.append((self.beat_at + self.config['robot_timeout'], 'robot gone'))
+        return sorted(found)
+
+    def due(self, now: float) -> Optional[str]:
+        """Return the reason of a deadline that has passed, or None."""
+        at, reason = self.deadlines()[0]
+        return reason if now >= at else None
+
+
+class Heartbeats:
+    """Receive heartbeats for a watchdog, and answer them."""
+
+    def __init__(self, loop: Loop, config: Json, watchdog: Watchdog) -> None:
+        self.loop = loop
+        self.config = config
+        self.watchdog = watchdog
+        self.socket: Optional[socket.socket] = None
+
+    def open(self) -> None:
+        """
+        Listen for heartbeats at the configured address, if there is one.
+
+        :raises Refused: the address cannot be used.
+        """
+        if self.socket is not None:
+            self.loop.select(self.socket, 0, self._receive)
+            self.socket.close()
+            self.socket = None
+        where = self.config['heartbeat']
+        if not where:
+            return
+        link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        try:
+            # the VPN's address may appear later, and disappear for a time
+            link.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
+            link.bind((where['bind'], where['port']))
+        except (OSError, OverflowError) as error:
+            link.close()
+            raise Refused(f"no heartbeats at {where['bind']}:{where['port']}: {error}") from error
+        self.socket = link
+        self.loop.select(link, selectors.EVENT_READ, self._receive)
+
+    def _receive(self, mask: int) -> None:
+        assert self.socket is not None
+        try:
+            data, peer = self.socket.recvfrom(2048)
+            if peer[0] != self.config['heartbeat']['peer']:
+                return
+            beat = json.loads(data)
+            if beat['launch'] != self.config['launch']:
+                return
+            self.watchdog.beat(self.loop.clock())
+            self.socket.sendto(dump({**beat, 'clock': time.time()}), peer)
+        except (OSError, KeyError, TypeError, ValueError, RecursionError):
+            return  # the VPN is down, or the datagram is invalid

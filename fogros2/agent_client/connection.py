@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A connection to a machine's agent: requests, and events that survive a lost connection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import itertools
+import json
+import math
+import threading
+import time
+from typing import Any, cast, Optional
+
+from fogros2 import events
+from fogros2.errors import (
+    AgentAbsent,
+    AgentError,
+    Cancelled,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+)
+from fogros2.model import Command, to_json
+from fogros2.shell import Shell, Stream
+from fogros2.waiting import wait_until
+
+#: Seconds without data after which a connection counts as lost.
+SILENCE = 20.0
+#: Seconds after which an agent that has gone will not come back.
+RESTART = 5.0
+
+#: A request without a waiting caller; its reply shows that the agent is there.
+_PING = b'{"id":0,"command":"ping"}\n'
+
+EventCallback = Callable[[events.Event], None]
+
+
+class _Pending:
+    """A request that waits for its reply."""
+
+    def __init__(self, command: str, line: bytes) -> None:
+        self.command = command
+        self.line = line
+        self.done = threading.Event()
+        self.reply: dict[str, Any] = {}
+
+
+class AgentClient:
+    """
+    A connection to a machine's agent that reconnects after a loss.
+
+    One thread reads, and checks each message against ``fogros2.events``. It passes each event to
+    the subscribers, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
+    agent that sends an invalid message, as one that is gone.
+    A subscriber must not make requests: its own thread would have to read their replies.
+
+    :param shell: reaches the machine.
+    :param directory: the agent's directory on the machine.
+    :param python: interpreter on the machine.
+    :param agent_path: path of ``agent.py`` on the machine.
+    :param cancel: when set, requests raise Cancelled and no new connection is opened.
+    :param silence: seconds without a byte, although a ping was sent, after which a connection
+        counts as lost. TCP would need 15 minutes after the robot has changed networks.
+    :param restart: seconds that an agent may need to restart.
+    """
+
+    def __init__(
+        self,
+        shell: Shell,
+        directory: str,
+        *,
+        agent_path: str,
+        python: str = 'python3',
+        cancel: Optional[threading.Event] = None,
+        silence: float = SILENCE,
+        restart: float = RESTART,
+    ) -> None:
+        self._shell = shell
+        self._command = Command(
+            # -IS: the agent needs only the standard library, and searching for more takes time
+            (python, '-IS', agent_path, 'connect', '--directory', directory),
+            what='reach the agent')
+        self._callbacks: list[EventCallback] = []
+        self._cancel = cancel or threading.Event()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._writing = threading.Lock()
+        self._silence = silence
+        self._heard = 0.0
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._stream: Optional[Stream] = None
+        self._error: Optional[AgentError] = None
+        self._restart = restart
+        self._ever = self._lost = False
+        self._absent: Optional[str] = None
+        self._next: Optional[int] = None
+        #: The id of the request whose reply says where the log begins; 0 is a ping's.
+        self._log_request = -1
+        self._thread: Optional[threading.Thread] = None
+
+    @property
+    def silent_for(self) -> float:
+        """Seconds since the last data from the machine; normally up to ``silence / 4``."""
+        return time.monotonic() - self._heard
+
+    def connect(self) -> None:
+        """
+        Open the connection now instead of with the first request; idempotent.
+
+        :raises ConnectError: the machine cannot be reached.
+        :raises AgentError: the connection was closed.
+        """
+        with self._lock:
+            if self._thread is not None:
+                return
+            if self._closed.is_set():
+                raise AgentError('the connection to the agent was closed')
+            self._stream = self._shell.open(self._command)
+            self._heard = time.monotonic()
+            self._thread = threading.Thread(
+                target=self._read_all, name='fogros2-agent', daemon=True)
+            self._thread.start()
+            threading.Thread(target=self._watch, name='fogros2-agent-watch', daemon=True).start()
+
+    def request(
+        self, command: str, *, timeout: float = 30.0, silent: Optional[float] = None,
+        **arguments: Any,
+    ) -> dict[str, Any]:
+        """
+        Send a request to the agent and return its reply.
+
+        If the connection breaks, the client reconnects and repeats the request, except ``signal``,
+        which would take effect twice.
+
+        :param timeout: seconds, including the time of lost connections.
+        :param silent: seconds without any data after which the request fails earlier; must be more
+            than half of ``silence``, because a busy agent still answers pings.
+        :raises AgentError: refused, with the agent's hint; or no agent is there (any more).
+        :raises DeadlineExceeded: no reply in time.
+        :raises Cancelled: ``cancel`` was set.
+        """
+        if threading.current_thread() is self._thread:
+            raise RuntimeError('a subscriber must not make requests')
+        self.connect()
+        number = next(self._numbers)
+        line = to_json({'id': number, 'command': command, **arguments}).encode() + b'\n'
+        pending = _Pending(command, line)
+        with self._lock:
+            if self._error is not None:
+                raise self._error
+            self._pending[number] = pending
+            stream = self._stream
+        if stream is not None:
+            self._send(stream, line)
+        begin = time.monotonic()
+        deadline = begin + timeout
+        try:
+            while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
+                if self._cancel.is_set():
+                    raise Cancelled(f"'{command}' of the agent")
+                if time.monotonic() >= deadline:
+                    raise DeadlineExceeded(
+                        f"the agent didn't answer '{command}' within {timeout:g} s")
+                if silent is not None and min(
+                        self.silent_for, time.monotonic() - begin) > silent:
+                    raise DeadlineExceeded(
+                        f"the agent sent nothing for {silent:g} s and didn't answer '{command}'")
+        finally:
+            with self._lock:
+                self._pending.pop(number, None)
+        reply = pending.reply
+        if isinstance(self._error, AgentAbsent):
+            raise self._error
+        if not reply.get('ok'):
+            raise AgentError(str(reply.get('error', 'refused')), str(reply.get('hint', '')))
+        return reply
+
+    def status(self, *, timeout: float = 30.0) -> events.Status:
+        """Return the agent's state; see ``request``."""
+        return cast(events.Status, self.request('status', timeout=timeout))
+
+    def subscribe(self, callback: EventCallback, since: Optional[int] = None) -> None:
+        """
+        Pass events to ``callback``, each once and in order, across lost connections.
+
+        The first subscriber decides where to begin; later ones join at the current event.
+
+        :param since: first seq, 1 for all that the agent has; None for new events only.
+        :raises AgentError: as for ``request``.
+        """
+        if since is None and self._next is None:
+            since = self.status()['next']
+        self._callbacks.append(callback)
+        if self._next is not None or since is None:
+            return
+        self._next = since
+        self.connect()
+        with self._lock:
+            stream = self._stream
+        if stream is not None:
+            self._follow_on(stream)
+
+    def close(self) -> None:
+        """Close the connection; waiting requests fail, and the agent keeps running."""
+        self._closed.set()
+        with self._lock:
+            stream, thread = self._stream, self._thread
+        if stream is not None:
+            stream.close()
+        if thread is not None and thread is not threading.current_thread():
+            # a thread that is still connecting notices later; its result is not needed
+            thread.join(5.0 if stream is not None else 0.5)
+
+    # -- the reader's thread --------------------------------------------------------------
+
+    def _read_all(self) -> None:
+        pause, quiet_since = 0.0, time.monotonic()
+        try:
+            while not self._closed.is_set():
+                if self._read_stream():
+                    pause, quiet_since = 0.0, time.monotonic()
+                else:
+                    self._judge(time.monotonic() - quiet_since)
+                if self._error is not None:
+                    break
+                if self._ever and not self._lost and not self._closed.is_set():
+                    self._lost = True
+                    self._tell({'event': 'connection', 'state': 'lost'})
+                if self._closed.wait(pause):
+                    break
+                pause = min(2 * pause + 0.1, 5.0)
+                self._reopen()
+                if self._stream is None:
+                    break
+        finally:
+            error = self._error or AgentError('the connection to the agent was closed')
+            with self._lock:
+                self._error = error
+                waiting = list(self._pending.values())
+            for pending in waiting:
+                pending.reply = {'ok': False, 'error': str(error.args[0]), 'hint': error.hint}
+                pending.done.set()
+        if self._error is not None and not self._closed.is_set():
+            self._tell({'event': 'connection', 'state': 'absent', 'error': str(self._error)})
+
+    def _judge(self, seconds: float) -> None:
+        """Give up an agent that was silent for so many seconds, if it will not come back."""
+        if self._absent is not None and (not self._ever or seconds > self._restart):
+            self._error = AgentAbsent(self._absent, 'its machine may have ended')
+        elif not self._ever and seconds > self._restart:
+            self._error = AgentError(
+                'the program that connects to the agent ended without an answer',
+                'is python3 on the machine, and agent.py with it?')
+
+    def _read_stream(self) -> bool:
+        """Read until the stream ends; return whether an agent answered."""
+        stream = self._stream
+        assert stream is not None
+        self._absent = None
+        spoke = False
+        try:
+            for line in iter(stream.readline, b''):
+                self._heard = time.monotonic()
+                message = _parsed(line)
+                if message is None:
+                    if spoke and line.endswith(b'\n'):
+                        raise events.InvalidMessage('not an event or an answer')
+                elif message.get('kind') == 'absent' and 'ok' not in message:
+                    self._absent = str(message.get('error'))
+                else:
+                    self._ever = spoke = True
+                    if self._lost:
+                        self._lost = False
+                        self._tell({'event': 'connection', 'state': 'back'})
+                    if 'event' in message:
+                        self._deliver(message)
+                    else:
+                        self._answer(message)
+        except events.InvalidMessage as error:
+            self._error = AgentError(
+                f'the agent sent an invalid message ({error})',
+                'the machine may be hijacked: delete it')
+        with self._lock:
+            self._stream = None
+        stream.close()
+        return spoke
+
+    def _deliver(self, message: dict[str, Any]) -> None:
+        event, seq = events.event(message), message.get('seq')
+        if seq is not None and self._next is not None and seq >= self._next:
+            self._next = seq + 1
+            if event is not None:
+                self._tell(event)
+
+    def _answer(self, message: dict[str, Any]) -> None:
+        number = message.get('id')
+        if number == self._log_request:
+            self._compare_logs(events.answer('log', message))
+            return
+        with self._lock:
+            pending = self._pending.get(number) if isinstance(number, int) else None
+        if pending is not None:
+            pending.reply = events.answer(pending.command, message)
+            pending.done.set()
+
+    def _compare_logs(self, log: dict[str, Any]) -> None:
+        """Report events that the agent's log has lost; begin anew with an agent that is new."""
+        if log['next'] < (self._next or 1):
+            # none of its events was delivered
+            self._next = 1
+            stream = self._stream
+            if log['next'] > 1 and stream is not None:
+                self._follow_on(stream)
+        elif log['lost'] > 0:
+            self._tell({'event': 'gap', 'count': log['lost']})
+
+    def _tell(self, event: events.Event) -> None:
+        for callback in self._callbacks:
+            callback(event)
+
+    def _follow_on(self, stream: Stream) -> None:
+        self._log_request = next(self._numbers)
+        self._send(stream, to_json({
+            'id': self._log_request, 'command': 'log', 'from': self._next, 'follow': True,
+        }).encode() + b'\n')
+
+    def _send(self, stream: Stream, line: bytes) -> None:
+        """Write a line; after a connection error the reading thread repeats the requests."""
+        with self._writing, contextlib.suppress(ConnectError):
+            stream.write(line)
+
+    def _watch(self) -> None:
+        """Ping a silent connection, and close it if nothing comes back."""
+        thread = self._thread
+        while thread is not None and thread.is_alive():
+            if self._closed.wait(self._silence / 4):
+                return
+            stream, silent = self._stream, time.monotonic() - self._heard
+            if stream is None or silent < self._silence / 4:
+                continue
+            if silent > self._silence:
+                stream.close()
+            elif self._writing.acquire(timeout=self._silence / 4):
+                # a thread that holds the lock for longer is stuck in a dead connection
+                self._writing.release()
+                self._send(stream, _PING)
+
+    def _reopen(self) -> None:
+        """Reconnect, with increasing pauses, until the client is closed."""
+        def attempt() -> Optional[Stream]:
+            if self._cancel.is_set():
+                raise Cancelled('the connection to the agent')
+            with contextlib.suppress(ConnectError, DeadlineExceeded):
+                return self._shell.open(self._command)
+            return None
+
+        try:
+            stream = wait_until(
+                attempt, timeout=math.inf, what='the agent', cancel=self._closed,
+                interval=0.1, longest=5.0)
+        except Cancelled:
+            return
+        except FogError as error:
+            # a changed host key or a refused login key: reconnecting does not help
+            self._error = AgentError(f"the agent can't be reached: {error.args[0]}", error.hint)
+            return
+        if self._closed.is_set():
+            stream.close()
+            return
+        self._heard = time.monotonic()
+        with self._lock:
+            self._stream = stream
+            again = []
+            for pending in self._pending.values():
+                if pending.command != 'signal':  # which would take effect twice
+                    again.append(pending.line)
+                elif not pending.done.is_set():
+                    pending.reply = {'ok': False, 'error': 'the connection was lost meanwhile'}
+                    pending.done.set()
+        if self._next is not None:
+            self._follow_on(stream)
+        for line in (_PING, *again):
+            self._send(stream, line)
+
+
+def _parsed(line: bytes) -> Optional[dict[str, Any]]:
+    """Return a message, None for other text, such as the output of a login script."""
+    try:
+        message = events.cleaned(json.loads(line))
+    except (ValueError, RecursionError):
+        return None
+    known = isinstance(message, dict) and message.keys() & {'event', 'ok', 'kind'}
+    return message if known else None

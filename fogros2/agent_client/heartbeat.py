@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heartbeats to a machine's agent through the VPN."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from typing import Optional
+
+from fogros2 import events
+from fogros2.clock import ClockOffset, OffsetFilter
+from fogros2.model import to_json
+
+#: Interval of heartbeats in seconds.
+HEARTBEAT_INTERVAL = 2.0
+#: Longest round trip in seconds that measures the machine's clock.
+LONGEST = 20.0
+
+
+class Heartbeat:
+    """
+    Send heartbeats to a machine through the VPN; measure the round trip and its clock.
+
+    Starts at once. Lost datagrams, or a VPN that is down for a while, raise no errors.
+
+    :param address: the machine's VPN address.
+    :param port: the agent's port on the machine.
+    :param launch_id: the launch for which the agent was configured.
+    :param interval: seconds between heartbeats.
+    """
+
+    def __init__(
+        self, address: str, port: int, launch_id: str, interval: float = HEARTBEAT_INTERVAL,
+    ) -> None:
+        self._target = (address, port)
+        self._launch_id = launch_id
+        self._interval = interval
+        self._stopped = threading.Event()
+        self._answered_at: Optional[float] = None
+        self._round_trip: Optional[float] = None
+        self._offsets = OffsetFilter()
+        self._offset: Optional[ClockOffset] = None
+        self._thread = threading.Thread(target=self._run, name='fogros2-heartbeat', daemon=True)
+        self._thread.start()
+
+    @property
+    def round_trip(self) -> Optional[float]:
+        """Round-trip time of the last answered heartbeat in seconds, None before the first."""
+        return self._round_trip
+
+    @property
+    def clock_offset(self) -> Optional[ClockOffset]:
+        """The best of the recent measurements; None before the first, or with an older agent."""
+        return self._offset
+
+    @property
+    def age(self) -> Optional[float]:
+        """Seconds since the last answer, None before the first."""
+        at = self._answered_at
+        return None if at is None else time.monotonic() - at
+
+    def close(self) -> None:
+        """Stop; the agent's watchdog then acts after its ``robot_timeout``."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+
+    def _run(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            number = 0
+            while not self._stopped.is_set():
+                number += 1
+                self._send(link, number)
+                self._listen(link, time.monotonic() + self._interval)
+
+    def _send(self, link: socket.socket, number: int) -> None:
+        data = to_json({'launch': self._launch_id, 'n': number, 't': time.monotonic()}).encode()
+        with contextlib.suppress(OSError):  # no route while the VPN is down
+            link.sendto(data, self._target)
+
+    def _listen(self, link: socket.socket, until: float) -> None:
+        while not self._stopped.is_set():
+            left = until - time.monotonic()
+            if left <= 0:
+                return
+            link.settimeout(min(left, 0.25))
+            try:
+                data, peer = link.recvfrom(2048)
+            except TimeoutError:
+                continue
+            except OSError:
+                # 'connection refused' because the agent does not listen yet; retry
+                self._stopped.wait(0.05)
+                continue
+            now = time.monotonic()
+            try:
+                answer = events.heartbeat(json.loads(data))
+            except (ValueError, RecursionError):
+                continue  # an invalid message, perhaps of a stranger
+            if peer != self._target or answer['launch'] != self._launch_id:
+                continue
+            round_trip = now - answer['t']
+            self._round_trip, self._answered_at = round_trip, now
+            if 'clock' in answer and 0 <= round_trip < LONGEST:
+                self._offset = self._offsets.add(round_trip, time.time(), answer['clock'])

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of machine specs that cost nothing, made before anything is created."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import contextlib
+from typing import Optional
+
+from fogros2 import plan
+from fogros2 import shell as shells
+from fogros2.errors import ConfigurationError, FogError
+from fogros2.host import bootstrap, containers, undeclared, wheels, workspace
+from fogros2.host.programs import check_program
+from fogros2.model import MachineSpec
+from fogros2.provider import Provider
+from fogros2.report import Reporter
+from fogros2.store import check_name
+
+
+def check_names(specs: Sequence[MachineSpec]) -> None:
+    """
+    Check that machines have valid and different names.
+
+    :raises ConfigurationError: they have not.
+    """
+    names = [spec.name for spec in specs]
+    for name in names:
+        check_name(name)
+        if names.count(name) > 1:
+            raise ConfigurationError(f"two machines of this launch are called '{name}'",
+                                     'give each a name= of its own')
+
+
+def check(
+    spec: MachineSpec, provider: Provider, *, rmw: str, environment: Mapping[str, str],
+    programs: Sequence[tuple[str, str]], images: Sequence[str], report: Reporter,
+) -> None:
+    """
+    Check a machine's options, rights, containers and programs; report undeclared packages.
+
+    :param environment: the user's environment variables.
+    :param programs: the (package, executable) pairs that will run there.
+    :param images: the container images that nodes there will run in.
+    :raises FogError: the first problem that was found, with its remedy.
+    """
+    prefixes = plan.ament_prefixes(environment)
+    shells.warm(provider.capabilities.shell_kind)
+    provider.check(spec)
+    if spec.on_exit == 'stop' and not provider.capabilities.owned:
+        raise ConfigurationError(
+            f"'{spec.name}' is a computer that exists already: no launch switches it off",
+            "use on_exit='delete' to leave nothing there, or 'keep'")
+    for line in spec.containers:
+        containers.check(containers.parse(line), rmw)
+    if spec.containers or images:
+        provider.check_containers(spec)
+    chain = [workspace.inspect(path) for path in spec.workspaces]
+    if not provider.has_own_packages(spec):
+        for package, executable in programs:
+            check_program(package, executable, prefixes, spec.workspace)
+    # a step that cannot do without reports what is wrong
+    with contextlib.suppress(FogError, OSError):
+        warned = undeclared.warning(
+            spec, chain, {package for package, _ in programs}, prefixes,
+            provider.shared_folders(spec))
+        if warned:
+            report(warned)
+
+
+def check_architecture(spec: MachineSpec, provider: Provider) -> None:
+    """
+    Check that wheels and workspace fit the processor of a machine with all choices made.
+
+    :raises WorkspaceError: the workspace is compiled for another processor.
+    """
+    if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
+        return  # only the machine's system decides
+    architecture: Optional[str] = provider.architecture(spec)
+    if architecture:
+        bootstrap.check_architecture(
+            spec, architecture,
+            workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the steps of one machine use and do not change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+import shutil
+import threading
+
+from fogros2 import plan
+from fogros2.dds import DdsVendor
+from fogros2.deploy.choosing import Choices
+from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.errors import FogError, PrerequisiteError
+from fogros2.host import workspace
+from fogros2.provider import Capabilities, Provider
+from fogros2.report import Reporter
+from fogros2.store import Store
+from fogros2.waiting import Timeouts
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """
+    What the steps of one machine use; only the machine's number and programs are its own.
+
+    :param launch: id of the launch.
+    :param environment: the user's environment variables.
+    :param failures: errors of undo steps.
+    :param cancel: when set, every wait of the deployment raises Cancelled.
+    :param ending: set when the launch is on its way down.
+    :param vpn: the robot's VPN interface; it need not be up.
+    :param index: the machine's number in the VPN.
+    :param others: returns the VPN addresses of the other machines that are known now.
+    :param programs: the (package, executable) pairs that are known to run on the machine.
+    :param images: the container images that nodes on the machine are known to run in.
+    """
+
+    launch: str
+    environment: Mapping[str, str]
+    store: Store
+    report: Reporter
+    failures: list[FogError]
+    timeouts: Timeouts
+    cancel: threading.Event
+    ending: threading.Event
+    provider: Provider
+    choices: Choices
+    vpn: RobotVpn
+    dds: DdsVendor
+    index: int = 0
+    others: Callable[[], Sequence[str]] = tuple
+    programs: Sequence[tuple[str, str]] = ()
+    images: Sequence[str] = ()
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the machine's provider can do."""
+        return self.provider.capabilities
+
+    @property
+    def packages(self) -> list[str]:
+        """The packages of the known programs."""
+        return sorted({package for package, _ in self.programs})
+
+    def underlay(self, workspaces: Sequence[str]) -> plan.Underlay:
+        """
+        Return the paths of the robot's ROS 2 and of workspaces; the first need not be sourced.
+
+        :raises PrerequisiteError: the robot has no ROS 2.
+        """
+        ros2 = shutil.which('ros2', path=self.environment.get('PATH'))
+        if ros2 is None:
+            raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
+        return plan.underlay(
+            workspace.sourced(next(iter(workspaces), None), self.environment), workspaces, ros2)

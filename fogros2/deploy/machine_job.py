@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One machine's deployment: what its steps learn and change, and how they are undone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+import contextlib
+import dataclasses
+import threading
+from typing import Any, Optional
+
+from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.deploy.context import Context
+from fogros2.deploy.undo import UndoStack
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError
+from fogros2.model import Command, Machine, MachineSpec, VpnInterface
+from fogros2.report import step
+from fogros2.shell import Shell
+from fogros2.store import Record
+
+#: Seconds in which a machine has to answer on the way down, and the time-out of each further
+#: undo step if the machine does not: Ctrl-C must not wait long for a computer that is off.
+ANSWER_TIMEOUT, SHORT_TIMEOUT = 4.0, 2.0
+#: Seconds without a sign of life that the way down accepts; time-out of one of its commands.
+SILENCE_TIMEOUT = 15.0
+#: Folder of the agents on machines whose provider chooses none.
+AGENT_FOLDER = '/run/fogros2'
+
+
+class MachineJob:
+    """
+    One machine's deployment.
+
+    :param spec: the launch file's spec; the creation replaces it by one with all choices made.
+    """
+
+    #: Each is set by the step that creates it.
+    machine: Machine
+    shell: Shell
+    agent: AgentClient
+    interface: VpnInterface
+    heartbeat: Heartbeat
+
+    def __init__(self, context: Context, spec: MachineSpec) -> None:
+        self._context = context
+        self.spec = spec
+        self.name = spec.name
+        self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
+        self.undo = UndoStack(context.report, spec.name, context.failures)
+        self.undo.callback(self._report_left)
+        self._left: list[str] = []
+        #: Whether an earlier launch created the machine, and the id of its last launch.
+        self.reused = False
+        self.former = ''
+        #: False as soon as the machine is up.
+        self.failed = True
+        #: ``gone``: the provider reports the machine as stopped.
+        #: ``deleted``: the provider no longer knows the machine.
+        self.gone = self.deleted = False
+        #: Number of the first agent event that belongs to this launch; 0 before the agent answers.
+        self.first_event = 0
+        #: Functions that ask the machine for an answer; each gets the time-out in seconds.
+        self.probes: list[Callable[[float], object]] = []
+        self._out_of_reach: Optional[bool] = None
+        #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
+        self.cancel = Either(context.cancel)
+
+    @contextlib.contextmanager
+    def failing(self) -> Iterator[None]:
+        """Cancel the parallel steps if the block fails."""
+        try:
+            yield
+        except BaseException:
+            self.cancel.set()
+            raise
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
+        return step(self._context.report, self.name, name)
+
+    def undoing(self, name: str, undo: Callable[[], None]) -> None:
+        """
+        Push an undo step; if it fails, report the error, and run the other undo steps.
+
+        Steps that fail because the machine does not answer are reported together, at the end.
+        """
+        self.undo.callback(self.undone, name, undo)
+
+    def undone(self, name: str, undo: Callable[[], None]) -> None:
+        """Run an undo step now, with the error handling of :meth:`undoing`."""
+        def tried() -> None:
+            try:
+                undo()
+            except (ConnectError, DeadlineExceeded):
+                if not self._out_of_reach:
+                    raise
+                self._left.append(name)
+
+        self.undo.run(name, tried)
+
+    def _report_left(self) -> None:
+        """Report what stays on a machine that did not answer, and how the machine ends."""
+        def left() -> None:
+            if self._context.store.exists(self.name):
+                ends = 'ends the nodes'
+                hint = f'the next launch may take the machine, or: ros2 fog delete {self.name}'
+            else:
+                ends, hint = 'ends all of that and leaves', 'nothing needs to be done'
+            # the agent may not have started yet
+            agent = 'its agent' if self.first_event else 'its agent, if it has one by now,'
+            raise ConnectError(
+                f"'{self.name}' does not answer, so what it has of this launch stays there "
+                f"({', '.join(dict.fromkeys(self._left))}): {agent} {ends} by itself, "
+                f'{self.spec.robot_timeout:g} s after it last heard of the launch', hint)
+
+        if self._left:
+            self.undo.run('left there', left)
+
+    def save(self, **changes: Any) -> None:
+        """Change fields of the record and write it to disk."""
+        # the way down needs the changes even if they cannot be written
+        self.record = dataclasses.replace(self.record, **changes)
+        self._context.store.save(self.record)
+
+    @property
+    def machine_id(self) -> str:
+        """The provider's id of the machine; set as soon as the provider has created it."""
+        assert self.record.machine_id is not None
+        return self.record.machine_id
+
+    @property
+    def directory(self) -> str:
+        """The agent's folder on the machine."""
+        return self._context.capabilities.agent_directory or f'{AGENT_FOLDER}/{self.name}'
+
+    @property
+    def dds_file(self) -> str:
+        """The path of the middleware's configuration on the machine."""
+        return f'{self.directory}/{self._context.dds.file_name}'
+
+    @property
+    def survives(self) -> bool:
+        """Whether the machine outlives the launch, so that the launch has to clean it up."""
+        if self.gone:
+            return False
+        owned = self._context.capabilities.owned
+        if self.failed and not self.reused:
+            return not owned
+        return self.spec.on_exit == 'keep' or not owned
+
+    def run(self, *commands: Command, timeout: Optional[float] = None) -> str:
+        """Run commands on the machine on the way up; return the last one's output."""
+        output = ''
+        for command in commands:
+            output = self.shell.run(command, timeout=timeout or self._context.timeouts.vpn,
+                                    cancel=self.cancel).stdout
+        return output
+
+    def clean_up(self, commands: Iterable[Command]) -> None:
+        """Run commands on the machine on the way down; each of them may run twice."""
+        for command in commands:
+            seconds = self.timeout(min(self._context.timeouts.vpn, SILENCE_TIMEOUT))
+            try:
+                try:
+                    self.shell.run(command, timeout=seconds)
+                except ConnectError:
+                    # the connection may break though the machine is there
+                    if self._out_of_reach or not self._answers():
+                        raise
+                    self.shell.run(command, timeout=seconds)
+            except (ConnectError, DeadlineExceeded):
+                self.out_of_reach()
+                raise
+
+    def out_of_reach(self) -> None:
+        """Shorten the time-outs of the remaining undo steps: the machine does not answer."""
+        self._out_of_reach = True
+
+    def timeout(self, seconds: float) -> float:
+        """
+        Return the time-out in seconds of an undo step that needs the machine.
+
+        :param seconds: the time-out if the machine answers; the first call checks whether it does.
+        """
+        if self._out_of_reach is None:
+            self._out_of_reach = not self._answers()
+        return min(seconds, SHORT_TIMEOUT) if self._out_of_reach else seconds
+
+    def _answers(self) -> bool:
+        for probe in self.probes:
+            try:
+                probe(ANSWER_TIMEOUT)
+                return True
+            except DeadlineExceeded:
+                return False
+            except FogError:
+                pass  # the agent has ended; the machine may still be there
+        return False
+
+
+class Step:
+    """A step of a machine's deployment."""
+
+    def __init__(self, context: Context, job: MachineJob) -> None:
+        self._context = context
+        self._job = job
+
+
+class Either(threading.Event):
+    """An event that also counts as set when another event is set."""
+
+    def __init__(self, other: threading.Event) -> None:
+        super().__init__()
+        self._other = other
+
+    def is_set(self) -> bool:
+        """Return whether one of the two events is set."""
+        return super().is_set() or self._other.is_set()
+
+    def wait(self, timeout: Optional[float] = None) -> bool:
+        """Wait for the other event; notice this event only after ``timeout`` seconds."""
+        return self._other.wait(timeout) or self.is_set()

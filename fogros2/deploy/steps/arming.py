@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Install the agent on a machine, configure it, and send it heartbeats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import contextlib
+from typing import Any, Optional
+
+from fogros2 import model, plan
+from fogros2.agent_client import AgentClient, Heartbeat, joined
+from fogros2.deploy.machine_job import AGENT_FOLDER, SILENCE_TIMEOUT, Step
+from fogros2.errors import (
+    AgentAbsent,
+    AgentError,
+    Cancelled,
+    CommandError,
+    DeadlineExceeded,
+    FogError,
+    VpnError,
+)
+from fogros2.host import bootstrap
+from fogros2.model import Command
+from fogros2.waiting import Periodic, wait_until
+
+#: Poll interval of the provider's preemption notice in seconds.
+NOTICE_POLL_INTERVAL = 5.0
+
+# Install and start the agent in one round trip. Standard input is the configuration in one line,
+# then the agent's source; sh reads the line byte by byte, so that cat gets the rest.
+# $1 folder of all agents, $2 this agent's folder, $3 program, $4 our configuration, $5 login user.
+_INSTALL = """\
+umask 077
+install -d -m 755 "$1"
+install -d -m 700 -o "$5" "$2"
+aside=$3.$$.new
+trap 'rm -f -- "$4" "$aside"' EXIT
+IFS= read -r line
+printf '%s\\n' "$line" >"$4"
+cat >"$aside"
+chmod 700 "$aside"
+chown "$5" "$aside"
+mv -f -- "$aside" "$3"
+python3 -IS "$3" serve --detach --config "$4"
+"""
+
+# Remove the agent. A released agent has exited; an agent that was never reached still runs.
+# Another robot's agent stays: its configuration names its launch.
+# $1 folder, $2 launch, $3 our configuration.
+_REMOVE = """\
+running() { [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }
+rm -f -- "$3"
+if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
+    grep -qsF "\\"launch\\": \\"$2\\"" "$1/config.json" || exit 0
+    kill -s TERM $pid; n=0
+    while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
+else
+    # another robot may be about to start one
+    for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
+fi
+rm -rf -- "$1"
+# the folder of all agents goes with the last one
+rmdir -- "${1%/*}" 2>/dev/null || :
+"""
+
+
+class Arming(Step):
+    """The agent of one machine, seen from the robot."""
+
+    _released = False
+    #: Makes the agent wait again for heartbeats, until these come through the VPN.
+    _rearming: Optional[Periodic] = None
+
+    # -- on the way up --------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """
+        Make sure that an agent guards the machine; connect to the agent.
+
+        :raises AgentError: another launch uses the machine.
+        """
+        context, job, program = self._context, self._job, self._context.capabilities.agent_program
+        endpoint = job.machine.shell
+        config = {
+            **plan.agent_config(
+                job.spec, context.launch, job.directory, job.machine.end_command),
+            'user': endpoint.user if endpoint else '',
+            # the launch keeps in touch from now on: by re-arming the agent, then by heartbeats
+            'boot_timeout': job.spec.robot_timeout}
+        with job.step('guard'):
+            agent = None
+            if not program:
+                program = f'{job.directory}/agent.py'
+                if job.run(Command.script(
+                        f'[ ! -S {job.directory}/agent.sock ] || echo there', sudo=True,
+                        what='look for an agent')).strip():
+                    # of a launch that died, or of another robot, which keeps it
+                    agent = self._claim(program, config)
+                job.undoing('guard', self._remove)
+                if agent is None:
+                    self._install(program, config)
+            job.save(agent=job.directory, agent_program=program)
+            job.agent = agent = agent or wait_until(
+                lambda: self._claim(program, config),
+                timeout=context.timeouts.agent, cancel=job.cancel,
+                what=f"the agent of '{job.name}'")
+            job.undo.callback(agent.close)
+            # a busy machine gets more time to answer, as long as it sends anything
+            job.probes.insert(0, lambda seconds: agent.request(
+                'ping', timeout=3 * seconds, silent=seconds))
+            self.undo_nodes()
+            self._rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
+            job.undo.callback(self._rearming.close)
+            notice = context.provider.capabilities_of(job.machine).preemption_notice
+            if notice:
+                agent.request('watch', timeout=context.timeouts.agent, what='notice',
+                              argv=list(notice), interval=NOTICE_POLL_INTERVAL)
+
+    def _rearm(self) -> None:
+        # a later call may get through; the current step reports a lasting failure
+        with contextlib.suppress(FogError):
+            self._job.agent.request('configure', launch=self._context.launch, again=True)
+
+    def _install(self, program: str, config: Mapping[str, Any]) -> None:
+        job = self._job
+        line = model.to_json(config).encode()
+        assert b'\n' not in line
+        try:
+            job.run(Command(
+                ('sh', '-ec', _INSTALL, 'sh', AGENT_FOLDER, job.directory, program,
+                 self._first_config, str(config['user'])),
+                sudo=True, input=line + b'\n' + joined().encode(),
+                what='start the agent'))
+        except CommandError as error:
+            if '"kind":"running"' in error.result.stdout:
+                raise AgentError(
+                    f"another robot has just taken the machine '{job.name}' of this computer",
+                    'give the machine another name=') from error
+            raise
+
+    @property
+    def _first_config(self) -> str:
+        return f'{self._job.directory}/start-{self._context.launch}.json'
+
+    def _claim(self, program: str, config: Mapping[str, Any]) -> Optional[AgentClient]:
+        """
+        Connect to the machine's agent and claim it; return None if there is no agent yet.
+
+        :raises AgentError: another launch uses the machine.
+        """
+        job = self._job
+        # no cancel: the way down needs the connection too, and each request has a time-out
+        agent = AgentClient(job.shell, job.directory, agent_path=program)
+        try:
+            # the record shows that the former launch has ended; its agent may not know that yet
+            answer = agent.request('configure', timeout=self._context.timeouts.agent,
+                                   force=job.former, **config)
+        except FogError as error:
+            agent.close()
+            if isinstance(error, AgentAbsent):
+                return None  # the SSH server may be up before the agent
+            raise
+        job.first_event = int(answer.get('next', 1))
+        return agent
+
+    def _remove(self) -> None:
+        job = self._job
+        if job.survives:
+            job.clean_up([Command(
+                ('sh', '-ec', _REMOVE, 'sh', job.directory, self._context.launch,
+                 self._first_config), sudo=True, what='remove the agent')])
+
+    # -- with nodes -----------------------------------------------------------------------------
+
+    def start_heartbeat(self, ros: bootstrap.RosInstall, dds: Mapping[str, str]) -> None:
+        """
+        Send the agent the environment of nodes, and start the heartbeat.
+
+        :raises VpnError: no heartbeat was answered through the VPN.
+        """
+        context, job, address = self._context, self._job, self._job.interface.address
+        try:
+            job.agent.request(
+                'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,
+                heartbeat={'bind': address, 'port': plan.HEARTBEAT_PORT,
+                           'peer': context.vpn.interface.address},
+                environment={
+                    'FOGROS2_VPN_ADDRESS': address,
+                    **plan.extended({**ros.environment, **dds}, job.spec.environment)},
+                setup=list(ros.setup), ros_command=list(ros.command))
+        except AgentError as error:
+            if 'in use' in str(error):
+                raise VpnError(
+                    f"UDP port {plan.HEARTBEAT_PORT} of '{job.name}' is in use already",
+                    f"end what listens there: ss -lunp 'sport = :{plan.HEARTBEAT_PORT}'"
+                ) from error
+            raise
+        job.heartbeat = Heartbeat(address, plan.HEARTBEAT_PORT, context.launch)
+        job.undo.callback(job.heartbeat.close)
+        try:
+            wait_until(
+                lambda: job.heartbeat.round_trip is not None, timeout=context.timeouts.vpn,
+                cancel=job.cancel, what='an answer through the VPN', longest=0.05)
+        except FogError as error:
+            if isinstance(error, Cancelled):
+                raise
+            raise VpnError(
+                f"nothing comes back from '{job.name}' through the VPN",
+                f'is UDP port {job.interface.port} open on the way there?') from error
+        if self._rearming is not None:
+            self._rearming.close()
+
+    # -- the way down ---------------------------------------------------------------------------
+
+    def undo_nodes(self) -> None:
+        """Push the undo that stops the nodes; it has to run first on the way down."""
+        self._job.undoing('nodes', self.release)
+
+    def release(self) -> None:
+        """Make the agent of a surviving machine stop the nodes and release the machine; once."""
+        context, job = self._context, self._job
+        if not job.survives or self._released:
+            return
+        self._released = True
+        if self._rearming is not None:
+            self._rearming.close()
+        with contextlib.suppress(AgentAbsent):
+            try:
+                # answered when the nodes have ended; an agent out of reach ends them by itself
+                job.agent.request(
+                    'release', timeout=job.timeout(context.timeouts.command),
+                    silent=SILENCE_TIMEOUT, launch=context.launch, on_exit=job.spec.on_exit,
+                    exit=not context.capabilities.agent_program)
+            except DeadlineExceeded:
+                job.out_of_reach()
+                raise

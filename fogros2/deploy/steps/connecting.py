@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Log in to a machine: by SSH from outside at first, through the VPN later.
+
+Some providers hand over the machine's host key at boot, where another program may have read it.
+The machine then generates a new host key over the first connection, and the robot pins that key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import dataclasses
+import time
+from typing import Optional
+
+from fogros2 import shell as shells
+from fogros2.deploy.machine_job import Step
+from fogros2.errors import (
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    HostKeyError,
+    MachineNotFound,
+    ProviderError,
+)
+from fogros2.model import Command, Endpoint, MachineState
+from fogros2.shell import host_key, Shell
+from fogros2.shell.movable import MovableShell
+from fogros2.waiting import wait_until
+
+#: Time-out of one login attempt in seconds: a cancel takes effect only at its end. An existing
+#: computer, which does not boot, gets no more time than this.
+LOGIN_TIMEOUT = 10.0
+#: Seconds between two checks of the machine's state and of the robot's public address.
+POLL_INTERVAL = 10.0
+#: Errors of a machine that is still booting.
+_TRANSIENT: tuple[type[FogError], ...] = (ConnectError, DeadlineExceeded)
+
+
+class Connection(Step):
+    """The robot's login to one machine."""
+
+    #: The source address to which the SSH port is open.
+    _allowed = ''
+    _checked = 0.0
+    _shell: MovableShell
+
+    def open(self) -> None:
+        """
+        Log in to the machine with a pinned host key that only the machine has.
+
+        :raises ShellError: the machine refuses the login.
+        """
+        context, job, endpoint = self._context, self._job, self._job.machine.shell
+        assert endpoint is not None
+        with job.step('connect') as detail:
+            if context.capabilities.owned:
+                endpoint = dataclasses.replace(
+                    endpoint, key_file=str(context.store.key_file(job.name)),
+                    host_key=job.record.host_key or endpoint.host_key)
+            job.save(shell=endpoint)
+            if context.capabilities.firewall:
+                job.undoing('firewall', lambda: self._close_port() if job.survives else None)
+                if job.reused:
+                    # the earlier launch closed the port, or the robot's address has changed
+                    self._open_port()
+            job.shell = self._shell = MovableShell(self._shell_to(endpoint))
+            job.probes.append(lambda seconds: job.shell.run(
+                Command(('true',), what='reach it'), timeout=seconds, check=False))
+            job.undo.callback(self._shell.close)
+            self._log_in(self._shell)
+            if context.capabilities.one_time_host_key and not job.record.host_key:
+                self._renew_host_key(endpoint)
+                detail.append('with a host key of its own')
+
+    def enter_vpn(self) -> None:
+        """
+        Move SSH into the VPN, and close the SSH port to the outside.
+
+        Does nothing where the provider has no firewall.
+        """
+        job, outside = self._job, self._job.record.shell
+        if not self._context.capabilities.firewall or outside is None:
+            return
+        with job.step('firewall') as detail:
+            inside = self._shell_to(dataclasses.replace(outside, host=job.interface.address))
+            try:
+                self._log_in(inside)
+            except BaseException:
+                inside.close()
+                raise
+            job.undoing('firewall', self._leave_vpn)
+            self._shell.move(inside)
+            self._close_port()
+            detail.append(f'SSH through the VPN alone, port {outside.port} closed')
+
+    def _leave_vpn(self) -> None:
+        """Reach a kept machine from outside again, before the VPN is taken down."""
+        outside = self._job.record.shell
+        if self._job.survives and outside is not None:
+            self._open_port()
+            self._shell.move(self._shell_to(outside))
+
+    def _close_port(self) -> None:
+        self._allow([])
+
+    def _open_port(self) -> None:
+        """Open the SSH port to the robot's current public address."""
+        address = self._context.provider.robot_address()
+        self._allow([address])
+        self._allowed = address
+
+    def _allow(self, sources: Sequence[str]) -> None:
+        outside = self._job.record.shell
+        assert outside is not None
+        self._context.provider.allow(self._job.machine_id, outside.port, sources)
+
+    def _shell_to(self, endpoint: Endpoint) -> Shell:
+        return shells.connect(
+            endpoint, name=self._job.name, timeout=self._context.timeouts.ssh)
+
+    def _log_in(
+        self, shell: Shell, transient: tuple[type[FogError], ...] = _TRANSIENT,
+    ) -> None:
+        """
+        Retry the login until it succeeds; after the time-out, raise the last error.
+
+        :param transient: errors that are retried.
+        """
+        job, ssh = self._job, self._context.timeouts.ssh
+        last: Optional[FogError] = None
+        self._checked = time.monotonic()
+
+        def probe() -> bool:
+            nonlocal last
+            try:
+                shell.run(Command(('true',), what='connect'), cancel=job.cancel,
+                          timeout=min(LOGIN_TIMEOUT, ssh))
+                return True
+            except transient as error:
+                last = error
+                self._check()
+                return False
+
+        try:
+            wait_until(probe, timeout=self._timeout(), cancel=job.cancel, longest=0.5,
+                       what=f"'{job.name}' to let us in")
+        except DeadlineExceeded as error:
+            raise last or error from error
+
+    def _timeout(self) -> float:
+        """Return the login time-out in seconds; a machine that may still boot gets more."""
+        timeouts, provider, record = self._context.timeouts, self._context.provider, \
+            self._job.record
+        if not provider.capabilities.owned:
+            return min(timeouts.ssh, LOGIN_TIMEOUT)
+        boots = provider.capabilities.one_time_host_key and not record.host_key
+        left = timeouts.boot - (time.time() - record.armed) if boots else 0.0
+        return max(timeouts.ssh, left)
+
+    def _check(self) -> None:
+        """
+        Check now and then that the machine runs, and that the firewall admits the robot.
+
+        :raises ProviderError: the machine has ended.
+        """
+        provider, job = self._context.provider, self._job
+        if not provider.capabilities.firewall or time.monotonic() - self._checked < POLL_INTERVAL:
+            return
+        self._checked = time.monotonic()
+        try:
+            state = provider.describe(job.machine_id).state
+        except MachineNotFound:
+            state = MachineState.DELETED
+        except FogError:
+            return
+        if state not in (MachineState.PENDING, MachineState.RUNNING):
+            raise ProviderError(f"'{job.name}' ended while it was coming up",
+                                "the provider's own log says why")
+        # a failed look-up is retried at the next check; the login's error is reported in the end
+        with contextlib.suppress(FogError):
+            if provider.robot_address() != self._allowed:
+                self._open_port()
+
+    def _renew_host_key(self, endpoint: Endpoint) -> None:
+        job = self._job
+        key = host_key.parse(job.run(host_key.renew()))
+        endpoint = dataclasses.replace(endpoint, host_key=key)
+        job.save(shell=endpoint, host_key=key)
+        self._context.provider.pin(job.machine_id, key)
+        self._shell.move(self._shell_to(endpoint))
+        # the SSH server may need a moment to load the new key
+        self._log_in(self._shell, transient=(*_TRANSIENT, HostKeyError))

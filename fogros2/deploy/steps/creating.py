@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Create a machine or reuse a kept one, and wait until it can be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import contextlib
+import dataclasses
+import json
+import time
+from typing import Any, Optional
+import uuid
+
+from fogros2 import model, monitor_addresses, plan, process
+from fogros2.deploy.machine_job import Step
+from fogros2.errors import (
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    Unsupported,
+)
+from fogros2.host import bootstrap
+from fogros2.model import Command, CreateRequest, Machine, MachineState
+from fogros2.provider import (
+    TAG_DEPENDENCIES,
+    TAG_EXPIRES,
+    TAG_LAUNCH,
+    TAG_NAME,
+    TAG_ON_EXIT,
+    TAG_ROBOT,
+)
+from fogros2.store import robot_name, this_process
+
+
+class Creation(Step):
+    """Create or reuse the machine of a deployment, and end it by its ``on_exit``."""
+
+    #: Whether the provider was asked to create the machine, and whether it refused at once.
+    _asked = _refused = False
+
+    def run(self) -> None:
+        """
+        Create or reuse the machine; return when a connection can be tried.
+
+        :raises NameTaken: another launch uses the name, or the kept machine has other options.
+        :raises ProviderError: the provider refused, or the machine ended while it started.
+        """
+        context, job = self._context, self._job
+        with job.step('machine') as detail:
+            kept = self._kept()
+            if kept is not None:
+                self._adopt(kept)
+                detail.append('kept from before')
+            else:
+                self._create()
+            price = context.choices.price(job.spec)
+            context.choices.begin(job.name, price)
+            machine = context.provider.reachable(
+                job.machine_id, name=job.name, timeout=context.timeouts.boot)
+            if machine.cost_per_hour is not None:
+                price = machine.cost_per_hour
+                context.choices.begin(job.name, price)
+            if price is not None:
+                detail.append(plan.price(price))
+            job.save(shell=machine.shell)
+            detail.append(machine.shell.host if machine.shell else machine.id[:20])
+            if machine.note:
+                detail.append(machine.note)
+            job.machine = machine
+
+    # -- a kept machine -------------------------------------------------------------------------
+
+    def _kept(self) -> Optional[Machine]:
+        """Return the machine of this name that an earlier launch kept or stopped, or None."""
+        context, job = self._context, self._job
+        if not context.store.exists(job.name):
+            return None  # ``create`` finds and refuses a machine without a record
+        before = context.store.load(job.name)
+        if before.launch_alive:
+            raise NameTaken(
+                f"the launch with process {before.pid} has the machine '{job.name}'",
+                'give the machine another name=, or end that launch')
+        if before.provider != job.spec.provider:
+            raise NameTaken(
+                f"'{job.name}' is a machine of the provider '{before.provider}'",
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        if before.machine_id is None:
+            # that launch was killed before it saved the id of its machine, if it has one
+            with contextlib.suppress(Unsupported):
+                for machine in self._find(before.last or before.launch):
+                    context.provider.destroy(machine.id)
+            return None
+        try:
+            machine = context.provider.describe(before.machine_id)
+        except MachineNotFound:
+            return None
+        if machine.state is MachineState.DELETED:
+            return None
+        self._check_alike(before.asked_options, machine)
+        # the earlier choices still hold; everything else comes from this launch
+        job.spec = dataclasses.replace(job.spec, options=before.spec.options)
+        job.record = dataclasses.replace(before, spec=job.spec)
+        job.former = before.last or before.launch
+        return machine
+
+    def _find(self, launch: str) -> Iterable[Machine]:
+        return self._context.provider.find({TAG_NAME: self._job.name, TAG_LAUNCH: launch})
+
+    def _check_alike(self, before: Any, machine: Machine) -> None:
+        """Raise if the kept machine was created with other options than this launch asks for."""
+        job = self._job
+        then, now = (json.loads(model.to_json(o)) for o in (before, job.spec.options))
+        other = sorted(key for key in {*then, *now} if then.get(key) != now.get(key))
+        if other:
+            raise NameTaken(
+                f"the machine '{job.name}' of an earlier launch has another {', '.join(other)}",
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        if job.spec.on_exit == 'stop' and not self._context.capabilities.adopt \
+                and machine.tags.get(TAG_ON_EXIT, 'stop') != 'stop':
+            raise ConfigurationError(
+                f"the machine '{job.name}' was not made to be stopped and started",
+                f"keep it with on_exit='keep', or: ros2 fog delete {job.name}")
+
+    def _adopt(self, machine: Machine) -> None:
+        context, job = self._context, self._job
+        job.reused = True
+        job.undoing('end', self._end)
+        before = job.record
+        self._claim(job.record.token)
+        context.provider.adopt(machine.id, job.spec, self._tags())
+        if before.monitor_open:
+            # left open by a launch that was killed
+            context.provider.open_port(machine, monitor_addresses.gate_port(before.monitor), ())
+        if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
+            context.provider.start(machine.id)
+
+    # -- a new machine --------------------------------------------------------------------------
+
+    def _create(self) -> None:
+        context, job = self._context, self._job
+        job.spec = context.choices.resolved(job.spec)
+        token = str(uuid.uuid4())
+        context.store.delete(job.name)
+        job.record = dataclasses.replace(job.record, spec=job.spec)
+        job.undoing('end', self._end)
+        self._claim(token)
+        config = {
+            **plan.agent_config(job.spec, context.launch, job.directory, ()),
+            'boot_timeout': context.timeouts.boot + context.timeouts.ssh,
+        } if context.capabilities.agent_directory else {}
+        dependencies = self._dependencies()
+        tags = {
+            TAG_NAME: job.name, TAG_ROBOT: robot_name(), **self._tags(),
+            **({TAG_DEPENDENCIES: dependencies} if dependencies else {}),
+        }
+        can = context.capabilities
+        key = self._login_key() if can.owned and can.shell_kind == 'ssh' else ''
+        self._asked = True
+        try:
+            machine_id = context.provider.create(job.spec, CreateRequest(
+                token=token, authorized_key=key, tags=tags,
+                vpn_port=plan.machine_port(context.launch), agent_config=config,
+                dependencies=dependencies,
+                application=monitor_addresses.IMAGE if job.spec.monitored else ''))
+        except FogError as error:
+            # after a refusal, no machine has to be looked for
+            self._asked = not error.refused
+            # without an answer a machine may exist: only a search by tags shows it
+            self._refused = isinstance(error, (ConfigurationError, PrerequisiteError))
+            for failure in error.undo_failures:
+                job.undo.failed('undo', failure)
+            raise
+        job.save(machine_id=machine_id)
+
+    def _tags(self) -> dict[str, str]:
+        """Return the tags that change with the launch that uses the machine."""
+        spec = self._job.spec
+        return {TAG_LAUNCH: self._context.launch, TAG_ON_EXIT: spec.on_exit,
+                TAG_EXPIRES: str(int(time.time() + spec.lifetime))}
+
+    def _dependencies(self) -> str:
+        """Return the hash of the machine's dependencies, by which the provider finds an image."""
+        context, job = self._context, self._job
+        try:
+            under = context.underlay(job.spec.workspaces)
+        except PrerequisiteError:
+            return ''  # the step that needs ROS 2 raises the same error
+        return bootstrap.dependencies(job.spec, under, context.packages)
+
+    def _claim(self, token: str) -> None:
+        """Record that this launch has the machine, before the provider creates anything."""
+        context, job = self._context, self._job
+        job.save(
+            token=token, created=job.record.created or time.time(), armed=time.time(),
+            launch=context.launch, last=context.launch, **this_process(),
+            robot_vpn=context.vpn.interface, monitor=0, monitor_open='')
+
+    def _login_key(self) -> str:
+        context, job = self._context, self._job
+        path = context.store.key_file(job.name)
+        process.run(Command((
+            'ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', f'fogros2-{job.name}',
+            '-f', str(path)), what='make the login key'), timeout=context.timeouts.command)
+        return path.with_suffix('.pub').read_text().strip()
+
+    # -- the end --------------------------------------------------------------------------------
+
+    def _end(self) -> None:
+        """End the machine by its ``on_exit``; delete the record only after the machine."""
+        context, job = self._context, self._job
+        mode = job.spec.on_exit
+        if job.deleted or job.failed and not job.reused:
+            mode = 'delete'
+        try:
+            with job.step(mode if context.capabilities.owned else 'let go'):
+                if mode == 'delete':
+                    for machine_id in self._made():
+                        context.provider.destroy(machine_id)
+                    context.store.delete(job.name)
+                    return
+                if mode == 'stop' and job.record.machine_id is not None:
+                    context.provider.stop(job.record.machine_id)
+                job.save(launch='', pid=0, pid_start=0, robot_vpn=None)
+        finally:
+            context.choices.end(job.name)
+
+    def _made(self) -> list[str]:
+        """Return the machine's id; find the machine of a failed creation by its tags."""
+        job = self._job
+        if job.record.machine_id is not None:
+            return [job.record.machine_id]
+        if not self._asked:
+            return []
+        try:
+            return [machine.id for machine in self._find(self._context.launch)]
+        except Unsupported:
+            return []
+        except FogError:
+            if not self._refused:
+                raise
+            return []  # the creation was refused before the provider was asked

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configure the middleware on a machine, and start the router of one that needs it."""
+
+from __future__ import annotations
+
+import json
+
+from fogros2.deploy.context import Context
+from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.robot_router import MACHINES, PAUSE
+from fogros2.errors import DdsError
+from fogros2.model import NodeSpec, to_json
+
+
+def configure(context: Context, job: MachineJob) -> dict[str, str]:
+    """Write the DDS configuration on the machine; return the variables that nodes need."""
+    vendor, interface = context.dds, job.interface
+    # the robot finds a machine by multicast; machines find each other by unicast to peers
+    text = vendor.render(vendor.machine_interfaces(
+        interface.address if vendor.by_address else interface.name), context.others())
+    # users inside containers read it too; the folder's mode excludes other users
+    job.shell.put(text.encode(), job.dds_file, mode=0o644, timeout=context.timeouts.command)
+    return dict(vendor.environment(job.dds_file, {}))
+
+
+def start_router(context: Context, job: MachineJob) -> None:
+    """Start the router of the machine's nodes, for a middleware that has one."""
+    router = context.dds.router(job.interface.address, context.others(), None)
+    if router is None:
+        return
+    if context.index >= MACHINES:
+        raise DdsError(
+            f"'{job.name}' is one machine too many: the robot's router knows {MACHINES}",
+            'spread them over several launches, or use another RMW_IMPLEMENTATION')
+    node = NodeSpec(
+        id=f'{job.name}/router', name='router', package=router.package,
+        executable=router.executable, files={'router.json5': router.config},
+        environment={router.variable: ({'file': 'router.json5'},)},
+        respawn=True, respawn_delay=PAUSE)
+    job.agent.request('start', nodes=[json.loads(to_json(node))])

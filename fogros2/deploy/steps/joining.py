@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bring up the machine's end of the VPN."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import contextlib
+import dataclasses
+from typing import Optional
+
+from fogros2 import plan
+from fogros2.deploy.context import Context
+from fogros2.deploy.machine_job import MachineJob, Step
+from fogros2.deploy.robot_vpn import VpnMember
+from fogros2.errors import CommandError, FogError, VpnError
+from fogros2.model import Command, host_port, Machine, Peer
+from fogros2.report import step
+from fogros2.vpn import addresses
+
+#: Sends a packet to an address and port, from which the peer learns this end's endpoint.
+_KNOCK = """\
+import socket, sys
+socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', (sys.argv[1], int(sys.argv[2])))
+"""
+
+
+class Joining(Step):
+    """
+    Add one machine to the launch's VPN, and remove it.
+
+    :param release: makes the agent release the machine; otherwise it would repair the interface
+        that the way down deletes.
+    """
+
+    def __init__(self, context: Context, job: MachineJob, release: Callable[[], None]) -> None:
+        super().__init__(context, job)
+        self._release = release
+        self._member: Optional[VpnMember] = None
+
+    def choose_interface(self) -> None:
+        """Choose the machine's interface; record it before it is created."""
+        context, job = self._context, self._job
+        port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch)
+        job.interface = plan.machine_interface(
+            context.launch, context.vpn.interface.network, context.index, port,
+            f'{job.directory}/vpn.key')
+        job.save(vpn=job.interface)
+
+    def avoid(self, routes: Sequence[str]) -> None:
+        """
+        Adapt the interface to a machine with these routes (IPv4, CIDR).
+
+        The robot chose the launch's subnet before the machine existed, and its nodes may already
+        run, so the subnet stays. If one of the machine's networks overlaps the subnet, the machine
+        routes only its peers' addresses into the VPN.
+        """
+        job = self._job
+        if addresses.overlapping(job.interface.network, routes):
+            job.interface = dataclasses.replace(job.interface, host_routes=True)
+            job.save(vpn=job.interface)
+
+    def join(self) -> None:
+        """
+        Bring the machine's interface up, and add the machine to the peers of the others.
+
+        :raises VpnError: the port is in use, or neither end can reach the other.
+        """
+        job, interface, robot = self._job, self._job.interface, self._context.vpn
+        with job.step('VPN') as detail:
+            job.undoing('VPN', self._leave)
+            job.undoing('VPN', lambda: robot.remove(job.name))
+            public_key = job.run(robot.vpn.keys(interface)).strip()
+            route = plan.route(
+                job.machine, Peer(job.name, public_key, interface.address), interface.port,
+                robot.interface.port)
+            member = VpnMember(
+                route, interface, lambda commands: job.run(*commands), self._health_check)
+            try:
+                # configure the end that is dialled first: the dialling end retries only after 5 s
+                if route.robot_endpoint is not None:
+                    robot.admit(member)
+                    member.up(robot)
+                else:
+                    member.up(robot)
+                    robot.admit(member)
+            except CommandError as error:
+                if 'Address already in use' in error.result.stderr:
+                    raise VpnError(
+                        f"UDP port {interface.port} of '{job.name}' is in use already",
+                        'launch again: each launch takes another port') from error
+                if 'in use already:' in error.result.stderr:
+                    raise VpnError(
+                        f"'{job.name}' uses addresses of the VPN's network itself: "
+                        f'{error.result.stderr.strip().splitlines()[-1]}',
+                        'launch again: each launch takes another network') from error
+                raise
+            robot.spread(member)
+            self._member = member
+            detail.append(interface.address)
+            if route.robot_endpoint is not None:
+                detail.append(f'dials {route.robot_endpoint}')
+        job.save(public_key=public_key)
+
+    def _health_check(self, peers: Sequence[Peer]) -> None:
+        """Make the agent repair the machine's VPN when its program ends."""
+        job, vpn = self._job, self._context.vpn.vpn
+        job.agent.request(
+            'keep', timeout=self._context.timeouts.agent, what='vpn', interval=1.0,
+            alive=list(vpn.health_check(job.interface).argv),
+            repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
+            down=[list(c.argv) for c in vpn.down(job.interface)])
+
+    def redial(self, machine: Machine) -> None:
+        """
+        Update the robot's endpoint on a machine that dials the robot, if it has changed.
+
+        :param machine: what the provider reports.
+        """
+        member, job, robot = self._member, self._job, self._context.vpn
+        if member is None or member.route.robot_endpoint is None or not machine.robot_host:
+            return
+        endpoint = host_port(machine.robot_host, robot.interface.port)
+        if endpoint != member.route.robot_endpoint:
+            with contextlib.suppress(FogError), step(
+                    self._context.report, job.name, 'VPN, from where the robot is now',
+                    fatal=False) as detail:
+                member.redial(robot, endpoint)
+                detail.append(f'dials {endpoint}')
+                # its next packet shows the robot the way back; a keepalive would take 25 s
+                job.run(Command(
+                    ('python3', '-IS', '-c', _KNOCK, robot.interface.address,
+                     str(plan.HEARTBEAT_PORT)), what='greet the robot'))
+
+    def _leave(self) -> None:
+        job = self._job
+        if job.survives:
+            job.undone('nodes', self._release)
+            job.clean_up(self._context.vpn.vpn.down(job.interface))

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Choose a region, an image or an instance type when the launch is executed.
+
+Each function returns launch substitutions and makes no request. A machine with such an option
+makes the requests in a thread, when it comes up. The exception is ``nearest_aws_region_now``.
+
+The names and keywords of FogROS2's package ``utils`` are among them (there
+``region_ami_selection`` and ``ec2_instance_type_selection``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+import threading
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext, Substitution
+
+from fogros2 import plugin_system
+from fogros2.describe import values
+from fogros2.errors import ConfigurationError
+from fogros2.provider import offers, Provider
+
+if TYPE_CHECKING:
+    from decimal import Decimal
+
+    from launch import SomeSubstitutionsType
+
+#: The value that stands for the region with the fastest response.
+NEAREST = 'nearest'
+
+
+class Choice(Substitution):
+    """
+    A value that is requested when the launch is executed, once.
+
+    :param what: description of the value, for messages.
+    :param ask: returns the value for the resolved ``arguments``; may take seconds.
+    """
+
+    def __init__(self, what: str, ask: Callable[..., str], arguments: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._what = what
+        self._ask = ask
+        self._arguments = dict(arguments)
+        self._answer: Optional[str] = None
+        self._lock = threading.Lock()
+
+    def describe(self) -> str:
+        """Return the description of the value."""
+        return self._what
+
+    def __repr__(self) -> str:
+        return f'<{self._what}>'
+
+    def defer(self, context: LaunchContext) -> values.Deferred:
+        """Resolve the arguments; return the function that requests the value, for a thread."""
+        resolved = {
+            key: values.resolve_deferred(context, value) for key, value in self._arguments.items()}
+        return functools.partial(self._once, resolved)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Request the value and wait for it; options of machines use :meth:`defer` instead."""
+        return self.defer(context)()
+
+    def _once(self, arguments: Mapping[str, Any]) -> str:
+        with self._lock:
+            if self._answer is None:
+                self._answer = self._ask(**values.await_all(arguments))
+            return self._answer
+
+
+def find_nearest_aws_region(regions: Optional[Sequence[SomeSubstitutionsType]] = None) -> Choice:
+    """
+    Choose the AWS region to which a connection opens fastest.
+
+    :param regions: candidates; None for all regions that every account may use.
+    """
+    return Choice('the nearest AWS region', _nearest, {'regions': values.items(regions)})
+
+
+def nearest_aws_region_now(regions: Optional[Sequence[str]] = None) -> str:
+    """
+    Measure now, and return the AWS region to which a connection opens fastest, as a string.
+
+    This is the only function that makes requests when it is called. So ``ros2 launch -s`` also
+    measures, for up to five seconds. Where another value of a machine depends on the region, a
+    mapping needs no such call: see :class:`~fogros2.AWSCloudInstance`.
+
+    :param regions: candidates; None for all regions that every account may use.
+    :raises ProviderError: no region answers, and this computer's location is unknown.
+    """
+    return _nearest(regions)
+
+
+def find_nearest_region_and_ami(
+    regions: Mapping[str, Mapping[str, str]],
+) -> tuple[Choice, Choice]:
+    """
+    Choose the nearest of some regions, and the image that is given for it.
+
+    :param regions: by region, such as ``{'us-west-1': {'ami_image': 'ami-0123'}}``.
+    """
+    region = find_nearest_aws_region(list(regions))
+    images = {name: about['ami_image'] for name, about in regions.items()}
+    return region, Choice(
+        'the image for that region', lambda region: images[region], {'region': region})
+
+
+def find_cheapest_ec2_instance_type(
+    region_name: SomeSubstitutionsType, cpu_architecture: Optional[str] = None,
+    default_cores: Optional[int] = None, default_threads_per_core: Optional[int] = None,
+    gpu: Union[bool, int, str, None] = None, *, arch: Optional[str] = None,
+    min_cpu: Optional[int] = None, min_memory_gb: Optional[float] = None,
+    cpu_type: Optional[str] = None, gpu_memory_gb: Optional[float] = None,
+    max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
+) -> Choice:
+    """
+    Choose the cheapest EC2 instance type of a region that meets the requirements.
+
+    With FogROS2's keywords, or with none, the type has exactly the cores and threads that FogROS2
+    looks for. With the keywords of AWSCloudInstance, their values are minimums.
+
+    :param region_name: such as 'eu-central-1', or 'nearest'.
+    :param cpu_architecture: keyword of FogROS2; default 'x86_64'.
+    :param default_cores: keyword of FogROS2; default 2.
+    :param default_threads_per_core: keyword of FogROS2; default 1.
+    :param gpu: True for any GPU, the number of GPUs, or part of the GPU's name.
+    :raises ConfigurationError: keywords of both kinds.
+    """
+    theirs = _said(cpu_architecture=cpu_architecture, default_cores=default_cores,
+                   default_threads_per_core=default_threads_per_core)
+    ours = _said(arch=arch, min_cpu=min_cpu, min_memory_gb=min_memory_gb, cpu_type=cpu_type,
+                 gpu_memory_gb=gpu_memory_gb, max_price=max_price, spot=spot or None)
+    if theirs and ours:
+        raise ConfigurationError(
+            f"{', '.join(theirs)} can't be combined with {', '.join(ours)}",
+            'say arch, min_cpu, min_memory_gb')
+    ask: Callable[..., str]
+    if not ours and isinstance(gpu, (bool, type(None))):
+        ask = functools.partial(_type_of_fogros2, **theirs, **_said(gpu=gpu))
+    else:
+        ask = functools.partial(_type, asked={**ours, **_said(gpu=gpu)})
+    return Choice('the cheapest type there', ask,
+                  {'region': region_name})
+
+
+def find_cheapest(
+    regions: Optional[Sequence[SomeSubstitutionsType]] = None, **wanted: Any,
+) -> tuple[Choice, Choice]:
+    """
+    Choose the region and the type of the cheapest EC2 instance that meets the requirements.
+
+    :param regions: candidates; None for all regions that the account may use.
+    :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
+        ``gpu_memory_gb``, ``max_price``, ``spot``, with the meaning of AWSCloudInstance.
+    :raises ConfigurationError: an unknown keyword.
+    """
+    for name in wanted:
+        if name not in _WANTED:
+            raise ConfigurationError(f"find_cheapest takes no '{name}'",
+                                     f"it takes regions, {', '.join(_WANTED)}")
+    # one request answers both
+    both = Choice('the cheapest EC2 instance', functools.partial(_cheapest, asked=wanted),
+                  {'regions': values.items(regions)})
+    return (
+        Choice('the region of the cheapest EC2 instance',
+               lambda both: str(both).partition(' ')[0], {'both': both}),
+        Choice('the type of the cheapest EC2 instance',
+               lambda both: str(both).partition(' ')[2], {'both': both}))
+
+
+_WANTED = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
+           'spot')
+
+
+def _said(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+# The provider is loaded only when a request is made.
+
+def _aws() -> Provider:
+    provider: Provider = plugin_system.load('fogros2.provider', 'aws')()
+    return provider
+
+
+def _nearest(regions: Optional[Sequence[str]]) -> str:
+    return _aws().nearest(regions or ())
+
+
+def _type(region: str, asked: Mapping[str, Any]) -> str:
+    return _aws().offers(offers.wants(**asked), [region]).chosen.type.name
+
+
+def _type_of_fogros2(
+    region: str, cpu_architecture: str = 'x86_64', default_cores: int = 2,
+    default_threads_per_core: int = 1, gpu: bool = False,
+) -> str:
+    """Choose the type as FogROS2 does: with exactly so many cores and threads."""
+    return _type(region, {
+        'arch': cpu_architecture, 'min_cpu': 0, 'min_memory_gb': 0, 'gpu': gpu,
+        'cores': default_cores, 'threads_per_core': default_threads_per_core})
+
+
+def _cheapest(regions: Optional[Sequence[str]], asked: Mapping[str, Any]) -> str:
+    offer = _aws().offers(offers.wants(**asked), regions or ['all']).chosen
+    return f'{offer.region} {offer.type.name}'

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Read the keywords of the machines' constructors from text: XML, YAML, the command line.
+
+The annotations of a constructor give the kind of each value, so a keyword of a provider becomes
+an attribute without any code here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import contextlib
+import inspect
+import re
+from typing import Any, Union
+
+from fogros2 import plugin_system
+from fogros2.describe import values
+from fogros2.describe.kinds import Keyword, parameters_of
+from fogros2.describe.machines import CloudInstance
+from fogros2.errors import ConfigurationError, did_you_mean
+
+#: Entry point group of the machines' classes, by provider.
+GROUP = 'fogros2.machine'
+#: The provider name for no machine: the nodes run on this computer.
+ROBOT = 'robot'
+
+class Robot(CloudInstance):
+    """No machine: its nodes run on the robot, and nothing is created."""
+
+    provider = ROBOT
+
+
+def providers() -> list[str]:
+    """Return the names of all providers, and 'robot'."""
+    return sorted([*plugin_system.names(GROUP), ROBOT])
+
+
+def machine_class(provider: str) -> type[CloudInstance]:
+    """
+    Return the class of a provider's machines.
+
+    :raises ConfigurationError: no such provider; the hint names the nearest one and all.
+    """
+    if provider == ROBOT:
+        return Robot
+    if provider not in plugin_system.names(GROUP):
+        raise ConfigurationError(f"no provider is called '{provider}'",
+                                 did_you_mean(provider, providers(), all_too=True))
+    found: type[CloudInstance] = plugin_system.load(GROUP, provider)
+    return found
+
+
+def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
+    """Return the keywords of a machine class by name; its own come before inherited ones."""
+    found: dict[str, Keyword] = {}
+    for base in cls.__mro__:
+        if '__init__' not in vars(base) or not issubclass(base, CloudInstance):
+            continue
+        constructor = vars(base)['__init__']
+        for name, keyword in parameters_of(constructor).items():
+            found.setdefault(name, keyword)
+    return found
+
+
+def read(keyword: Keyword, text: str) -> Any:
+    """
+    Convert text to the value that the constructor expects.
+
+    :raises ConfigurationError: the text does not fit the keyword's kind.
+    """
+    try:
+        return _read(keyword, text)
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{keyword.name}: {error.args[0]}', error.hint) from error
+
+
+def _read(keyword: Keyword, text: str) -> Any:
+    if keyword.kind == 'bool':
+        return values.read_bool(text)
+    if keyword.kind == 'list':
+        return values.split(text)
+    if keyword.kind == 'scalar' and text.lower() in ('true', 'false'):
+        return values.read_bool(text)
+    if keyword.kind in ('number', 'scalar'):
+        return number(text)
+    if keyword.kind in ('mapping', 'table') or (
+            keyword.kind == 'text or mapping' and text.startswith('{')):
+        return _nested(keyword, text)
+    return text
+
+
+def number(text: str) -> Union[int, float, str]:
+    """Return the number in a text, or the text itself if it is no number, such as '8h'."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _nested(keyword: Keyword, text: str) -> Any:
+    """Parse a YAML mapping, or the rows of a table: ``{a: b}``, ``[{key: gpu}]``."""
+    found = values.read_yaml(text)
+    if keyword.kind != 'table':
+        if isinstance(found, dict) and all(isinstance(one, str) for one in found.values()):
+            return found
+        raise ConfigurationError(f'{text!r} has no names and texts', 'write {name: value}')
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise ConfigurationError(f'{text!r} is no list of mappings', 'write [{name: value}]')
+    return [row_of(keyword, row) for row in found]
+
+
+def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Convert the values of a table's row to their kinds.
+
+    :raises ConfigurationError: the table has no such column.
+    """
+    for name in row:
+        if name not in keyword.columns:
+            raise unknown(keyword.name, name, keyword.columns)
+    return {name: read(Keyword(name, keyword.columns[name]), value)
+            if isinstance(value, str) else value for name, value in row.items()}
+
+
+def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
+    """
+    Create a machine's description.
+
+    :param given: keywords of its constructor.
+    :raises ConfigurationError: an unknown provider or keyword, a wrong value, or a missing one.
+    """
+    cls = machine_class(provider)
+    known = keywords(cls)
+    for name in given:
+        if name not in known:
+            raise unknown(f"a machine of the provider '{provider}'", name, known)
+    for keyword in known.values():
+        if keyword.needed and keyword.name not in given:
+            raise ConfigurationError(
+                f"a machine of the provider '{provider}' needs {keyword.name}",
+                f'{keyword.name}= says it')
+    return cls(**given)
+
+
+@contextlib.contextmanager
+def refused(cls: type[Any]) -> Iterator[None]:
+    """
+    Replace the error of an unexpected keyword by one that names the nearest keyword.
+
+    :param cls: the class; launch's actions pass keywords on to their base classes.
+    """
+    try:
+        yield
+    except TypeError as error:
+        match = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
+        if match is None:
+            raise
+        known = {name for each in cls.__mro__ if '__init__' in vars(each)
+                 for name in inspect.signature(vars(each)['__init__']).parameters}
+        raise unknown(f'a {cls.__name__}', match[1], known - {'self', 'args', 'kwargs'}) from None
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> ConfigurationError:
+    """Return the error for an unknown name, with the nearest known one in its hint."""
+    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(known)))

@@ -1,0 +1,455 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines in launch files: constructors that describe a MachineSpec and make no request."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import inspect
+import os
+import re
+import shlex
+from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
+
+from fogros2.describe import names, networks, values
+from fogros2.describe.kinds import options_of
+from fogros2.errors import ConfigurationError, did_you_mean
+from fogros2.host import containers, dependencies
+from fogros2.host.workspace import find_workspaces, underlays
+from fogros2.model import (
+    Bootstrap,
+    DEFAULT_LIFETIME,
+    DEFAULT_ROBOT_TIMEOUT,
+    MachineSpec,
+    OnExit,
+    OnInterrupt,
+)
+from fogros2.store import check_name
+
+if TYPE_CHECKING:
+    from launch import LaunchContext, SomeSubstitutionsType
+
+    from fogros2.deploy import RunningMachine
+
+    Value = Union[SomeSubstitutionsType, int, float]
+    Bool = Union[bool, SomeSubstitutionsType]
+    #: A machine in a launch file; a name may be of a machine that is mentioned elsewhere.
+    SomeMachine = Union['CloudInstance', SomeSubstitutionsType]
+
+_UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
+_DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
+
+
+class CloudInstance:
+    """
+    A machine that a launch requests; the base class of one class for each provider.
+
+    The constructor makes no request and costs nothing. The launch creates the machine when it
+    executes the machine's first node, and resolves substitutions in the values at that time.
+
+    :param ros_workspace: colcon workspace that is sent to the machine; None for the one whose
+        install space comes first in COLCON_PREFIX_PATH (or AMENT_PREFIX_PATH), '' for none.
+        Its sourced underlays are sent too.
+    :param working_dir_base: accepted for FogROS2's launch files; only :meth:`info` shows it. The
+        records of machines are below FOGROS2_STATE_HOME.
+    :param launch_foxglove: serve the machine's topics to Foxglove.
+    :param name: up to 40 lower-case letters, digits and hyphens, unique on this robot; without
+        a name, each launch invents one.
+    :param on_exit: what happens to the machine when the launch ends: 'delete', 'stop' or 'keep'.
+        With 'stop' and 'keep' a name is required, so that a later launch finds the machine.
+    :param lifetime: time until the machine ends by itself, in seconds or as '8h', '1d12h'.
+    :param robot_timeout: time without contact to the launch until the machine stops its nodes;
+        seconds or as above.
+    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
+    :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
+        of folders are prepended to the machine's own.
+    :param apt: Debian packages that the machine needs, such as 'libzbar0'.
+    :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
+        system has the same package, the system's version is used.
+    :param on_interrupt: what to do when the provider reclaims the machine while its nodes run.
+        'shutdown' ends the launch with a nonzero exit status. 'robot' restarts the nodes on the
+        robot, where their programs must be installed. They keep names and parameters, and lose
+        their memory: lifecycle states and loaded components.
+    :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
+        bridge, by TLS and with a token.
+    :param options: the provider's own options; subclasses set it.
+    :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
+    """
+
+    #: Name of the entry point in the group ``fogros2.provider``.
+    provider: ClassVar[str] = ''
+
+    def __init__(
+        self, ros_workspace: Optional[SomeSubstitutionsType] = None,
+        working_dir_base: Optional[SomeSubstitutionsType] = None,
+        launch_foxglove: Bool = False, *,
+        name: Optional[SomeSubstitutionsType] = None,
+        on_exit: SomeSubstitutionsType = 'delete',
+        lifetime: Value = DEFAULT_LIFETIME,
+        robot_timeout: Value = DEFAULT_ROBOT_TIMEOUT,
+        bootstrap: SomeSubstitutionsType = 'auto',
+        environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        on_interrupt: SomeSubstitutionsType = 'shutdown',
+        monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
+        apt: Optional[Sequence[SomeSubstitutionsType]] = None,
+        pip: Optional[Sequence[SomeSubstitutionsType]] = None,
+        options: Optional[Mapping[str, Any]] = None,
+        **unknown: object,
+    ) -> None:
+        if unknown:
+            raise self._unknown(next(iter(unknown)))
+        if not self.provider:
+            raise ConfigurationError(
+                f'{type(self).__name__} is no machine yet',
+                'use one of its kinds, such as ContainerInstance or AWSCloudInstance')
+        self._made_up = name is None
+        self._name = names.two_words() if name is None else name
+        self._workspace = ros_workspace
+        self._working_dir_base = working_dir_base
+        self._values: dict[str, Any] = {
+            'on_exit': on_exit, 'lifetime': lifetime, 'robot_timeout': robot_timeout,
+            'bootstrap': bootstrap, 'on_interrupt': on_interrupt,
+        }
+        self._environment = dict(environment or {})
+        self._options = {k: v for k, v in (options or {}).items() if v is not None}
+        self._foxglove = launch_foxglove
+        self._monitor_allow = networks.items(monitor_allow)
+        self._containers: list[SomeSubstitutionsType] = []
+        self._packages = {'apt': _packages('apt', apt), 'pip': _packages('pip', pip)}
+        self._spec: Optional[MachineSpec] = None
+        self._running: Optional[RunningMachine] = None
+        # values that are known already are checked where they are written
+        for key, value in self._options.items():
+            with _named(key):
+                values.check_plain(value)
+        if isinstance(self._name, str):
+            check_name(self._name)
+        for key, value in self._values.items():
+            if isinstance(value, (str, int, float)):
+                _CHECKS[key](key, value)
+        if isinstance(on_exit, str):
+            self._check_findable(on_exit)
+
+    def _check_findable(self, on_exit: str) -> None:
+        if self._made_up and on_exit != 'delete':
+            raise ConfigurationError(
+                f"a machine with on_exit='{on_exit}' needs a name",
+                'give it a name=, so that the next launch finds it')
+
+    def _unknown(self, name: str) -> ConfigurationError:
+        known = sorted({
+            parameter for cls in type(self).__mro__[:-1]
+            for parameter in inspect.signature(cls).parameters
+        } - {'self', 'options', 'unknown', 'common'})
+        return ConfigurationError(
+            f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, known))
+
+    @property
+    def name(self) -> str:
+        """The machine's name; a description while it is an unresolved substitution."""
+        if self._spec is not None:
+            return self._spec.name
+        return values.describe(self._name)
+
+    @property
+    def own_name(self) -> SomeSubstitutionsType:
+        """The name as the launch file gives it."""
+        return self._name
+
+    @property
+    def ip(self) -> Optional[str]:
+        """The address at which the robot reaches the machine, None until the machine is up."""
+        return self._running.machine.vpn_host if self._running else None
+
+    @property
+    def vpn_ip(self) -> Optional[str]:
+        """The machine's address in the VPN, None until the machine is up."""
+        return self._running.vpn_address if self._running else None
+
+    @property
+    def is_created(self) -> bool:
+        """Whether the machine is up."""
+        return self._running is not None
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """
+        Return what is known about the machine, with FogROS2's keys.
+
+        :param flush_to_disk: accepted for FogROS2's launch files; the record is on disk already.
+        """
+        shell = self._running.machine.shell if self._running else None
+        return {
+            'name': self.name,
+            'cloud_service_provider':
+                self._running.spec.provider if self._running else self.provider,
+            'ros_workspace': self._spec.workspace if self._spec else values.describe(
+                self._workspace),
+            'working_dir': self._working_dir_base and values.describe(self._working_dir_base),
+            'ssh_key_path': shell.key_file if shell else None,
+            'public_ip': self.ip,
+            'vpn_ip': self.vpn_ip,
+        }
+
+    def apt_install(self, args: str) -> None:
+        """
+        Install Debian packages on the machine before its nodes start, as ``apt=`` does.
+
+        :param args: package names, separated by spaces.
+        :raises ConfigurationError: an invalid package name.
+        """
+        self._packages['apt'] += _packages('apt', shlex.split(args))
+
+    def pip_install(self, args: str) -> None:
+        """
+        Install Python packages on the machine before its nodes start, as ``pip=`` does.
+
+        :param args: requirements, separated by spaces.
+        :raises ConfigurationError: an invalid requirement, or a package that FogROS2 contains.
+        """
+        self._packages['pip'] += _packages('pip', shlex.split(args))
+
+    def add_docker_container(
+        self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
+    ) -> None:
+        """
+        Run a container on the machine, from before its nodes start until they have ended.
+
+        ROS nodes in the container communicate with the launch's nodes: by default the container
+        uses the machine's network and the variables and configuration of the middleware.
+
+        :param cmd: a ``docker run`` command line.
+        :param image: instead of ``cmd``, the container's image, with any of ``command``,
+            ``ports``, ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see
+            :func:`fogros2.host.containers.described`.
+        :raises ConfigurationError: neither or both were given.
+        """
+        if bool(cmd) == bool(image) or cmd and parts:
+            raise ConfigurationError(
+                'add_docker_container takes a command line, or image= and the rest by name',
+                "such as 'docker run --net=host IMAGE'")
+        if image:
+            try:
+                cmd = containers.described(image, **parts)
+            except TypeError as error:
+                raise ConfigurationError(
+                    f'add_docker_container: {error}',
+                    f"there are: {', '.join(inspect.signature(containers.described).parameters)}"
+                ) from error
+        assert cmd is not None
+        if isinstance(cmd, str):
+            containers.parse(cmd)
+        self._containers.append(cmd)
+        self.takes_containers()
+
+    def takes_containers(self) -> None:
+        """Note that containers will run on the machine; a provider's class may override it."""
+
+    def is_up(self, running: RunningMachine) -> None:
+        """Note that the machine is up; the launch calls this."""
+        self._running = running
+
+    def spec(self, context: LaunchContext) -> MachineSpec:
+        """
+        Resolve all values, once; return the machine's spec.
+
+        :raises ConfigurationError: a wrong value.
+        """
+        if self._spec is None:
+            settings = {
+                key: _CHECKS[key](key, values.resolve(context, value))
+                for key, value in self._values.items()}
+            self._check_findable(settings['on_exit'])
+            workspace = values.resolve(context, self._workspace)
+            chain = find_workspaces(context.environment)
+            if workspace is None:
+                workspace = next(iter(chain), None)
+            elif workspace:
+                workspace = os.path.abspath(os.path.expanduser(workspace))
+            name = values.resolve(context, self._name)
+            self._spec = MachineSpec(
+                name=check_name(name),
+                provider=self.provider,
+                options={
+                    key: self._resolved(context, key, value)
+                    for key, value in self._options.items()},
+                workspace=workspace or None, underlays=underlays(workspace or None, chain),
+                environment={
+                    key: values.resolve(context, value)
+                    for key, value in self._environment.items()},
+                containers=tuple(values.resolve(context, line) for line in self._containers),
+                launch_foxglove=self._resolved(
+                    context, 'launch_foxglove', values.Bool(self._foxglove)),
+                monitor_allow=networks.resolve(context, self._monitor_allow),
+                apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
+                **settings)
+        return self._spec
+
+    def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
+        wanted = [value for some in self._packages[program]
+                  for value in values.resolve(context, some)]
+        return tuple(dict.fromkeys(_PACKAGE_CHECKS[program](value) for value in wanted))
+
+    def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
+        with _named(keyword):
+            return values.resolve_deferred(context, value)
+
+    def _option(self, name: str) -> Any:
+        """Return an option: resolved if the machine is up, else its plain value or description."""
+        if self._running is not None:
+            return self._running.spec.options.get(name)
+        value = (self._spec.options if self._spec else self._options).get(name)
+        return values.plain(value)
+
+
+class ContainerInstance(CloudInstance):
+    """
+    A container on this computer that behaves like a separate cloud machine.
+
+    :param image: its container image; None for this computer's own root file system, restricted
+        by an allow-list (podman only).
+    :param isolated: use the root file system of a new installation of this computer's release
+        instead, created once by debootstrap. Like a new machine in a cloud, it has none of the
+        packages that are installed on this computer.
+    :param engine: 'podman' or 'docker'; None for the one that works.
+    :param user: login user, created if needed.
+    :param network: name of an existing container network; None for the engine's default.
+    :param ip: fixed address in that network.
+    :param cpus: CPU limit, such as 1.5.
+    :param memory: memory limit, such as '2g'.
+    :param ports: ports to publish on the robot, in the engine's syntax.
+    :param mounts: folders of this computer that the container can read: ``path`` or
+        ``path:path there``.
+    :param gpus: 'all' or a number.
+    :param devices: such as '/dev/video0'.
+    :param containers: whether it may run containers of its own, which weakens its isolation;
+        None: only if ``add_docker_container`` or a node's ``image`` requires it.
+    """
+
+    provider = 'container'
+
+    def __init__(
+        self, *, image: Optional[SomeSubstitutionsType] = None,
+        isolated: Optional[Bool] = None,
+        engine: Optional[SomeSubstitutionsType] = None,
+        network: Optional[SomeSubstitutionsType] = None,
+        ip: Optional[SomeSubstitutionsType] = None,
+        cpus: Optional[Value] = None,
+        memory: Optional[SomeSubstitutionsType] = None,
+        ports: Optional[Sequence[SomeSubstitutionsType]] = None,
+        mounts: Optional[Sequence[SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        gpus: Optional[SomeSubstitutionsType] = None,
+        devices: Optional[Sequence[SomeSubstitutionsType]] = None,
+        containers: Optional[Bool] = None,
+        **common: Any,
+    ) -> None:
+        super().__init__(options=options_of(ContainerInstance.__init__, locals()), **common)
+
+    def takes_containers(self) -> None:
+        """Create the machine with the rights that a container engine needs, by default."""
+        self._options.setdefault('containers', values.Bool(True))
+
+
+class SSHInstance(CloudInstance):
+    """
+    An existing computer that accepts the robot's SSH key; it outlives the launch.
+
+    :param host: name or address.
+    :param user: login user; None for the user that ``ssh`` would choose.
+    :param port: TCP port of its SSH server.
+    :param key: private key file for the login; None for the user's own keys and agent.
+    :param host_key: its public host key (``ssh-ed25519 AAAA...``); None to use known_hosts.
+    """
+
+    provider = 'ssh'
+
+    def __init__(
+        self, host: SomeSubstitutionsType, user: Optional[SomeSubstitutionsType] = None,
+        port: Value = 22, key: Optional[SomeSubstitutionsType] = None,
+        host_key: Optional[SomeSubstitutionsType] = None, **common: Any,
+    ) -> None:
+        super().__init__(options=options_of(SSHInstance.__init__, locals()), **common)
+
+
+def checked(machine: SomeMachine) -> SomeMachine:
+    """
+    Check that a value is a machine, or the name of one; return it.
+
+    :raises ConfigurationError: it is neither.
+    """
+    if not isinstance(machine, CloudInstance) and not values.is_text(machine):
+        raise ConfigurationError(
+            f'machine={machine!r} is no machine',
+            'pass one such as ContainerInstance(), or the name of one')
+    return machine
+
+
+def parse_duration(what: str, value: Union[str, int, float]) -> float:
+    """
+    Convert a number, or text such as '90', '8h', '1h30m', '2d', to seconds.
+
+    :raises ConfigurationError: not a duration, or not above zero.
+    """
+    seconds = 0.0
+    if isinstance(value, str):
+        text = value.replace(' ', '')
+        try:
+            seconds = float(text)
+        except ValueError:
+            if _DURATION.fullmatch(text):
+                seconds = sum(
+                    float(number) * _UNITS[unit]
+                    for number, unit in re.findall(r'([\d.]+)([smhd])', text))
+    else:
+        seconds = float(value)
+    if not 0 < seconds < float('inf'):
+        raise ConfigurationError(
+            f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
+    return seconds
+
+
+@contextlib.contextmanager
+def _named(keyword: str) -> Iterator[None]:
+    """Name the keyword in the error of a wrong value."""
+    try:
+        yield
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{keyword}: {error.args[0]}', error.hint) from error
+
+
+def _choice(kind: Any) -> Any:
+    def check(what: str, value: object) -> str:
+        if value not in get_args(kind):
+            raise ConfigurationError(
+                f'{what}={value!r} is unknown',
+                did_you_mean(str(value), get_args(kind),
+                             f"use one of {', '.join(get_args(kind))}"))
+        return cast(str, value)
+    return check
+
+
+_PACKAGE_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
+
+
+def _packages(program: str, given: Any) -> list[Union[values.Items, values.List]]:
+    """
+    Read a value of ``apt=`` or ``pip=``; check the items that are known already.
+
+    :raises ConfigurationError: not a list of packages.
+    """
+    if isinstance(given, str):
+        raise ConfigurationError(f'{program}={given!r} is no list', f'{program}=[{given!r}]')
+    found = values.items(given)
+    for value in found if isinstance(found, values.Items) else ():
+        if isinstance(value, str):
+            _PACKAGE_CHECKS[program](value)
+    return [] if found is None else [found]
+
+
+_CHECKS: dict[str, Any] = {
+    'on_exit': _choice(OnExit),
+    'bootstrap': _choice(Bootstrap),
+    'on_interrupt': _choice(OnInterrupt),
+    'lifetime': parse_duration,
+    'robot_timeout': parse_duration,
+}

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines of cloud providers in launch files: an EC2 instance, a pod. They make no request."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from typing import Any, ClassVar, Optional, TYPE_CHECKING, TypedDict, Union
+
+from fogros2.describe.kinds import options_of
+from fogros2.describe.machines import CloudInstance
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.describe.machines import Bool, Value
+
+    #: One value, or one for each region.
+    ByRegion = Union[SomeSubstitutionsType, Mapping[str, SomeSubstitutionsType]]
+
+
+class Toleration(TypedDict, total=False):
+    """Allow a pod on tainted nodes, with the fields of a pod's specification."""
+
+    key: str
+    operator: str
+    value: str
+    effect: str
+    tolerationSeconds: int
+
+
+class AWSCloudInstance(CloudInstance):
+    """
+    An EC2 instance, created for the launch.
+
+    Defaults: the region of the user's AWS configuration, an image that ``ros2 fog`` has baked with
+    what the launch needs or else Ubuntu 24.04, and the type t3.medium, or the cheapest type that
+    meets the requirements below.
+
+    ``ami_image``, ``ec2_instance_type`` and ``subnet`` may depend on the region: a mapping such as
+    ``{'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}`` has a value for each region, and the launch
+    uses the value of the region that it chooses.
+
+    :param ami_image: id of an image.
+    :param region: such as 'eu-central-1'; 'nearest' for the region with the fastest response.
+    :param ec2_instance_type: such as 't3.medium'; 'cheapest' for the cheapest type that meets
+        the requirements below.
+    :param disk_size: GB; default 30.
+    :param spot: use a spot instance: cheaper, but AWS may reclaim it with two minutes' notice.
+    :param arch: x86_64 or arm64.
+    :param min_cpu: minimum number of vCPUs.
+    :param min_memory_gb: minimum memory in GiB.
+    :param cpu_type: manufacturer of the processor: intel, amd, aws.
+    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
+    :param gpu_memory_gb: minimum memory of each GPU in GB.
+    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
+    :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
+    :param subnet: subnet id; None for one of the default VPC.
+    :param security_groups: ids of groups in addition to the instance's own.
+    :param tags: tags for everything that is created, in addition to FogROS2's own.
+    :param regions: further regions to try, in this order, if one has no capacity.
+    :param instance_types: further types to try, in this order, if there is no capacity for one.
+    :param user: the image's login user.
+    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
+        address only.
+    """
+
+    provider = 'aws'
+
+    def __init__(
+        self, ami_image: Optional[ByRegion] = None,
+        region: Optional[SomeSubstitutionsType] = None,
+        ec2_instance_type: Optional[ByRegion] = None,
+        disk_size: Optional[Value] = None, *,
+        spot: Optional[Bool] = None,
+        arch: Optional[SomeSubstitutionsType] = None,
+        min_cpu: Optional[Value] = None,
+        min_memory_gb: Optional[Value] = None,
+        cpu_type: Optional[SomeSubstitutionsType] = None,
+        gpu: Optional[Union[Value, bool]] = None,
+        gpu_memory_gb: Optional[Value] = None,
+        max_price: Optional[Union[Value, Decimal]] = None,
+        iam_instance_profile: Optional[SomeSubstitutionsType] = None,
+        subnet: Optional[ByRegion] = None,
+        security_groups: Optional[Sequence[SomeSubstitutionsType]] = None,
+        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
+        instance_types: Optional[Sequence[SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
+        **common: Any,
+    ) -> None:
+        super().__init__(options=options_of(AWSCloudInstance.__init__, locals()), **common)
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """Return what is known about the machine, with FogROS2's keys."""
+        machine = self._running.machine if self._running else None
+        region = self._option('region')
+
+        def regional(name: str) -> Any:
+            value = self._option(name)
+            return value.get(region, value) if isinstance(value, Mapping) else value
+
+        return {
+            **super().info(flush_to_disk),
+            'ec2_region': region,
+            'ec2_instance_type': regional('ec2_instance_type'),
+            'disk_size': self._option('disk_size'),
+            'aws_ami_image': regional('ami_image'),
+            'ec2_instance_id': machine.id.rpartition('/')[2] if machine else None,
+        }
+
+
+class KubeInstance(CloudInstance):
+    """
+    A pod of a Kubernetes cluster, created for the launch in the context's namespace.
+
+    :param container_image: needs Python 3.10 or newer and ``sh``; ROS 2 in it saves time.
+    :param zone: preferred zone of the pod.
+    :param mcpu: CPU request and limit in thousandths of a CPU; 0 for none.
+    :param mb: memory request and limit in MiB; 0 for none.
+    :param namespace: None for the context's own.
+    :param context: context of the kubeconfig; None for the current one.
+    :param gpus: number of devices of the kind ``gpu_resource``.
+    :param gpu_resource: such as 'nvidia.com/gpu'.
+    :param node_selector: labels that the cluster's node must have.
+    :param tolerations: as in a pod's specification.
+    :param runtime_class: such as 'nvidia'.
+    :param image_pull_secrets: names of secrets in the namespace.
+    :param service_account: the pod's service account; its token is not mounted.
+    :param expose: how the VPN reaches the pod: 'load_balancer', 'node_port', 'pod_dials_robot',
+        'pod_ip'; 'auto' tries them in this order.
+    :param robot_host: address at which pods reach the robot, if they have to dial it.
+    :param user: login user, created if the image has none of this name.
+    :param env: variables of every login; ``environment`` is for the nodes only.
+    :param annotations: annotations of the Service, for example for a cloud's load balancer.
+    """
+
+    provider = 'kubernetes'
+
+    def __init__(
+        self, container_image: Optional[SomeSubstitutionsType] = None,
+        zone: Optional[SomeSubstitutionsType] = None,
+        mcpu: Optional[Value] = None, mb: Optional[Value] = None, *,
+        namespace: Optional[SomeSubstitutionsType] = None,
+        context: Optional[SomeSubstitutionsType] = None,
+        gpus: Optional[Value] = None,
+        gpu_resource: Optional[SomeSubstitutionsType] = None,
+        node_selector: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        tolerations: Optional[Sequence[Toleration]] = None,
+        runtime_class: Optional[SomeSubstitutionsType] = None,
+        image_pull_secrets: Optional[Sequence[SomeSubstitutionsType]] = None,
+        service_account: Optional[SomeSubstitutionsType] = None,
+        expose: Optional[SomeSubstitutionsType] = None,
+        robot_host: Optional[SomeSubstitutionsType] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        env: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        annotations: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        **common: Any,
+    ) -> None:
+        super().__init__(options=options_of(KubeInstance.__init__, locals()), **common)
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """Return what is known about the machine, with FogROS2's keys."""
+        machine = self._running.machine if self._running else None
+        return {
+            **super().info(flush_to_disk),
+            'compute_region': self._option('zone'),
+            'compute_instance_type':
+                f'{self._option("mcpu") or 0}mx{self._option("mb") or 0}Mb',
+            'compute_instance_id': machine.id if machine else None,
+        }
+
+
+class _NoProvider(CloudInstance):
+    """A machine class of FogROS2 without a provider here; the constructor raises an error."""
+
+    cloud: ClassVar[str]
+
+    def __init__(self, *given: object, **keywords: object) -> None:
+        raise ConfigurationError(
+            f'{type(self).__name__} is not available: FogROS2 for Jazzy has no provider for '
+            f'{self.cloud}',
+            'use KubeInstance for a cluster there, SSHInstance(host=..., user=...) for a VM that '
+            'you create there yourself, AWSCloudInstance, or ContainerInstance on this computer')
+
+
+class GCPCloudInstance(_NoProvider):
+    """A virtual machine of Google Cloud; launch files of FogROS2 may name it."""
+
+    cloud = 'Google Cloud'
+
+
+class AzureCloudInstance(_NoProvider):
+    """A virtual machine of Azure; launch files of FogROS2 may name it."""
+
+    cloud = 'Azure'

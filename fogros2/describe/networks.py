@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read the networks of a launch file's ``monitor_allow``."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Any, TYPE_CHECKING
+
+from fogros2.describe import values
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+
+_SUCH = "write networks such as '198.51.100.0/28', or addresses"
+
+
+def items(given: Any) -> Any:
+    """
+    Return networks as separate values, None for none; check those that are known already.
+
+    :raises ConfigurationError: a single text, or an invalid network.
+    """
+    if isinstance(given, str):
+        raise ConfigurationError(f'monitor_allow={given!r} is no list of networks', _SUCH)
+    found = values.items(given)
+    if isinstance(found, values.Items):
+        for value in found:
+            if isinstance(value, str):
+                normal(value)
+    return found
+
+
+def resolve(context: LaunchContext, networks: Any) -> tuple[str, ...]:
+    """
+    Resolve networks; return them in CIDR form.
+
+    :param networks: a result of :func:`items`.
+    :raises ConfigurationError: an invalid network.
+    """
+    return tuple(normal(value) for value in values.resolve(context, networks) or ())
+
+
+def normal(text: str) -> str:
+    """
+    Convert a network or an address to CIDR form.
+
+    :raises ConfigurationError: it is neither, or has bits set beyond its mask.
+    """
+    try:
+        return str(ipaddress.ip_network(text.strip()))
+    except ValueError:
+        pass
+    try:
+        meant = str(ipaddress.ip_network(text.strip(), strict=False))
+    except ValueError as error:
+        raise ConfigurationError(f"monitor_allow: '{text}' is no network", _SUCH) from error
+    raise ConfigurationError(f"monitor_allow: '{text}' is an address within a network",
+                             f"write '{meant}', or the address alone")

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values of launch files: plain, or substitutions that are resolved at execution."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
+import os
+from typing import Any, Protocol, TYPE_CHECKING, Union
+
+from fogros2.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from launch import LaunchContext, SomeSubstitutionsType, Substitution
+
+_BOOLS = {'true': True, '1': True, 'false': False, '0': False}
+
+
+class Items(tuple[Any, ...]):
+    """Several values, each resolved separately; launch would read a plain list as one text."""
+
+
+class Converted(abc.ABC):
+    """A value that is converted once it is resolved; a substitution resolves to text only."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    @staticmethod
+    @abc.abstractmethod
+    def convert(value: Any, /) -> Any:
+        """
+        Return a resolved value in its type.
+
+        :raises ConfigurationError: it cannot be converted.
+        """
+
+    @classmethod
+    def of(cls, value: Any) -> Any:
+        """Mark a value, None for none."""
+        return None if value is None else cls(value)
+
+
+def items(
+    values: Union[Iterable[SomeSubstitutionsType], Substitution, List, None],
+) -> Union[Items, List, None]:
+    """Return values as separate items, None for none; a substitution contains them in one text."""
+    if values is None or isinstance(values, List):
+        return values
+    # recognised by its method: describing a machine does not import launch
+    return List(values) if hasattr(values, 'perform') else Items(values)
+
+
+def split(text: str) -> list[str]:
+    """
+    Split a text into values: ``a, b``, or YAML's ``[a, b]``; an empty text has none.
+
+    :raises ConfigurationError: it begins with '[' and is not a YAML list of texts.
+    """
+    if not text.lstrip().startswith('['):
+        return [part.strip() for part in text.split(',') if part.strip()]
+    found = read_yaml(text)
+    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        raise ConfigurationError(f'{text!r} is no list of texts', "write 'a, b' or '[a, b]'")
+    return found
+
+
+def read_yaml(text: str) -> Any:
+    """Parse YAML, with scalars as texts; return None if it is invalid."""
+    import yaml
+    # the base of the safe loader; it does not convert 2222:22 to a number
+    loader = yaml.BaseLoader(text)
+    try:
+        return loader.get_single_data()
+    except yaml.YAMLError:
+        return None
+    finally:
+        loader.dispose()
+
+
+class Deferred(Protocol):
+    """A value that takes time to obtain: the call makes the request, in a thread."""
+
+    def __call__(self) -> str:
+        """
+        Return the value; a second call returns the same.
+
+        :raises FogError: the request failed, or there is no such value.
+        """
+
+
+def resolve_deferred(context: LaunchContext, value: Any) -> Any:
+    """Resolve a value like ``resolve``, but return a slow value as a :class:`Deferred`."""
+    defer = getattr(value, 'defer', None)
+    return resolve(context, value) if defer is None else defer(context)
+
+
+def await_all(options: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Call every :class:`Deferred` among options; run it in a thread.
+
+    :raises FogError: a value cannot be obtained.
+    """
+    return {key: value() if callable(value) else value for key, value in options.items()}
+
+
+def plain(value: Any) -> Any:
+    """Return the value without its mark, or a description of an unresolved one."""
+    if isinstance(value, Converted):
+        return plain(value.value)
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    return value if value is None or isinstance(value, (bool, int, float)) else describe(value)
+
+
+def resolve(context: LaunchContext, value: Any) -> Any:
+    """
+    Resolve the substitutions in a value.
+
+    A list or tuple is one text in parts, as everywhere in launch. Items become a list. Values of
+    other types are returned unchanged.
+    """
+    if value is None or isinstance(value, (str, int, float, Decimal)):
+        return value
+    if isinstance(value, Converted):
+        return value.convert(resolve(context, value.value))
+    if isinstance(value, Items):
+        return [resolve(context, item) for item in value]
+    if isinstance(value, Mapping):
+        return {key: resolve(context, item) for key, item in value.items()}
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+    return perform_substitutions(context, normalize_to_list_of_substitutions(value))
+
+
+def is_text(value: Any) -> bool:
+    """Return whether a value is a text, or what launch resolves to one."""
+    from launch import Substitution
+    parts = value if isinstance(value, (list, tuple)) and value else [value]
+    return all(isinstance(part, (str, Substitution)) for part in parts)
+
+
+def check_plain(value: Any) -> None:
+    """
+    Check a Number or a Bool whose value is known already.
+
+    :raises ConfigurationError: the value is something else.
+    """
+    if isinstance(value, Converted) and isinstance(
+            value.value, (str, bool, int, float, Decimal)):
+        value.convert(value.value)
+
+
+def read_number(value: Any) -> Union[int, float]:
+    """
+    Convert a value to a number.
+
+    :raises ConfigurationError: it is none.
+    """
+    if isinstance(value, (int, float)):
+        return value
+    try:
+        return int(value) if isinstance(value, str) else float(value)
+    except ValueError:
+        pass
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigurationError(f'{value!r} is no number', 'such as 2 or 1.5') from None
+
+
+def read_bool(value: Any) -> bool:
+    """
+    Convert a text to True or False, as launch does for a condition; other values by ``bool``.
+
+    :raises ConfigurationError: the text is neither.
+    """
+    if not isinstance(value, str):
+        return bool(value)
+    if value.lower() not in _BOOLS:
+        raise ConfigurationError(f'{value!r} is neither true nor false', 'write one of the two')
+    return _BOOLS[value.lower()]
+
+
+class Number(Converted):
+    """A value that resolves to a number."""
+
+    convert = staticmethod(read_number)
+
+
+class Bool(Converted):
+    """A value that resolves to True or False, with the syntax of launch's conditions."""
+
+    convert = staticmethod(read_bool)
+
+
+class List(Converted):
+    """A text that contains several values once it is resolved; see :func:`split`."""
+
+    convert = staticmethod(split)
+
+
+def describe(value: Any) -> str:
+    """Return a readable text: the value itself, or a substitution's description."""
+    if value is None or isinstance(value, (str, os.PathLike)):
+        return os.fspath(value or '')
+    parts = value if isinstance(value, (list, tuple)) else [value]
+    return ''.join(
+        part if isinstance(part, str) else f'<{part.describe()}>' for part in parts)

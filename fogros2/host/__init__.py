@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a machine needs, and how the machine gets it.
+
+``inspection`` reads a machine's facts. ``locked`` has the pinned versions of the package index.
+``wheels`` packs the robot's own distributions. ``modules`` names the modules that programs import,
+``workspace`` sends workspaces, ``programs`` checks that the programs of nodes exist.
+``dependencies`` names the packages that nodes declare, ``undeclared`` finds imports that nodes do
+not declare. ``bootstrap`` installs ROS 2. ``container_scripts`` has the scripts that run
+containers, ``containers`` the commands with them.
+"""

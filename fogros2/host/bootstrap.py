@@ -1,0 +1,655 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Prepare a machine for ROS 2 nodes.
+
+``inspection.probe`` reads the machine's facts in one round trip, ``plan`` decides, and ``ensure``
+carries the plan out: its ``tools``, then its wheels, then its ``commands``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+from pathlib import Path
+import re
+import shlex
+import sys
+import threading
+from typing import Literal, Optional
+
+from fogros2 import process
+from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
+from fogros2.host import dependencies as needs
+from fogros2.host import inspection as host
+from fogros2.host import locked
+from fogros2.host import wheels as wheel_cache
+from fogros2.host import workspace as workspaces
+from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
+from fogros2.model import Bootstrap, Command, MachineSpec, Result
+from fogros2.plan import DEFAULT_RMW, extended, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.shell import Shell
+
+#: The system for which ROS 2 Jazzy has packages.
+APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
+APT_ARCHITECTURES = ('x86_64', 'aarch64')
+#: Folder in the login user's home, with a folder for each version of the sent wheels.
+INSTALL_FOLDER = '.local/share/fogros2'
+#: Free bytes that the embedded default needs, and that ROS 2's packages need.
+EMBEDDED_BYTES, APT_BYTES = 300 << 20, 3 << 30
+
+#: Programs that every machine needs, with their Debian packages.
+TOOLS: Mapping[str, str] = {
+    'ip': 'iproute2',
+    'rsync': 'rsync',
+    'wg': 'wireguard-tools',
+}
+#: Without the middleware's package, see :func:`apt_packages`.
+APT_PACKAGES = (
+    f'ros-{DISTRO}-ros-base',
+    'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
+    'wireguard-tools', 'rsync', 'iproute2',
+    'sudo',  # for rosdep; images of ROS lack it
+)
+#: Variables with lists of folders; of the robot's folders, a machine has only those that are sent.
+_PATH_VARIABLES = (
+    'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'LD_LIBRARY_PATH',
+    'PYTHONPATH', 'PATH')
+#: Variables that ROS's setup script sets.
+_ROS_VARIABLES = ('ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION')
+
+
+@dataclasses.dataclass(frozen=True)
+class RosInstall:
+    """
+    How ROS programs run on a machine.
+
+    :param kind: ROS 2 itself, or the embedded default.
+    :param command: command that starts our launch file there.
+    :param setup: scripts for sh to source in this order, after ``environment`` is set; with a
+        workspace's script if it is needed.
+    :param facts: facts of the machine; ``robot`` has those of the robot.
+    :param workspaces: how workspaces get there, in the order in which they are sourced.
+    """
+
+    kind: Literal['ros', 'embedded']
+    command: tuple[str, ...]
+    setup: tuple[str, ...] = ()
+    environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    facts: HostFacts = HostFacts()
+    robot: HostFacts = HostFacts()
+    workspaces: tuple[workspaces.WorkspacePlan, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Preparation:
+    """
+    The steps of a machine's preparation, in this order: ``tools``, wheels, ``commands``.
+
+    :param mode: how ROS gets to the machine; 'none' if the machine has it.
+    :param tools: commands that install rsync and the VPN's programs, which later steps need.
+    :param wheels_target: folder on the machine to send the wheels to; '' sends none.
+    """
+
+    mode: Literal['none', 'apt', 'embedded']
+    install: RosInstall
+    tools: tuple[Command, ...] = ()
+    wheels_target: str = ''
+    commands: tuple[Command, ...] = ()
+
+    @property
+    def note(self) -> str:
+        """What the preparation does, in a few words."""
+        if self.mode == 'none':
+            return 'there already' if not (self.tools or self.commands) else 'completed'
+        return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
+
+
+def apt_packages(rmw: str) -> tuple[str, ...]:
+    """Return the Debian packages of ROS 2 with a middleware."""
+    first, *others = APT_PACKAGES
+    return (first, f"ros-{DISTRO}-{rmw.replace('_', '-')}", *others)
+
+
+def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = ()) -> str:
+    """
+    Return a hash, 16 hexadecimal digits, of what must be installed on a machine.
+
+    It covers the ROS distribution, the packages of every machine, the workspaces' dependencies
+    outside themselves, and the packages that only the launch names. It does not cover what each
+    launch sends, such as the workspaces. A launch finds an image of a machine by this hash.
+
+    :param under: environment of the robot's launch.
+    :param packages: packages of the nodes that will run there.
+    :raises WorkspaceError: a manifest of a workspace cannot be read.
+    """
+    embedded = any(
+        next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
+        for prefix in under.prefixes)
+    wanted = {
+        'distro': under.environment.get('ROS_DISTRO') or DISTRO,
+        'bootstrap': spec.bootstrap,
+        'kind': 'embedded' if embedded else 'ros',
+        'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
+        'workspace': workspaces.dependencies(*spec.workspaces),
+        'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
+    }
+    # Our packages come with the wheels, and those of the embedded default with it.
+    ours = {name.replace('-', '_') for name in needs.OURS}
+    named = needs.keys(map(workspaces.inspect, spec.workspaces), {*packages} - ours)
+    named = tuple({*named} & {*packages})
+    if named := needs.outside(named, [sys.prefix] if embedded else []):
+        wanted['launch'] = sorted(named)
+    return hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def ensure(
+    shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
+    cancel: Optional[threading.Event] = None,
+    on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
+    packages: Sequence[str] = (),
+) -> tuple[RosInstall, str]:
+    """
+    Prepare a machine for ROS 2 nodes, by its facts and by ``spec.bootstrap``.
+
+    :param under: environment of the robot's launch.
+    :param timeout: time-out of each command in seconds.
+    :param on_plan: callback with the plan, as soon as files can be sent and the VPN set up; these
+        steps need not wait for the slowest ones.
+    :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
+    :param packages: packages of the nodes that will run there.
+    :returns: how ROS programs run there, and what was done in a few words.
+    :raises ConfigurationError: the machine has this computer's network.
+    :raises PrerequisiteError: the machine cannot be prepared.
+    :raises WorkspaceError: the workspace can neither be used nor built there.
+    """
+    question = host.probe(under.prefixes)
+    with ThreadPoolExecutor(1, 'fog-probe') as pool:
+        here = pool.submit(_robot_facts, under.prefixes, timeout)
+        there = shell.run(question, timeout=timeout, cancel=cancel)
+        robot = here.result()
+    facts = host.parse_facts(there.stdout)
+    if elsewhere:
+        check_elsewhere(spec, facts, robot)
+    chain = [workspaces.inspect(path) for path in spec.workspaces]
+    keys = needs.keys(chain, packages)
+    todo = plan_alike(spec, facts, robot, under, chain)
+    if todo is not None:
+        # The machine has the same ROS packages.
+        keys = needs.outside(keys, under.prefixes)
+    else:
+        try:
+            wheels = wheel_cache.collect()
+        except OSError as error:
+            raise PrerequisiteError(
+                f"what '{spec.name}' lacks can't be packed on this computer: {error}",
+                'XDG_CACHE_HOME names another folder for it') from error
+        todo = plan(spec, facts, robot, under, wheels, chain)
+        if todo.install.kind == 'embedded':
+            # The machine gets a copy of this environment.
+            keys = needs.outside(keys, [sys.prefix])
+    folder = needs.PipFolder.of(spec, facts, keys)
+    if spec.pip or keys:
+        todo = dataclasses.replace(todo, install=dataclasses.replace(
+            todo.install, environment=folder.found_by(todo.install.environment)))
+    for command in todo.tools:
+        shell.run(command, timeout=timeout, cancel=cancel)
+    on_plan(todo.install)
+    if todo.wheels_target:
+        shell.run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'),
+                  timeout=timeout, cancel=cancel)
+        shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
+                   cancel=cancel)
+    for command in todo.commands:
+        shell.run(command, timeout=timeout, cancel=cancel)
+    notes = [todo.note]
+    if (spec.apt or spec.pip or keys) and folder.done not in facts.installed:
+        notes += _complete(spec, todo, folder, keys, functools.partial(
+            shell.run, timeout=timeout, cancel=cancel))
+    return todo.install, ', '.join(notes)
+
+
+def _complete(
+    spec: MachineSpec, todo: Preparation, folder: needs.PipFolder, keys: Sequence[str],
+    run: Callable[..., Result],
+) -> list[str]:
+    """
+    Install what nodes need besides ROS 2, and return what was done in a few words.
+
+    :param keys: rosdep keys. If a key cannot be resolved, or its package cannot be installed, the
+        result names it; the nodes may not need it.
+    :param run: function that runs a command on the machine.
+    :raises PrerequisiteError: a package in the launch file cannot be installed.
+    """
+    install, facts = todo.install, todo.install.facts
+    environment = extended(install.environment, spec.environment)
+    apt, pip, notes = spec.apt, spec.pip, []
+    able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
+    left = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
+    if left:
+        asked = run(needs.resolve(left, environment, install.setup), check=False)
+        if asked.returncode == needs.NO_ROSDEP and able:
+            run(apt_install([needs.rosdep_package(facts)], 'install rosdep'), check=False)
+            asked = run(needs.resolve(left, environment, install.setup), check=False)
+        if asked.returncode == 0:
+            more_apt, more_pip = needs.resolved(asked.stdout)
+            apt, pip = (*apt, *more_apt), (*pip, *more_pip)
+            left = re.findall(r"no rosdep rule for '([^']+)'", asked.stderr)
+        if left:
+            notes.append(f"the machine may lack {', '.join(left)}")
+    if apt:
+        lacking = run(needs.missing(apt)).stdout.split()
+        named = [name for name in lacking if name in spec.apt]
+        if named and not able:
+            raise PrerequisiteError(
+                f"machine '{spec.name}' lacks the packages {', '.join(named)}",
+                f"on the machine: apt-get install {' '.join(named)}")
+        if lacking and not able:
+            notes.append(f"the machine lacks {', '.join(lacking)}")
+        elif lacking:
+            run(apt_install(lacking, f"install {', '.join(lacking)}"))
+            notes.append(f"installed {', '.join(lacking)}")
+    if not (apt or pip) and install.kind == 'ros':
+        return notes
+    run(dataclasses.replace(folder, requirements=pip).fill(
+        install.environment, spec.environment, install.setup))
+    if pip:
+        notes.append(f"installed {', '.join(pip)} by pip")
+    return notes
+
+
+def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:
+    """
+    Check that a machine does not have the robot's network.
+
+    Packets between two addresses of one computer never pass through a VPN.
+
+    :raises ConfigurationError: the machine has the robot's network.
+    """
+    if facts.network and facts.network == robot.network:
+        raise ConfigurationError(
+            f"'{spec.name}' is this robot itself, or shares its network: no VPN leads there",
+            f'run its nodes here with --machine {spec.name}=robot, or in a ContainerInstance')
+
+
+_probing = threading.Lock()
+_robot: dict[tuple[str, ...], HostFacts] = {}
+
+
+def _robot_facts(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
+    """Return the facts of this computer, probed once for all machines of a launch."""
+    with _probing:
+        if prefixes not in _robot:
+            _robot[prefixes] = host.parse_facts(
+                process.run(host.probe(prefixes), timeout=timeout).stdout)
+        return _robot[prefixes]
+
+
+def plan_alike(
+    spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
+    chain: Sequence[workspaces.Workspace] = (),
+) -> Optional[Preparation]:
+    """
+    Return the plan for a machine with the robot's environment, None for other machines.
+
+    Such a machine has each folder of the underlay, with the same packages for the same processor
+    architecture: a machine made from the robot's image, the robot itself, or an equal computer.
+    """
+    same = facts.architecture == robot.architecture and all(
+        facts.environments.get(prefix, '?') == robot.environments.get(prefix)
+        for prefix in under.prefixes)
+    ours = _travelling(chain) or ((facts.cloud_launch,) if facts.cloud_launch else ())
+    if not same or not ours or spec.bootstrap == 'apt':
+        return None
+    install = RosInstall(
+        'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
+        environment=under.environment, facts=facts, robot=robot)
+    return Preparation(
+        'none', _with_workspaces(install, chain, spec.name, _builds(facts)),
+        _tools(facts, spec.bootstrap, spec.name))
+
+
+def plan(
+    spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
+    wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace] = (),
+) -> Preparation:
+    """
+    Decide how a machine with another environment than the robot's gets what its nodes need.
+
+    :param wheels: wheels that the robot can send.
+    :param chain: the workspaces, overlays first.
+    :raises PrerequisiteError: ``spec.bootstrap`` cannot prepare this machine.
+    :raises WorkspaceError: the workspace cannot be used there.
+    """
+    mode, machine = spec.bootstrap, f"machine '{spec.name}' ({facts.name})"
+    if facts.python is None:
+        raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
+                                'install python3 there')
+    tools = _tools(facts, mode, spec.name)
+    python_only = mode == 'embedded' or all(space.python_only for space in chain)
+    no_embedded = _why_not_embedded(facts, wheels, python_only)
+    if under.rmw != DEFAULT_RMW:
+        no_embedded = f'the embedded default has {DEFAULT_RMW} alone, and not {under.rmw}'
+    no_apt = _why_not_apt(facts)
+    if facts.has_rmw(under.rmw) and (
+            mode in ('auto', 'none')
+            or mode == 'apt' and _builds(facts)):
+        todo = _ros(facts, wheels, chain)
+    elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
+            and under.rmw == DEFAULT_RMW):
+        todo = Preparation('none', _embedded_install(facts, wheels))
+    elif mode == 'none':
+        raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {under.rmw}',
+                                "bootstrap='auto' would install what is missing")
+    elif mode != 'apt' and not no_embedded:
+        todo = _embedded(facts, wheels)
+    elif mode == 'embedded':
+        raise PrerequisiteError(
+            f"{machine} can't take the embedded default: {no_embedded}",
+            'make room there' if 'are free' in no_embedded else
+            "bootstrap='auto' takes another way where there is one")
+    elif not no_apt:
+        todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt))
+    else:
+        reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
+        raise PrerequisiteError(
+            f"{machine} can't be made ready for ROS 2: {reason}",
+            'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
+    install = dataclasses.replace(
+        todo.install, facts=facts, robot=robot,
+        environment=_merged(todo.install, under, chain))
+    return dataclasses.replace(
+        todo, tools=tools, install=_with_workspaces(
+            install, chain, spec.name, todo.mode == 'apt' or _builds(facts)))
+
+
+def check_architecture(
+    spec: MachineSpec, architecture: str, workspace: Optional[workspaces.Workspace],
+    wheels: Callable[[], wheel_cache.Wheels],
+) -> None:
+    """
+    Check, before a machine is created, that its architecture has all that its nodes need.
+
+    ``plan`` checks what depends on the machine's system.
+
+    :param architecture: in the form of ``uname -m``.
+    :param wheels: function that returns the wheels that the robot can send; called if necessary.
+    :raises PrerequisiteError: no bootstrap installs ROS 2 there.
+    :raises WorkspaceError: the workspace is compiled for another architecture, and cannot be
+        built there.
+    """
+    machine = f"machine '{spec.name}' ({architecture})"
+    if spec.bootstrap == 'embedded':
+        sent = wheels()
+        names = [] if sent.architecture == architecture else [
+            _distribution(file) for file in sent.hashes if not file.endswith('-none-any.whl')]
+        lacking = locked.lacking(names, architecture)
+        if lacking:
+            raise PrerequisiteError(
+                f"{machine} can't take the embedded default: its {', '.join(lacking)} has no "
+                f'package for {architecture} processors',
+                f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
+                'machine with an x86_64 processor')
+    elif spec.bootstrap == 'apt' and architecture not in APT_ARCHITECTURES:
+        raise PrerequisiteError(
+            f"{machine} can't be made ready for ROS 2: "
+            f'{_why_not_apt(HostFacts(architecture=architecture))}',
+            'choose an image or computer that has ROS 2 already')
+    reason = workspaces.why_not_on(workspace, architecture) if workspace is not None else ''
+    if workspace is None or not reason:
+        return
+    if not workspace.sources:
+        raise workspaces.no_sources(workspace, spec.name, reason)
+    if spec.bootstrap == 'embedded':
+        raise WorkspaceError(
+            f'{workspace.root} would have to be built on {machine}: {reason}; the embedded '
+            'default builds nothing', "use bootstrap='auto' or 'apt'")
+
+
+def _builds(facts: HostFacts) -> bool:
+    """Return whether a machine can build a workspace."""
+    return {'colcon', 'rosdep'} <= facts.programs
+
+
+def _with_workspaces(
+    install: RosInstall, chain: Sequence[workspaces.Workspace], name: str, can_build: bool,
+) -> RosInstall:
+    """
+    Add how the workspaces get to the machine, underlays first.
+
+    A workspace that is built there needs its setup script, and so do its overlays: a script puts
+    its packages before all others.
+    """
+    ways: list[workspaces.WorkspacePlan] = []
+    setup = install.setup
+    for space in reversed(chain):
+        ways.append(workspaces.plan(
+            space, install.facts, install.robot,
+            ros_setup=(*install.setup, *(way.setup for way in ways)),
+            can_build=install.kind == 'ros' and can_build, name=name))
+        if any(way.commands for way in ways):
+            setup = (*setup, ways[-1].setup)
+    return dataclasses.replace(install, workspaces=tuple(ways), setup=setup)
+
+
+def _merged(
+    install: RosInstall, under: Underlay, chain: Sequence[workspaces.Workspace],
+) -> dict[str, str]:
+    """Return the robot's plain variables and workspace folders, then the install's variables."""
+    merged = {name: under.environment[name] for name in PLAIN_VARIABLES
+              if name in under.environment and name not in _ROS_VARIABLES}
+    below = tuple(f'{space.root}/' for space in chain)
+    for name in _PATH_VARIABLES:
+        entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
+                   if entry.startswith(below)]
+        own = install.environment.get(name)
+        entries += [own] if own else []
+        if entries:
+            merged[name] = os.pathsep.join(entries)
+    for name, value in install.environment.items():
+        merged.setdefault(name, value)
+    return merged
+
+
+def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ...]:
+    """Return the commands that install the missing programs of ``TOOLS``."""
+    packages = [package for program, package in TOOLS.items() if program not in facts.programs]
+    able = mode != 'none' and facts.root and 'apt-get' in facts.programs
+    if packages and not able:
+        raise PrerequisiteError(
+            f"machine '{machine}' lacks {', '.join(packages)}",
+            f"on the machine: apt-get install {' '.join(packages)}")
+    # A kernel module that is not loaded yet may be invisible; the VPN's step finds out.
+    if able and not facts.kernel_wireguard and 'wireguard-go' not in facts.programs:
+        packages.append('wireguard-go')
+    if not packages:
+        return ()
+    return (apt_install(packages, f"install {', '.join(packages)}"),)
+
+
+def _why_not_embedded(
+    facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool,
+) -> str:
+    if not wheels.embedded:
+        return 'this robot runs ROS 2 itself and has no embedded default to send'
+    if not python_only:
+        return 'the workspace has compiled packages, which need ROS 2 itself'
+    lacking = locked.lacking(_asked(facts, wheels), facts.architecture)
+    if lacking:
+        return f"its {', '.join(lacking)} has no package for {facts.architecture} processors"
+    if not any(p.venv and p.version >= MIN_PYTHON for p in facts.pythons):
+        return "its Python lacks the module 'venv' (package python3-venv)"
+    if facts.free_bytes is not None and facts.free_bytes < EMBEDDED_BYTES:
+        return (f'{facts.free_bytes >> 20} MB are free in {facts.home}, '
+                f'{EMBEDDED_BYTES >> 20} are needed')
+    return ''
+
+
+def _why_not_apt(facts: HostFacts) -> str:
+    if facts.architecture not in APT_ARCHITECTURES:
+        return (f"ROS 2 {DISTRO} has packages for {' and '.join(APT_ARCHITECTURES)} processors, "
+                f'and not for {facts.architecture}')
+    if (facts.system, facts.release) != (APT_SYSTEM, APT_RELEASE):
+        return f'ROS 2 {DISTRO} has packages for Ubuntu {APT_RELEASE} alone'
+    if not facts.root:
+        return f'installing packages takes root, and {facts.user} has no sudo without a password'
+    if facts.free_bytes is not None and facts.free_bytes < APT_BYTES:
+        return f'{facts.free_bytes >> 20} MB are free, {APT_BYTES >> 20} are needed'
+    return ''
+
+
+def _fits(facts: HostFacts, wheels: wheel_cache.Wheels) -> Optional[Python]:
+    """Return the interpreter that can use the robot's compiled wheels, None if there is none."""
+    if facts.architecture != wheels.architecture or not wheel_cache.runs_on(
+            wheels.libc, facts.libc):
+        return None
+    return next((p for p in facts.pythons if p.venv and p.version == wheels.python), None)
+
+
+def _asked(facts: HostFacts, wheels: wheel_cache.Wheels) -> list[str]:
+    """
+    Return the distributions that a machine gets from its own package index.
+
+    The robot's wheels of them are compiled for another Python, C library or processor.
+    """
+    if _fits(facts, wheels) is not None:
+        return []
+    return [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+
+
+def _distribution(file: str) -> str:
+    return locked.name_of(file.partition('-')[0])
+
+
+def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
+    return f'{facts.home}/{INSTALL_FOLDER}/{wheels.key}'
+
+
+def _embedded_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
+    return _fits(facts, wheels) or next(
+        p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
+
+
+def _embedded_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
+    prefix = f'{_folder(facts, wheels)}/venv'
+    version = '{}.{}'.format(*_embedded_python(facts, wheels).version)
+    program = f'{prefix}/lib/python{version}/site-packages/fogros2/cloud_launch.py'
+    return RosInstall('embedded', (f'{prefix}/bin/ros2', 'launch', program), environment={
+        'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
+        'VIRTUAL_ENV': prefix})
+
+
+def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+    """Return the plan that installs the sent wheels into a virtual environment."""
+    folder = _folder(facts, wheels)
+    target = f'{folder}/wheels'
+    # pip runs from its wheel, so that the machine needs no ensurepip (package python3-venv).
+    words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
+             '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
+    asked = _asked(facts, wheels)
+    if not asked:
+        words.append('--no-index')
+    lines = [locked.from_file(f'{target}/{file}', digest, name)
+             for file, digest in wheels.hashes.items()
+             if (name := _distribution(file)) not in asked]
+    script = (
+        f'cd {shlex.quote(folder)}\n'
+        f'{_checked(wheels, wheels.pip)}'
+        'rm -rf venv\n'
+        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip venv\n'
+        f"printf '%s\\n' {shlex.join([*lines, *locked.requirements(asked)])} >requirements.txt\n"
+        f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
+        ': >complete\n')
+    return Preparation(
+        'embedded', _embedded_install(facts, wheels), wheels_target=target,
+        commands=(Command.script(script, what='install the embedded default'),))
+
+
+def _checked(wheels: wheel_cache.Wheels, file: str) -> str:
+    """Return script lines that fail if a wheel has another hash."""
+    line = f'{wheels.hashes[file]}  wheels/{file}'
+    return f'echo {shlex.quote(line)} | sha256sum -c >/dev/null\n'
+
+
+def _travelling(chain: Sequence[workspaces.Workspace]) -> tuple[str, ...]:
+    """Return the arguments of ``ros2 launch`` for our launch file if a workspace contains it."""
+    if any(wheel_cache.OWN in space.packages for space in chain):
+        return (wheel_cache.OWN, 'cloud.launch.py')
+    return ()
+
+
+def _ros(
+    facts: HostFacts, wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace],
+) -> Preparation:
+    """Return the plan that adds this package to an installed ROS, by unpacking its wheel."""
+    prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
+    if _travelling(chain):
+        return Preparation('none', RosInstall(
+            'ros', (f'{prefix}/bin/ros2', 'launch', *_travelling(chain)),
+            (f'{prefix}/setup.sh',)))
+    folder = _folder(facts, wheels)
+    install = RosInstall(
+        'ros', (f'{prefix}/bin/ros2', 'launch', f'{folder}/site/fogros2/cloud_launch.py'),
+        (f'{prefix}/setup.sh',),
+        {'PYTHONPATH': f'{folder}/site', 'AMENT_PREFIX_PATH': f'{folder}/site/prefix'})
+    if wheels.key in facts.installed:
+        return Preparation('none', install)
+    assert facts.python is not None
+    script = (
+        f'cd {shlex.quote(folder)}\n'
+        'rm -rf site\n'
+        f'{_checked(wheels, wheels.fogros2)}'
+        f'{shlex.quote(facts.python.path)} -m zipfile -e '
+        f'wheels/{shlex.quote(wheels.fogros2)} site\n'
+        'mkdir -p site/prefix\n'
+        'for data in site/*.data/data; do [ ! -d "$data" ] || cp -R "$data/." site/prefix; done\n'
+        # zipfile does not restore modes
+        '[ ! -d site/prefix/lib ] || chmod -R u+x site/prefix/lib\n'
+        ': >complete\n')
+    return Preparation(
+        'none', install, wheels_target=f'{folder}/wheels',
+        commands=(Command.script(script, what='unpack fogros2'),))
+
+
+def _apt(
+    facts: HostFacts, wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace],
+    packages: Sequence[str],
+) -> Preparation:
+    """Return the plan that installs ROS 2's and the user's packages, and adds this package."""
+    ours = _ros(facts, wheels, chain)
+    commands = [apt_install(packages, f'install ROS 2 {DISTRO}')]
+    if DISTRO not in facts.ros:
+        commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
+    return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))
+
+
+#: As in ROS's installation instructions: a package with the source list and its key.
+_APT_SOURCE = f"""
+export DEBIAN_FRONTEND=noninteractive
+apt-get update -q
+apt-get install -qy -o DPkg::Lock::Timeout=300 --no-install-recommends ca-certificates curl
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+base=https://github.com/ros-infrastructure/ros-apt-source/releases
+version=$(curl -fsSLo /dev/null --retry 3 -w '%{{url_effective}}' "$base/latest")
+version=${{version##*/}}
+curl -fsSL --retry 3 -o "$folder/source.deb" \\
+    "$base/download/$version/ros2-apt-source_$version.{APT_CODENAME}_all.deb"
+dpkg -i "$folder/source.deb"
+"""
+
+
+def apt_install(packages: Sequence[str], what: str) -> Command:
+    """Return the command that installs Debian packages."""
+    return Command.script(
+        'export DEBIAN_FRONTEND=noninteractive\n'
+        # a machine that has just booted runs apt by itself: wait for its lock
+        'apt-get -q -o DPkg::Lock::Timeout=300 update\n'
+        # repair an installation that was killed; apt waits for one that still runs
+        'dpkg --configure -a </dev/null || :\n'
+        'apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends '
+        f'{shlex.join(packages)}\n', sudo=True, what=what)

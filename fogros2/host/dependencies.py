@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Install what nodes need besides ROS 2: packages in launch files, and rosdep keys.
+
+The keys are the packages of the launch's nodes, and what the sent packages declare
+(``exec_depend``). pip's packages go into a separate folder, which Python searches last, so that
+they replace no packages of the system, of ROS 2 or of this project (PEP 668).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+import re
+import shlex
+
+from fogros2 import plan
+from fogros2.errors import ConfigurationError
+from fogros2.host import locked, modules
+from fogros2.host.inspection import DISTRO, HostFacts
+from fogros2.host.workspace import run_dependencies, Workspace
+from fogros2.model import Command, MachineSpec
+from fogros2.plugin_system import OWN_PACKAGES
+
+#: Distributions that only this project's own wheels may install, and their modules.
+OURS = tuple(locked.name_of(name) for name in (*OWN_PACKAGES, 'ros2_embedded'))
+#: Name of a Debian package, with an optional architecture and version.
+_APT = re.compile(r'[a-z0-9][a-z0-9+.-]+(:[a-z0-9-]+)?(=[A-Za-z0-9.+:~-]+)?')
+#: A requirement begins with a name (PEP 508): neither an option nor a URL.
+_PIP = re.compile(r'([A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?)\s*($|[\[@<>=!~;(,])')
+
+_MISSING = """\
+for name; do
+    state=$(dpkg-query -W -f '${db:Status-Status} ${Version}' "${name%%=*}" 2>/dev/null) || state=
+    case $name in
+        *=*) [ "$state" = "installed ${name#*=}" ] || echo "$name" ;;
+        *) [ "${state%% *}" = installed ] || echo "$name" ;;
+    esac
+done
+"""
+#: Prints the keys that are neither an installed ROS package nor an installed Debian package.
+_UNKNOWN = r"""
+left=()
+for key; do
+    IFS=:
+    for prefix in $AMENT_PREFIX_PATH; do
+        [ ! -e "$prefix/share/ament_index/resource_index/packages/$key" ] || continue 2
+    done
+    left+=("$key")
+done
+[ ${#left[@]} != 0 ] || exit 0
+# one call for all: each takes a hundredth of a second
+there=" $(dpkg-query -W -f '${Package}=${db:Status-Status} ' "${left[@]}" 2>/dev/null) "
+for key in "${left[@]}"; do
+    [[ $there = *" $key=installed "* ]] || echo "$key"
+done
+"""
+#: Exit status if rosdep is not installed.
+NO_ROSDEP = 4
+#: rosdep downloads its lists once; it exits with 1 if a key has no rule.
+_RESOLVE = f"""\
+command -v rosdep >/dev/null || exit {NO_ROSDEP}
+""" + """\
+if [ ! -e "${ROS_HOME:-$HOME/.ros}/rosdep/sources.cache/index" ]; then
+    [ -n "$ROSDEP_SOURCE_PATH" ] || [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] \\
+        || sudo -n rosdep init >&2 || exit 3
+    rosdep update --rosdistro "$distro" >&2 || exit 3
+fi
+rosdep resolve --rosdistro "$distro" "$@" || [ $? = 1 ]
+"""
+#: Python runs this module at its start; it runs the system's module of the same name afterwards.
+_LAST_IN_PATH = """\
+import importlib.util, os, site, sys
+from importlib.machinery import PathFinder
+_here = os.path.dirname(os.path.abspath(__file__))
+if sys.base_prefix == '/usr' != sys.prefix:
+    # virtual environments of the system's Python get the packages of apt
+    sys.path.append('/usr/lib/python3/dist-packages')
+site.addsitedir(os.path.join(os.path.dirname(_here), 'site'))
+_next = PathFinder.find_spec('sitecustomize', [p for p in sys.path if os.path.abspath(p) != _here])
+if _next is not None:
+    _next.loader.exec_module(importlib.util.module_from_spec(_next))
+"""
+
+
+def check_apt(name: str) -> str:
+    """
+    Check and return the name of a Debian package.
+
+    :raises ConfigurationError: the name is invalid.
+    """
+    if not _APT.fullmatch(name):
+        raise ConfigurationError(f'apt: {name!r} is no name of a Debian package',
+                                 "such as 'libzbar0', one text for each package")
+    return name
+
+
+def check_pip(requirement: str) -> str:
+    """
+    Check and return a requirement for pip.
+
+    :raises ConfigurationError: it names no package, or a package of this project.
+    """
+    found = _PIP.match(requirement)
+    if found is None:
+        raise ConfigurationError(f'pip: {requirement!r} names no Python package',
+                                 "such as 'pyzbar>=0.1.9' or 'pyzbar @ https://...'")
+    if locked.name_of(found[1]) in OURS:
+        raise ConfigurationError(f"pip: '{found[1]}' is part of FogROS2, which brings it itself",
+                                 'leave it out')
+    return requirement
+
+
+def keys(workspaces: Iterable[Workspace], packages: Iterable[str]) -> tuple[str, ...]:
+    """
+    Return the rosdep keys of what a machine needs besides the workspaces, sorted.
+
+    :param packages: packages of the launch's nodes.
+    """
+    own: set[str] = set()
+    found = set(packages)
+    for workspace in workspaces:
+        own |= set(workspace.packages)
+        for name, prefix in workspace.installed.items():
+            found |= run_dependencies(prefix / 'share' / name / 'package.xml')
+    return tuple(sorted(found - own - {''}))
+
+
+def outside(names: Iterable[str], prefixes: Iterable[str]) -> tuple[str, ...]:
+    """Return the keys without the ROS packages below some prefixes of this computer."""
+    folders = [Path(prefix, 'share/ament_index/resource_index/packages') for prefix in prefixes]
+    return tuple(name for name in names
+                 if not any((folder / name).exists() for folder in folders))
+
+
+def rosdep_package(facts: HostFacts) -> str:
+    """Return the Debian package of rosdep."""
+    return 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
+
+
+def unknown(
+    names: Sequence[str], environment: Mapping[str, str], setup: Sequence[str],
+) -> Command:
+    """Return the command that prints the keys whose packages a machine may lack."""
+    return modules.among_nodes(
+        environment, setup, f'set -- {shlex.join(names)}\n{_UNKNOWN}', 'look for dependencies')
+
+
+def resolve(
+    names: Sequence[str], environment: Mapping[str, str], setup: Sequence[str],
+) -> Command:
+    """Return the command that resolves rosdep keys, for ``resolved``."""
+    return modules.among_nodes(
+        environment, setup, f'distro={DISTRO}\nset -- {shlex.join(names)}\n{_RESOLVE}',
+        'resolve rosdep keys')
+
+
+def resolved(output: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    r"""
+    Return the Debian packages and the pip packages in the output of ``resolve``.
+
+    >>> resolved('#ROSDEP[a]\n#apt\nliba libb\n#ROSDEP[c]\n#pip\nc')
+    (('liba', 'libb'), ('c',))
+    """
+    found: dict[str, list[str]] = {'apt': [], 'pip': []}
+    installer = ''
+    for line in output.splitlines():
+        if line.startswith('#'):
+            installer = line[1:].strip()
+        elif installer in found:
+            found[installer] += line.split()
+    return tuple(dict.fromkeys(found['apt'])), tuple(dict.fromkeys(found['pip']))
+
+
+def missing(names: Iterable[str]) -> Command:
+    """Return the command that prints the Debian packages that a machine lacks, each once."""
+    return Command(('sh', '-c', _MISSING, 'sh', *dict.fromkeys(names)),
+                   what='look for apt packages')
+
+
+@dataclasses.dataclass(frozen=True)
+class PipFolder:
+    """
+    A folder on a machine with the packages of pip.
+
+    :param path: equal for equal requirements, so that they are installed once.
+    """
+
+    path: str
+    requirements: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, spec: MachineSpec, facts: HostFacts, names: Sequence[str] = (),
+    ) -> PipFolder:
+        """
+        Return the folder of a machine, below the login user's home.
+
+        :param names: rosdep keys, some of which may need pip.
+        """
+        need = json.dumps([sorted(spec.pip), sorted(names), sorted(spec.apt),
+                           *(python.version for python in facts.pythons)])
+        digits = hashlib.sha256(need.encode()).hexdigest()[:16]
+        return cls(f'{facts.home}/.local/share/fogros2/pip-{digits}', spec.pip)
+
+    def found_by(self, environment: Mapping[str, str]) -> dict[str, str]:
+        """Return variables with which Python finds these packages after all others."""
+        own = f'{self.path}/last'
+        before = environment.get('PYTHONPATH')
+        return {**environment, 'PYTHONPATH': f'{before}:{own}' if before else own}
+
+    @property
+    def done(self) -> str:
+        """The name of the complete folder in ``HostFacts.installed``."""
+        return self.path.rpartition('/')[2]
+
+    def fill(
+        self, environment: Mapping[str, str], given: Mapping[str, str], setup: Sequence[str],
+    ) -> Command:
+        """
+        Return the command that installs the packages by one call of pip.
+
+        :param environment: variables of nodes there; ``given`` has those of the launch file.
+        """
+        names = ' '.join(name.replace('-', '_') for name in OURS)
+        script = modules.PIP.format(folder=shlex.quote(self.path)) if self.requirements else (
+            f'set -e\nmkdir -p {shlex.quote(self.path)}\ncd {shlex.quote(self.path)}\n')
+        script += (
+            (f'"$@" {shlex.join(self.requirements)}\n' if self.requirements else '') +
+            'rm -rf pip\n'
+            f'for name in {names}; do [ ! -e "site/$name" ] || {{\n'
+            "    echo \"one of the packages brings '$name', which is part of FogROS2\" >&2\n"
+            '    rm -rf site; exit 1; }\n'
+            'done\n'
+            f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
+            ': >complete\n')
+        return modules.among_nodes(
+            plan.extended(environment, given), setup, script, 'install Python packages')

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pinned versions, with hashes, of the distributions that a machine may get from its package index.
+
+Compiled wheels of the robot do not run with another processor, C library or Python. A machine
+gets them from its own index, and pip refuses files with other hashes. ``tools/lock.py`` writes
+the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+import re
+
+from fogros2.errors import PrerequisiteError
+
+FILE = Path(__file__).with_name('locked.txt')
+#: Start of the line in the file with the distributions that have wheels only for x86_64.
+X86_64_ALONE = '# Wheels for x86_64 alone:'
+#: Options of pip besides the requirements. Sources would be built by programs without hashes.
+OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
+
+
+def name_of(requirement: str) -> str:
+    """Return the normalised name in a requirement: ``pyyaml`` for ``PyYAML>=6``."""
+    return re.sub('[-_.]+', '-', re.split(r'[^A-Za-z0-9._-]', requirement.strip())[0]).lower()
+
+
+def parse(text: str) -> dict[str, list[str]]:
+    """
+    Return the entries of a requirements file by the distribution's name.
+
+    A distribution has several entries if the version depends on the Python.
+    """
+    found: dict[str, list[str]] = {}
+    for entry in re.sub(r'\s*\\\n\s*', ' ', text).splitlines():
+        if entry.strip() and not entry.startswith('#'):
+            found.setdefault(name_of(entry), []).append(entry.strip())
+    return found
+
+
+def requirements(names: Iterable[str]) -> list[str]:
+    """
+    Return the lines of a requirements file for some distributions.
+
+    :raises PrerequisiteError: a distribution is not pinned.
+    """
+    entries = parse(FILE.read_text())
+    lines: list[str] = []
+    for name in names:
+        if name_of(name) not in entries:
+            raise PrerequisiteError(
+                f'{name} is compiled for this robot, and no other build of it is pinned',
+                'choose a machine with the same Python, processor and C library as the robot')
+        lines += entries[name_of(name)]
+    return lines
+
+
+def lacking(names: Iterable[str], architecture: str) -> list[str]:
+    """
+    Return the distributions that have no wheel for a processor architecture.
+
+    :param architecture: in the form of ``uname -m``.
+    """
+    if architecture == 'x86_64':
+        return []
+    lines = FILE.read_text().splitlines()
+    without = {name for line in lines if line.startswith(X86_64_ALONE)
+               for name in line.removeprefix(X86_64_ALONE).split()}
+    return [name for name in names if name_of(name) in without]
+
+
+def from_file(path: str, sha256: str, name: str) -> str:
+    """Return the line of a requirements file for a wheel on the disk, with its hash."""
+    from urllib.parse import quote
+    return f'{name} @ file://{quote(path)} --hash=sha256:{sha256}'

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Python modules that some of our programs need besides ROS 2, and their installation on a machine.
+
+They go into a folder that only these programs search, so that no other program finds another NumPy
+than it was built for. The robot sends its own modules if they run on the machine. Otherwise the
+machine installs them from its package index, in versions that are pinned with hashes. apt is no
+alternative: Ubuntu 24.04 has PyAV 11, which does not support colour ranges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+import hashlib
+from importlib import metadata
+import importlib.util
+import json
+import platform
+import re
+import shlex
+import sys
+from typing import Optional
+
+from fogros2.errors import PrerequisiteError
+from fogros2.host import locked
+from fogros2.host.wheels import libc_for, runs_on
+from fogros2.model import Command, NodeSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class Module:
+    """
+    A Python module that is not part of ROS 2.
+
+    :param distributions: distributions that contain it; the first is the one to install.
+    :param oldest: first numbers of the oldest usable version.
+    :param replaced_by: a ROS package that replaces the module.
+    """
+
+    name: str
+    distributions: tuple[str, ...]
+    oldest: tuple[int, ...] = ()
+    replaced_by: str = ''
+
+    @property
+    def requirement(self) -> str:
+        """The requirement for pip."""
+        version = '.'.join(map(str, self.oldest))
+        return f'{self.distributions[0]}>={version}' if version else self.distributions[0]
+
+
+MODULES: Mapping[str, Module] = {module.name: module for module in (
+    Module('numpy', ('numpy',)),
+    # 16 converts bgr8 with a wrong colour range, 14 damages depth images of a few pixels
+    Module('av', ('av',), (17,)),
+    Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
+                   'opencv-contrib-python')),
+    Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),
+    # for the applications; their wheels need only NumPy
+    Module('gtsam', ('gtsam',)),
+    Module('ompl', ('ompl',), (2,)),
+    Module('fcl', ('python-fcl',)),
+)}
+IMAGES = ('numpy', 'av', 'cv2')
+#: Modules that (package, executable) pairs need.
+NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ('image_transport_h264', 'encoder'): IMAGES,
+    ('image_transport_h264', 'decoder'): IMAGES,
+    ('fogros2_examples', 'camera'): ('numpy', 'cv2'),
+    ('fogros2_examples', 'image_processor'): ('numpy', 'cv2'),
+    ('fogros2_examples', 'slam'): ('numpy', 'cv2', 'gtsam'),
+    ('fogros2_examples', 'grasp_planner'): ('numpy', 'cv2', 'fcl'),
+    ('fogros2_examples', 'motion_planner'): ('numpy', 'ompl', 'fcl'),
+    ('fogros2', 'bridge'): ('foxglove',),
+}
+
+#: Imports each module, because an installed module may lack a shared library.
+_ASK = """\
+import importlib, json, os, platform, re, sys
+from importlib import metadata
+def version(module, names):
+    if hasattr(module, '__version__'):
+        return module.__version__
+    for name in names:
+        try:
+            return metadata.version(name)
+        except metadata.PackageNotFoundError:
+            pass
+    return ''
+missing = {}
+for name, names, oldest, package in json.loads(sys.argv[1]):
+    if package and any(
+            os.path.exists(prefix + '/share/ament_index/resource_index/packages/' + package)
+            for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix):
+        continue
+    try:
+        module = importlib.import_module(name)
+        if oldest and [int(n) for n in re.findall(
+                '[0-9]+', version(module, names))[:len(oldest)]] < oldest:
+            missing[name] = ''
+    except Exception as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name == name
+        missing[name] = '' if absent else str(error)[:200]
+libc = ' '.join(platform.libc_ver())
+print(json.dumps([sys.version_info[:2], platform.machine(), libc, missing]))
+"""
+#: Creates an empty folder, and sets ``"$@"`` to the command of pip for the nodes' Python.
+PIP = """\
+set -e
+mkdir -p {folder}
+cd {folder}
+rm -rf site
+if python3 -m pip --version >/dev/null 2>&1; then
+    set -- python3 -m pip
+elif wheel=$(ls "$VIRTUAL_ENV"/../wheels/pip-*.whl 2>/dev/null); then
+    # the wheel of the embedded default: Debian's venv has no pip
+    set -- python3 "$wheel/pip"
+else
+    python3 -m venv --clear pip
+    set -- pip/bin/python -m pip
+fi
+set -- "$@" install --quiet --no-compile --disable-pip-version-check --target site
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """
+    The Python of a machine's nodes, and the modules that it lacks.
+
+    :param architecture: in the form of ``uname -m``.
+    :param libc: such as ``glibc 2.36``.
+    :param missing: names of modules that cannot be imported, or are too old.
+    :param broken: errors of installed modules, such as a missing shared library.
+    """
+
+    python: tuple[int, int]
+    architecture: str
+    libc: str
+    missing: tuple[str, ...]
+    broken: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Copy:
+    """
+    Modules of this computer that run on a machine.
+
+    :param entries: by folder with modules: names of the entries that belong to the modules.
+    :param versions: names and versions of the distributions.
+    """
+
+    entries: Mapping[str, tuple[str, ...]]
+    versions: tuple[str, ...]
+
+
+def needed_by(programs: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the names of the modules that (package, executable) pairs need, in fixed order."""
+    needed = {name for program in programs for name in NEEDS.get(program, ())}
+    return tuple(name for name in MODULES if name in needed)
+
+
+def lacking_here(names: Iterable[str]) -> list[Module]:
+    """Return the modules that this Python lacks or has too old; do not import them."""
+    return [MODULES[name] for name in names
+            if importlib.util.find_spec(name) is None or _too_old(MODULES[name])]
+
+
+def _too_old(module: Module) -> bool:
+    found = next(filter(None, map(_installed, module.distributions)), None)
+    if found is None:
+        return False  # installed without a version
+    numbers = map(int, re.findall('[0-9]+', found.version)[:len(module.oldest)])
+    return tuple(numbers) < module.oldest
+
+
+def ask(
+    names: Iterable[str], environment: Mapping[str, str], setup: Sequence[str], site: str = '',
+) -> Command:
+    """
+    Return the command that looks for modules, for ``answer``.
+
+    :param names: names of the modules.
+    :param environment: variables of nodes on the machine; ``setup`` has scripts to source.
+    :param site: an additional folder, which Python searches first.
+    """
+    words = ['python3', '-c', _ASK, json.dumps([
+        (name, MODULES[name].distributions, MODULES[name].oldest, MODULES[name].replaced_by)
+        for name in names])]
+    return among_nodes(
+        environment, setup, f'{_path([site]) if site else ""}exec {shlex.join(words)}',
+        'look for Python modules')
+
+
+def answer(output: str) -> Answer:
+    """
+    Parse the output of ``ask``.
+
+    :raises PrerequisiteError: the machine's nodes have no Python.
+    """
+    try:
+        python, architecture, libc, missing = json.loads(output.strip().splitlines()[-1])
+        return Answer((int(python[0]), int(python[1])), str(architecture), str(libc),
+                      tuple(map(str, missing)), tuple(filter(None, map(str, missing.values()))))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise PrerequisiteError(
+            f'no Python there says what it has: {output[-200:]!r}',
+            'is its python3 at least 3.10, and does a login there print nothing?') from error
+
+
+def copy(there: Answer) -> Optional[Copy]:
+    """Return the missing modules from this Python, None if they would not run there."""
+    if there.architecture != platform.machine():
+        return None
+    entries: dict[str, set[str]] = {}
+    versions = []
+    for name in there.missing:
+        found = next(filter(None, map(_installed, MODULES[name].distributions)), None)
+        if found is None or not _runs(found, there):
+            return None
+        # The other files are programs in a bin folder.
+        entries.setdefault(str(found.locate_file('')), set()).update(
+            file.parts[0] for file in found.files or () if file.parts[0] != '..')
+        versions.append(f'{found.name} {found.version}')
+    return Copy({folder: tuple(sorted(names)) for folder, names in entries.items()},
+                tuple(versions))
+
+
+def _installed(name: str) -> Optional[metadata.Distribution]:
+    try:
+        return metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _runs(found: metadata.Distribution, there: Answer) -> bool:
+    """Return whether an installed distribution runs on a machine with this processor."""
+    tags = [tag.split('-') for tag in re.findall(
+        r'^Tag: (\S+)$', found.read_text('WHEEL') or '', re.MULTILINE)]
+    if not tags:
+        return False  # not from a wheel: it may need libraries of this computer
+    # It is for this version of Python, for the tag's version and later ones, or for any version.
+    least = re.fullmatch(r'(?:cp|py)(\d)(\d*)', tags[0][0])
+    stable = tags[0][1] in ('abi3', 'none') and least is not None and there.python >= (
+        int(least[1]), int(least[2] or 0))
+    if not stable and there.python != sys.version_info[:2]:
+        return False
+    wheel = f"x-{'.'.join(tag[2] for tag in tags)}.whl"
+    return runs_on(libc_for([wheel]), there.libc)
+
+
+def folder(home: str, there: Answer, versions: Sequence[str]) -> str:
+    """
+    Return the folder of modules on a machine; equal for equal modules.
+
+    :param home: home of the login user.
+    :param versions: names and versions of the modules.
+    """
+    need = json.dumps([there.python, there.missing, list(versions)])
+    return (f'{home}/.local/share/fogros2/'
+            f'modules-{hashlib.sha256(need.encode()).hexdigest()[:16]}')
+
+
+def pinned(missing: Iterable[str]) -> list[str]:
+    """
+    Return the lines of a requirements file for modules from an index.
+
+    :raises PrerequisiteError: a module is not pinned.
+    """
+    return locked.requirements(MODULES[name].distributions[0] for name in missing)
+
+
+def install(
+    environment: Mapping[str, str], setup: Sequence[str], target: str, missing: Sequence[str],
+) -> Command:
+    """Return the command that installs pinned modules from the index into ``target``/site."""
+    lines = shlex.join(pinned(missing))
+    return among_nodes(environment, setup, PIP.format(folder=shlex.quote(target)) + (
+        f"printf '%s\\n' {lines} >requirements.txt\n"
+        f'"$@" {shlex.join(locked.OPTIONS)} --requirement requirements.txt\nrm -rf pip\n'),
+        'install Python modules')
+
+
+def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:
+    """
+    Return a node whose Python finds the modules that it needs.
+
+    :param places: folders by module, '' for modules that the machine has itself.
+    """
+    needed = needed_by([(node.package, node.executable)])
+    sites = dict.fromkeys(f'{places[name]}/site' for name in needed if places.get(name))
+    if not sites or node.shell:
+        return node
+    # Searched first, because the machine's own version may be too old.
+    return dataclasses.replace(node, prefix=(
+        *node.prefix, 'sh', '-c', _path(sites) + 'exec "$@"', 'sh'))
+
+
+def _path(sites: Iterable[str]) -> str:
+    path = shlex.quote(':'.join(sites))
+    return f'export PYTHONPATH={path}${{PYTHONPATH:+:$PYTHONPATH}}\n'
+
+
+def among_nodes(
+    environment: Mapping[str, str], setup: Sequence[str], script: str, what: str,
+) -> Command:
+    """Return a command that runs a script in the nodes' environment."""
+    # Variables of a launch file may be secrets, and every user can read command lines.
+    lines = [f'export {name}={shlex.quote(value)}' for name, value in environment.items()]
+    # A workspace may not be there yet.
+    lines += [f'[ ! -f {shlex.quote(path)} ] || . {shlex.quote(path)}' for path in setup]
+    # bash reads the whole group before it starts a program, which could read the rest.
+    text = '\n'.join(['{', *lines, script, '} </dev/null', ''])
+    return Command(('bash', '-s'), input=text.encode(), what=what)

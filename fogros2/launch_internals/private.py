@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Give the other packages access to private parts of launch, and say why each is needed.
+
+launch has no public extension point to start a process elsewhere. ``ExecuteLocal.execute``
+resolves the action, registers its handlers and then creates a task from its private method
+``__execute_process``. FogROS2 extends launch at that method: a :class:`RemoteStart` replaces it
+and sets ``_subprocess_transport`` and ``_subprocess_protocol``, and :func:`delay_start` calls it
+later. Everything else (substitutions, handlers, output, ``on_exit``, signals) stays launch's own
+code. The options that the method reads have no getters.
+
+The names are those of Jazzy (launch 3.4), which the embedded default shares;
+``test/unit/test_launch_internals.py`` checks each name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+import functools
+from typing import Any, Optional, Union
+
+from launch import (
+    LaunchContext,
+    LaunchDescription,
+    LaunchDescriptionEntity,
+    LaunchDescriptionSource,
+)
+from launch.actions import ExecuteLocal, TimerAction
+from launch.utilities import AsyncSafeSignalManager
+
+#: The method of ExecuteLocal that starts the process and awaits its end.
+EXECUTE_PROCESS = '_ExecuteLocal__execute_process'
+#: The coroutine method of TimerAction that waits, then fires.
+WAIT_TO_FIRE = '_wait_to_fire_event'
+
+def option(action: ExecuteLocal, name: str) -> Any:
+    """Return an option of a prepared action, such as ``respawn``; there are no getters."""
+    return getattr(action, f'_ExecuteLocal__{name}')
+
+
+def prefix_output(action: ExecuteLocal, machine: str, *, remove: bool = False) -> None:
+    """Put the machine's name before the process's name in the output format, or remove it."""
+    name = '{this.process_description.final_name}'
+    # a machine's name contains no braces, so it is safe in a format string
+    names = (name, f'{machine}.{name}')
+    old, new = reversed(names) if remove else names
+    vars(action)['_ExecuteLocal__output_format'] = option(
+        action, 'output_format').replace(old, new)
+
+
+def completed(action: ExecuteLocal) -> Optional[asyncio.Future[Any]]:
+    """Return the future of the process's end, None before the action's execution."""
+    future: Optional[asyncio.Future[Any]] = option(action, 'completed_future')
+    return future
+
+
+def set_transport(action: ExecuteLocal, process: object) -> None:
+    """
+    Make an action use ``process`` as its subprocess.
+
+    launch calls ``send_signal``, ``kill``, ``get_returncode`` and reads ``complete``.
+    """
+    vars(action).update(_subprocess_transport=process, _subprocess_protocol=process)
+
+
+def transport(action: ExecuteLocal) -> Any:
+    """Return the object that the action uses as its subprocess, None if there is none yet."""
+    return action._subprocess_transport
+
+
+class RemoteStart(ExecuteLocal):
+    """
+    A process action whose start and shutdown a subclass can replace.
+
+    As the last base of a class it comes between launch's action and ExecuteLocal.
+    """
+
+    async def fogros2_start(self, context: LaunchContext) -> None:
+        """Start the process as launch does, and await its end."""
+        await getattr(super(), EXECUTE_PROCESS)(context)
+
+    def fogros2_shut_down(
+        self, context: LaunchContext, send_sigint: bool,
+    ) -> Optional[list[LaunchDescriptionEntity]]:
+        """End the process as launch does."""
+        return super()._shutdown_process(context, send_sigint=send_sigint)
+
+    async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
+        await self.fogros2_start(context)
+
+    def _shutdown_process(
+        self, context: LaunchContext, *, send_sigint: bool,
+    ) -> Optional[list[LaunchDescriptionEntity]]:
+        return self.fogros2_shut_down(context, send_sigint)
+
+
+def delay_start(
+    entity: Union[ExecuteLocal, TimerAction], until: Callable[[], Awaitable[bool]],
+) -> None:
+    """
+    Delay the start of a process, or of a timer's period.
+
+    :param until: awaited first; if it returns False, the process never starts.
+    """
+    method = EXECUTE_PROCESS if isinstance(entity, ExecuteLocal) else WAIT_TO_FIRE
+    start = getattr(entity, method)
+
+    async def start_later(context: LaunchContext) -> None:
+        begins = await until()
+        if isinstance(entity, TimerAction) or begins and not context.is_shutdown:
+            await start(context)
+            return
+        future = completed(entity)
+        if future is not None and not future.done():
+            future.set_result(None)
+
+    setattr(entity, method, start_later)
+
+
+def replace_reader(
+    source: LaunchDescriptionSource,
+    reader: Callable[[Callable[[str], LaunchDescription], str], LaunchDescription],
+) -> None:
+    """
+    Make a source of a launch description read its launch file by a function.
+
+    :param reader: called with the function that read the file before, and the file's path.
+    """
+    vars(source)['_get_launch_description'] = functools.partial(
+        reader, source._get_launch_description)
+
+
+def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
+    """
+    Return the saved environments that launch restores, so that callers can change them.
+
+    A scoped group restores one at its end, ResetEnvironment another. Variables of the whole
+    launch have to be in all of them.
+    """
+    found: list[dict[str, str]] = []
+    for name, value in vars(context).items():
+        if 'environment' in name:
+            found += [kept for kept in (value if isinstance(value, list) else [value])
+                      if isinstance(kept, dict)]
+    return found
+
+
+def waiting_events(context: LaunchContext) -> int:
+    """Return the number of events that launch has yet to process."""
+    return int(context._event_queue.qsize())
+
+
+def signal_manager() -> Optional[AsyncSafeSignalManager]:
+    """
+    Return the signal manager of the running LaunchService.
+
+    Its SIGTERM handler cancels the service at once; launch has no public way to replace it.
+    """
+    name = '_AsyncSafeSignalManager__current'
+    manager: Optional[AsyncSafeSignalManager] = getattr(AsyncSafeSignalManager, name)
+    return manager

@@ -1,0 +1,428 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run machines on this computer: containers of podman or docker, each with an SSH server.
+
+``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
+machine without an image, ``entry`` makes its first process. ``machine`` reads the reports of the
+engine, ``options`` parses the options in launch files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import json
+import os
+from pathlib import Path
+import re
+import stat
+from typing import Any, ClassVar, Optional
+
+from fogros2 import process
+from fogros2.errors import (
+    CommandError,
+    DeadlineExceeded,
+    MachineNotFound,
+    NameTaken,
+    PrerequisiteError,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
+from fogros2.provider import Capabilities, Provider
+from fogros2.provider.container import debian_root
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container import entry as container_entry
+from fogros2.provider.container import machine as container_machine
+from fogros2.provider.container import options as container_options
+from fogros2.provider.container import root as container_root
+from fogros2.provider.container.engine import Engine
+from fogros2.provider.container.options import Options
+from fogros2.provider.container.root import Archive
+from fogros2.waiting import wait_until
+
+#: File systems that cannot hold the writable layer of an overlay.
+_NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
+
+# One process does all steps, in its own session: a launch that is killed meanwhile leaves either
+# nothing or a machine with its watchdog. From the fourth argument on, the words are the engine's.
+_CREATE = """\
+top=$1 hook=$2 layers=$3
+shift 3
+engine=$1
+umask 022
+failed() {
+    code=$?
+    [ $code -eq 0 ] && return
+    [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
+    rm -rf -- "$top"
+    rmdir -- "${top%/*}" 2>/dev/null
+    exit $code
+}
+tries=0
+until mkdir "$top" 2>/dev/null; do
+    # it exists: another attempt with this token, or one that was interrupted
+    [ -e "$top" ] || [ $tries -gt 9 ] && exit 17  # _TOKEN_USED
+    mkdir -p "${top%/*}"
+    tries=$((tries + 1))
+done
+trap failed EXIT
+mkdir "$top/root" "$top/hooks"
+chmod 711 "$top"
+[ -z "$hook" ] || echo "$hook" > "$top/hooks/remove.json"
+for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/work"; done
+tar -xpf - --numeric-owner -C "$top/root"
+"$@"
+"""
+
+#: Maximum size of a host key's file in bytes, and the form of a key.
+_KEY_BYTES = 4096
+_HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
+_READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
+
+#: Exit statuses of a regular end, SIGKILL and SIGTERM.
+_GOOD_ENDS = (0, 137, 143)
+#: Exit status of ``_CREATE`` for a token that was used before.
+_TOKEN_USED = 17
+
+_DESTROY = """\
+identity=$1 top=$2
+shift 2
+"$@" rm -f -v -t 0 "$identity" >/dev/null || "$@" rm -f -v "$identity" >/dev/null
+code=$?
+rm -rf -- "$top"
+rmdir -- "${top%/*}" 2>/dev/null
+exit $code
+"""
+
+
+class ContainerProvider(Provider):
+    """Containers of podman or docker on this computer."""
+
+    name: ClassVar[str] = 'container'
+    #: Containers only on request: they need SYS_ADMIN, which weakens the machine's isolation.
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        containers=False, stop=True, agent_directory=f'/{container_entry.AGENT_DIRECTORY}',
+        agent_program=f'/{container_entry.FOLDER}/agent.py')
+    poll_interval: ClassVar[float] = 0.1
+
+    def __init__(self) -> None:
+        self._host_keys: dict[str, str] = {}
+
+    def check(self, spec: MachineSpec) -> None:
+        """Check the engine, the rights, TUN, and what a machine without an image needs."""
+        options = Options.parse(spec.options)
+        engine = container_engine.select(options.engine, options.image or None)
+        trouble = process.sudo_trouble() if engine.sudo else None
+        if trouble is not None:
+            raise PrerequisiteError(
+                f'{engine.name} takes root on this computer, and {trouble[0]}', trouble[1])
+        if not os.path.exists('/dev/net/tun'):
+            raise PrerequisiteError('there is no /dev/net/tun on this computer',
+                                    'sudo modprobe tun')
+        container_engine.answers(engine)
+        container_options.check_network(engine, options)
+        if options.image:
+            container_engine.check_architecture(engine, options.image)
+        else:
+            check_root(isolated=options.isolated)
+
+    def architecture(self, spec: MachineSpec) -> str:
+        """Return the image's architecture; the engine downloads images for this computer's."""
+        options = Options.parse(spec.options)
+        if not options.image:
+            return os.uname().machine
+        engine = container_engine.select(options.engine, options.image)
+        return container_engine.architecture(engine, options.image) or os.uname().machine
+
+    def shared_folders(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the folders of the system and of ROS 2, which replace an image."""
+        options = Options.parse(spec.options)
+        return () if options.image or options.isolated else (
+            *container_root.system_mounts(), *container_root.environment_mounts(*spec.workspaces))
+
+    def has_own_packages(self, spec: MachineSpec) -> bool:
+        """Return whether the machine starts from a container image."""
+        return bool(spec.options.get('image'))
+
+    def check_containers(self, spec: MachineSpec) -> None:
+        """Check that the machine is created with the rights to run containers."""
+        if not container_options.runs_containers(spec, Options.parse(spec.options)):
+            raise Unsupported(f"'{spec.name}' was made without the rights that containers take",
+                              'say containers=True where the machine is described')
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Create and start the container; return when the engine has started it."""
+        options = Options.parse(spec.options)
+        ways = container_engine.candidates(
+            container_engine.select(options.engine, options.image or None))
+        engine = next(ways)
+        create = self._create_from_image if options.image else self._create_from_root
+        while True:
+            try:
+                identity = create(engine, spec, request, options)
+                container_engine.remember(engine)
+                break
+            except ProviderError as error:
+                another = next(ways, None)
+                if another is None or not container_engine.is_runtime_trouble(error):
+                    identity = self._existing(engine, spec.name, request.token, error)
+                    break
+                engine = another
+        return container_machine.machine_id(engine, identity, request.token)
+
+    def _existing(
+        self, engine: Engine, name: str, token: str, error: ProviderError,
+    ) -> str:
+        """Return the container that an earlier attempt with this token created, or raise."""
+        found = engine.inspect([container_machine.container_name(name)])
+        if not found:
+            raise error
+        if container_machine.labels_of(found[0]).get(container_machine.ATTEMPT) != token:
+            raise NameTaken(f"there is a container machine '{name}' already",
+                            f'ros2 fog delete {name}') from error
+        return str(found[0]['Id'])
+
+    def _create_from_root(
+        self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
+    ) -> str:
+        top = container_machine.directory(request.token)
+        base = str(debian_root.root(cancel=self.cancel)) if options.isolated else ''
+        system = container_root.system_mounts(base)
+        kept = spec.on_exit == 'stop'
+        words = [*container_options.common_flags(engine, spec, request, options)]
+        for path in system:
+            # Podman deletes its own layer when the container ends; a stopped machine keeps it.
+            upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
+            words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
+        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
+            words += ['-v', f'{mount}:{mount}:ro']
+        archive = _entry(spec, request, options)
+        if base:
+            archive.file('etc/apt/sources.list', ''.join(
+                f'{line}\n' for line in debian_root.release().sources).encode())
+            archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
+        flags = engine.flags if kept else (*engine.flags, *hook_flags(top))
+        command = Command(
+            ('sh', '-ec', _CREATE, 'sh', str(top), '' if kept else removal_hook(top),
+             ' '.join(system) if kept else '',
+             engine.name, *flags, 'run', '-d', '--cidfile', f'{top}/cid', *words,
+             '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
+            sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
+            input=container_root.skeleton(options.user, base) + archive.data())
+        try:
+            return process.run(command, timeout=120.0).stdout.split()[-1]
+        except CommandError as error:
+            if error.result.returncode != _TOKEN_USED:
+                raise container_engine.translate(error) from error
+            raise ProviderError(
+                f'an attempt to create {spec.name} that was cut short left {top}',
+                f'sudo rm -rf {top}') from error
+
+    def _create_from_image(
+        self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
+    ) -> str:
+        what = f"creating container machine '{spec.name}' from {options.image}"
+        identity = engine.call(
+            'create', *container_options.common_flags(engine, spec, request, options),
+            '--user', '0:0', '--entrypoint', '/bin/sh', options.image,
+            f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
+            cancel=self.cancel).stdout.split()[-1]
+        try:
+            engine.call('cp', '-', f'{identity}:/', what=what,
+                        data=_entry(spec, request, options).data())
+            engine.call('start', identity, what=what)
+        except BaseException:
+            engine.call('rm', '-f', '-v', identity, what='removing it again', check=False)
+            raise
+        return identity
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the state of a container, from the engine."""
+        engine, identity, found = _inspected(machine_id)
+        state = container_machine.state_of(found)
+        if state is MachineState.STOPPED:
+            self._check_exit(engine, found)
+        key = None
+        if state is MachineState.RUNNING:
+            # The first boot creates the key in 20 ms; another call of the engine takes longer.
+            with contextlib.suppress(DeadlineExceeded):
+                key = wait_until(lambda: self._host_key(engine, found), timeout=0.15,
+                                 interval=0.004, longest=0.02, what='the host key')
+        return container_machine.machine_of(engine, found, key)
+
+    def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """Yield the containers of both engines that have all of ``tags`` as labels."""
+        filters = [f'--filter=label={container_machine.ATTEMPT}',
+                   *(f'--filter=label={key}={value}' for key, value in tags.items())]
+        for engine in container_engine.installed():
+            result = engine.call('ps', '-aq', *filters, what='listing containers', check=False)
+            if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
+                raise ProviderError(
+                    f'{engine.name} lists no containers: '
+                    f'{container_engine.last_line(result.stderr)}',
+                    container_engine.sudo_hint(result.stderr))
+            # Without docker's service, its socket may still exist; it has no containers.
+            listed = result.stdout.split()
+            if listed:
+                for entry in engine.inspect(listed):
+                    running = container_machine.state_of(entry) is MachineState.RUNNING
+                    yield container_machine.machine_of(
+                        engine, entry, self._host_key(engine, entry) if running else None)
+
+    def destroy(self, machine_id: str) -> None:
+        """Remove a container and its root; return when both are removed."""
+        engine, identity, token = container_machine.parse_id(machine_id)
+        result = process.run(
+            Command(('sh', '-c', _DESTROY, 'sh', identity,
+                     str(container_machine.directory(token)), *engine.argv()),
+                    sudo=engine.sudo, what=f'removing container {identity}'),
+            timeout=60.0, check=False)
+        self._host_keys.pop(identity, None)
+        if result.returncode == 0:
+            return
+        if sudo := container_engine.sudo_hint(result.stderr):
+            raise ProviderError(f'container {identity} was not removed', sudo)
+        # The engine may be removing it already.
+        wait_until(lambda: not engine.inspect([identity]), timeout=20.0,
+                   what=f'container {identity} to be removed',
+                   hint=container_engine.last_line(result.stderr))
+
+    def stop(self, machine_id: str) -> None:
+        """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
+        engine, identity, found = _inspected(machine_id)
+        if container_machine.ENDS_STOPPED not in container_machine.labels_of(found):
+            raise Unsupported('a container made to be deleted at its end can not be stopped',
+                              "create it with on_exit='stop'")
+        engine.call('stop', '-t', '3', identity, what=f'stopping container {identity}')
+
+    def start(self, machine_id: str) -> None:
+        """Start a stopped container again."""
+        engine, identity, _ = _inspected(machine_id)
+        engine.call('start', identity, what=f'starting container {identity}')
+
+    def _host_key(self, engine: Engine, entry: Mapping[str, Any]) -> Optional[str]:
+        """Return the public host key that a machine created at its first boot, None before."""
+        identity = str(entry['Id'])[:12]
+        if identity in self._host_keys:
+            return self._host_keys[identity]
+        labels = container_machine.labels_of(entry)
+        path = container_machine.host_key_file(labels[container_machine.ATTEMPT])
+        if not labels.get(container_machine.DIRECTORY):
+            log = engine.call('logs', identity, what='reading the host key', check=False).stdout
+            text = _after(log, container_entry.HOST_KEY_MARK)
+        elif os.geteuid() == 0:
+            text = read_plain(path)
+        else:
+            text = process.run(
+                Command(('sh', '-c', _READ_PLAIN, 'sh', str(path)), sudo=True), timeout=10.0,
+                check=False).stdout
+        key = ' '.join(text.split()[:2])
+        if not _HOST_KEY.fullmatch(key):
+            return None
+        self._host_keys[identity] = key
+        return key
+
+    def _check_exit(self, engine: Engine, entry: Mapping[str, Any]) -> None:
+        """
+        Check that a container that ended did so regularly; images may lack what it needs.
+
+        :raises ProviderError: it ended by an error; with the container's last message.
+        """
+        if int(entry['State']['ExitCode']) in _GOOD_ENDS:
+            return
+        identity = str(entry['Id'])[:12]
+        log = engine.call('logs', identity, what='reading its log', check=False)
+        reason = _after(log.stdout, container_entry.ERROR_MARK) \
+            or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
+        raise ProviderError(f'container {identity} could not start: {reason}',
+                            'it needs sshd, sudo, rsync and python3, or apt-get and a network')
+
+
+def _inspected(machine_id: str) -> tuple[Engine, str, dict[str, Any]]:
+    """
+    Return a machine's engine, its container's id, and what the engine reports of it.
+
+    :raises MachineNotFound: there is no such container.
+    """
+    engine, identity, _ = container_machine.parse_id(machine_id)
+    found = engine.inspect([identity])
+    if not found:
+        raise MachineNotFound(f'container {identity} does not exist any more')
+    return engine, identity, found[0]
+
+
+def _entry(spec: MachineSpec, request: CreateRequest, options: Options) -> Archive:
+    """Return an archive with the first process of a machine, and the files that it needs."""
+    archive = Archive()
+    container_entry.add(
+        archive, user=options.user, authorized_key=request.authorized_key,
+        environment=options.env, agent_config=request.agent_config,
+        nested=container_options.runs_containers(spec, options))
+    return archive
+
+
+def read_plain(path: Path) -> str:
+    """
+    Return the first bytes of a file in a machine's root, '' if there is no such file.
+
+    The machine can replace the file by a link to a file of this computer, or by a pipe.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return ''
+    with os.fdopen(handle, 'rb') as file:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            return ''
+        return file.read(_KEY_BYTES).decode(errors='replace')
+
+
+def _after(log: str, mark: str) -> str:
+    found = [line[len(mark):] for line in log.splitlines() if line.startswith(mark)]
+    return found[-1] if found else ''
+
+
+def removal_hook(top: Path) -> str:
+    """Return the hook by which podman deletes a machine's root when its container ends."""
+    return json.dumps({
+        'version': '1.0.0',
+        'hook': {'path': '/bin/sh', 'args': [
+            'sh', '-c', f'rm -rf -- {top}; rmdir -- {top.parent} 2>/dev/null; true']},
+        'when': {'always': True},
+        'stages': ['poststop'],
+    })
+
+
+def hook_flags(top: Path) -> Iterator[str]:
+    """Yield podman's flags for the machine's own hook, and for the system's."""
+    for folder in ('/usr/share/containers/oci/hooks.d', '/etc/containers/oci/hooks.d'):
+        if os.path.isdir(folder):
+            yield from ('--hooks-dir', folder)
+    yield from ('--hooks-dir', f'{top}/hooks')
+
+
+def check_root(*, isolated: bool = False) -> None:
+    """
+    Check that this computer's own root can replace an image.
+
+    :param isolated: check the root of a new system instead.
+    :raises PrerequisiteError: it cannot be overlaid, or lacks what a machine needs.
+    """
+    if isolated:
+        debian_root.check()
+    else:
+        process.require(
+            ('sshd', 'ssh-keygen', 'sudo', 'rsync', 'tar'),
+            package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
+    kinds = Path('/proc/filesystems').read_text().split()
+    if 'overlay' not in kinds and not os.path.isdir('/sys/module/overlay'):
+        process.run(Command(('modprobe', 'overlay'), sudo=True), timeout=10.0, check=False)
+        if 'overlay' not in Path('/proc/filesystems').read_text().split():
+            raise PrerequisiteError("this computer's root can't be overlaid: no overlay support",
+                                    "name an image with image='...'")
+    kind = container_root.file_system(Path('/var/lib/containers/storage'))
+    if kind.split('.')[0] in _NO_UPPER:
+        raise PrerequisiteError(
+            f"this computer's root can't be overlaid: /var/lib/containers is on {kind}",
+            "put it on another file system, or name an image with image='...'")

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parse the options of a container machine, and convert them to the engine's flags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import dataclasses
+import ipaddress
+import json
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from fogros2.errors import ConfigurationError
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider.container import engine as container_engine
+from fogros2.provider.container.engine import Engine
+from fogros2.provider.container.machine import (
+    ATTEMPT,
+    container_name,
+    DIRECTORY,
+    ENDS_STOPPED,
+    LOGIN,
+    MACHINE,
+)
+from fogros2.provider.options import parsed
+
+APPARMOR = Path('/sys/kernel/security/apparmor')
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """
+    The options of a container machine in a launch file.
+
+    :param image: name of an image; '' for a machine without one (podman only), which uses this
+        computer's own root.
+    :param engine: auto, podman or docker.
+    :param user: login user, created with sudo rights and no password.
+    :param network: a network of the engine; '' for its default.
+    :param ip: fixed address in that network.
+    :param cpus: number of CPUs, such as 1.5.
+    :param memory: such as '2g'.
+    :param gpus: 'all' or a number, as in ``docker run --gpus``.
+    :param devices: such as '/dev/video0'.
+    :param ports: such as '8080:80' or '8080:80/udp'.
+    :param mounts: read-only folders: 'path' or 'path:path on the machine'.
+    :param env: environment variables of every login.
+    :param containers: whether the machine may run containers.
+    :param isolated: whether the machine gets the root of a new system instead of this computer's.
+    """
+
+    image: str = ''
+    engine: str = 'auto'
+    user: str = 'fog'
+    network: str = ''
+    ip: str = ''
+    cpus: float = 0.0
+    memory: str = ''
+    gpus: str = ''
+    devices: tuple[str, ...] = ()
+    ports: tuple[str, ...] = ()
+    mounts: tuple[str, ...] = ()
+    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    containers: bool = False
+    isolated: bool = False
+
+    @classmethod
+    def parse(cls, given: Mapping[str, Any]) -> Options:
+        """
+        Return the options of a spec.
+
+        :raises ConfigurationError: an option is unknown (with the nearest name) or invalid.
+        """
+        options = parsed(cls, given, 'a container machine')
+        _check_values(options)
+        return options
+
+
+def _check_values(options: Options) -> None:
+    if options.engine not in ('auto', *container_engine.ENGINES):
+        raise ConfigurationError(f"there is no container engine '{options.engine}'",
+                                 'engine= takes auto, podman or docker')
+    if options.engine == 'docker' and not options.image:
+        raise ConfigurationError("docker can't use this computer's own root",
+                                 "name an image with image='...', or take engine='podman'")
+    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
+        raise ConfigurationError(
+            f"'{options.user}' can't be a user name",
+            'user= takes small letters, digits, - and _, beginning with a letter')
+    for name in ('image', 'network', 'ip', 'memory', 'gpus'):
+        word = getattr(options, name)
+        # The engine would parse it as an option.
+        if word.startswith('-') or any(c.isspace() for c in word):
+            raise ConfigurationError(f"option '{name}' can't be '{word}'",
+                                     'it is one word, and none that begins with a hyphen')
+    if options.memory and not re.fullmatch(r'(?i)[0-9]+([.][0-9]+)?([bkmg]|[kmg]b)?',
+                                           options.memory):
+        raise ConfigurationError(f"'{options.memory}' is no amount of memory",
+                                 "memory= takes '2g' or '512m'")
+    if options.ip:
+        _check_address(options)
+    for port in options.ports:
+        _check_port(port)
+    for device in options.devices:
+        if not os.path.exists(device.split(':')[0]):
+            raise ConfigurationError(f"there is no device '{device.split(':')[0]}' here",
+                                     "devices= takes such as '/dev/video0'")
+    for name, value in options.env.items():
+        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name) or '"' in value or '\n' in value:
+            raise ConfigurationError(f"env= can't carry the variable {name!r}",
+                                     'a name has letters, digits and _, a value one line')
+    for mount in options.mounts:
+        source = mount.split(':')[0]
+        if mount.count(':') > 1 or not os.path.isabs(source) or '/..' in mount:
+            raise ConfigurationError(f"mounts= can't hold '{mount}'",
+                                     "it takes '/path' or '/path:/path there'")
+        if not os.path.exists(source):
+            raise ConfigurationError(f"'{source}' of mounts= doesn't exist",
+                                     'make it, or correct the path: it is one on this computer')
+
+
+def _check_address(options: Options) -> None:
+    try:
+        ipaddress.IPv4Address(options.ip)
+    except ValueError:
+        raise ConfigurationError(f"'{options.ip}' is no IPv4 address",
+                                 "ip= takes such as '10.89.0.7'") from None
+    if not options.network:
+        raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
+
+
+def _check_port(port: str) -> None:
+    """Check the form ``[address:][host port:]port[/udp]``; ports may be ranges."""
+    ports = '([0-9]+)(?:-([0-9]+))?'
+    match = re.fullmatch(
+        rf'(?:[0-9]+(?:[.][0-9]+){{3}}:)?(?:{ports}:)?{ports}(?:/(?:tcp|udp|sctp))?', port)
+    numbers = [int(number) for number in match.groups() if number] if match else []
+    if not numbers or not all(0 < number < 65536 for number in numbers):
+        raise ConfigurationError(f"ports= can't hold '{port}'",
+                                 "it takes '8080:80' or '8080:80/udp', numbers from 1 to 65535")
+
+
+def check_network(engine: Engine, options: Options) -> None:
+    """
+    Check that the network of a fixed address exists, and contains the address.
+
+    :raises ConfigurationError: it does not.
+    """
+    if not options.ip:
+        return
+    result = engine.call('network', 'inspect', options.network, what='looking at the network',
+                         check=False)
+    if result.returncode != 0:
+        raise ConfigurationError(f"{engine.name} has no network '{options.network}'",
+                                 f'{engine.name} network ls shows those there are')
+    subnets = network_subnets(result.stdout)
+    if subnets and not any(ipaddress.ip_address(options.ip) in subnet for subnet in subnets):
+        raise ConfigurationError(
+            f"{options.ip} is no address of the network '{options.network}'",
+            f"its addresses are in {', '.join(map(str, subnets))}")
+
+
+def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
+    """Return the IPv4 subnets in the report of podman or docker about a network."""
+    found = []
+    for network in json.loads(output):
+        parts = [*(network.get('subnets') or ()), *(
+            (network.get('IPAM') or {}).get('Config') or ())]
+        for part in parts:
+            text = str(part.get('subnet') or part.get('Subnet') or '')
+            if '.' in text:
+                found.append(ipaddress.IPv4Network(text, strict=False))
+    return found
+
+
+def common_flags(
+    engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
+) -> Iterator[str]:
+    """Yield the engine's flags for a spec, with or without an image."""
+    yield from ('--name', container_name(spec.name), '--hostname', spec.name)
+    labels = {
+        **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
+        DIRECTORY: '' if options.image else 'root',
+    }
+    if spec.on_exit == 'stop':
+        labels[ENDS_STOPPED] = 'yes'
+    for key, value in labels.items():
+        yield from ('--label', f'{key}={value}')
+    # Only what WireGuard needs; ping needs NET_RAW, sshd's log AUDIT_WRITE.
+    for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
+        yield from ('--cap-add', right)
+    yield from ('--device', '/dev/net/tun')
+    # Only the machine's name, not the names in this computer's /etc/hosts.
+    yield '--no-hosts'
+    yield from container_engine.limits()
+    if options.network:
+        yield from ('--network', options.network)
+    if options.ip:
+        yield from ('--ip', options.ip)
+    if options.cpus:
+        yield from ('--cpus', f'{options.cpus:g}')
+    if options.memory:
+        yield from ('--memory', options.memory)
+    if options.gpus:
+        # Podman names GPUs by the vendor's description (CDI).
+        yield from (('--gpus', options.gpus) if engine.name == 'docker' else
+                    ('--device', f'nvidia.com/gpu={options.gpus}'))
+    for device in options.devices:
+        yield from ('--device', device)
+    for port in options.ports:
+        yield from ('-p', port)
+    for mount in options.mounts:
+        source, _, target = mount.partition(':')
+        yield from ('-v', f'{source}:{target or source}:ro')
+    if spec.on_exit != 'stop':
+        yield '--rm'
+    if runs_containers(spec, options):
+        yield from nested_flags(engine)
+
+
+def runs_containers(spec: MachineSpec, options: Options) -> bool:
+    """Return whether a machine will run containers."""
+    return options.containers or bool(spec.containers)
+
+
+def nested_flags(engine: Engine) -> Iterator[str]:
+    """
+    Yield the flags that an engine in the machine needs: to mount, and to store layers.
+
+    Masked paths and, with podman, the filter of system calls remain.
+    """
+    yield from ('--cap-add', 'SYS_ADMIN', '-v', '/var/lib/containers')
+    if APPARMOR.exists():
+        # Its usual profile forbids mounts.
+        yield from ('--security-opt', 'apparmor=unconfined')
+    if engine.name == 'docker':
+        # Its filter forbids containers to change their root.
+        yield from ('--security-opt', 'seccomp=unconfined')

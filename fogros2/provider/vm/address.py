@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The public address from which this robot's connections reach a cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import contextlib
+import ipaddress
+import os
+import socket
+import threading
+import time
+import urllib.request
+
+from fogros2.errors import ProviderError
+from fogros2.provider.vm.options import cidr
+
+#: Names this robot's address (or network) as machines see it; then no service is asked.
+ADDRESS_VARIABLE = 'FOGROS2_ROBOT_ADDRESS'
+#: Service that returns the address of the caller, and the variable that names another one.
+CHECKIP, CHECKIP_VARIABLE = 'https://checkip.amazonaws.com', 'FOGROS2_AWS_CHECKIP'
+#: Seconds for which an answer is used again, so that machines of one launch ask once.
+ADDRESS_AGE = 5.0
+#: A public address, to which the system chooses a route; nothing is sent.
+FAR_IPV6 = ('2600:1f18::1', 22)
+
+
+class RobotAddress:
+    """The public address of this computer, requested at most every 5 s; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known = ('', '', 0.0)
+
+    def __call__(self) -> str:
+        """
+        Return the address in CIDR form.
+
+        :raises ConfigurationError: the variable that names it has no address.
+        :raises ProviderError: the service does not answer.
+        """
+        told = os.environ.get(ADDRESS_VARIABLE, '')
+        if told:
+            return cidr(told)
+        url = os.environ.get(CHECKIP_VARIABLE, CHECKIP)
+        with self._lock:
+            address, asked, when = self._known
+            if asked != url or time.monotonic() - when > ADDRESS_AGE:
+                address = self._ask(url)
+                self._known = (address, url, time.monotonic())
+            return address
+
+    def with_ipv6(self, networks: Iterable[str]) -> list[str]:
+        """Return networks; if this computer's address is among them, add its IPv6 address."""
+        named = list(networks)
+        own = own_ipv6() if self._known[0] in named else ''
+        return [*named, *([own] if own else [])]
+
+    def _ask(self, url: str) -> str:
+        hint = f'{ADDRESS_VARIABLE}=... names it'
+        try:
+            with urllib.request.urlopen(url, timeout=5.0) as answer:
+                said = answer.read(100).decode('ascii', 'replace').strip()
+            return cidr(str(ipaddress.ip_address(said)))
+        except OSError as error:
+            own = own_ipv6()
+            if own:
+                return own  # a computer without IPv4 reaches only machines with IPv6
+            raise ProviderError(
+                f"{url} does not tell this robot's public address: {error}", hint) from error
+        except ValueError as error:
+            raise ProviderError(f"{url} told no address but '{said[:40]}'", hint) from error
+
+
+def own_ipv6() -> str:
+    """Return this computer's public IPv6 address (CIDR), '' without one; send nothing."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+        probe.connect(FAR_IPV6)  # the system chooses a route, and the address for that route
+        address = ipaddress.IPv6Address(probe.getsockname()[0])
+        if address.is_global:
+            return f'{address}/128'
+    return ''

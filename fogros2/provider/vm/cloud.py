@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The adapter of a cloud of virtual machines, and the data that it exchanges with the provider."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import copy
+import dataclasses
+from decimal import Decimal
+import hashlib
+import threading
+from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
+import uuid
+
+from fogros2.errors import ProviderError, Unsupported
+from fogros2.model import CreateRequest, Image, MachineSpec, MachineState
+from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
+from fogros2.provider.offers import MachineType
+from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.regions import Regions
+
+#: The tag of every resource of one machine: it identifies the attempt that created them.
+TAG_ATTEMPT = 'fogros2-attempt'
+TAG_HOST_KEY = 'fogros2-host-key'
+TAG_USER = 'fogros2-user'
+TAG_DISK = 'fogros2-disk-gb'
+TAG_PRICE = 'fogros2-price-per-hour'
+TAG_SSH_FROM = 'fogros2-ssh-from'
+#: Only on resources beside the machine: seconds since the epoch of their creation.
+TAG_MADE = 'fogros2-made'
+
+Adapter = TypeVar('Adapter', bound='VmCloud')
+
+
+class CloudError(ProviderError):
+    """
+    A cloud refused a request.
+
+    :param full: no capacity in this zone, or in this region; another one may have some.
+    :param gone: the resource does not exist (any more).
+    :param denied: these credentials must not do that.
+    """
+
+    def __init__(
+        self, message: str, hint: str = '', *, full: Literal['', 'zone', 'region'] = '',
+        gone: bool = False, denied: bool = False,
+    ) -> None:
+        super().__init__(message, hint)
+        self.full = full
+        self.gone = gone
+        self.denied = denied
+
+
+class VmId(NamedTuple):
+    """The parts of a machine's id: region, the cloud's id, the attempt that created it."""
+
+    region: str
+    vm: str
+    attempt: str
+
+
+class Place(NamedTuple):
+    """Where a machine is tried: region, type, and a zone or subnet; '' for any."""
+
+    region: str
+    kind: str
+    zone: str = ''
+
+
+@dataclasses.dataclass(frozen=True)
+class Vm:
+    """
+    A virtual machine as its cloud reports it.
+
+    :param address: address at which the robot reaches it, '' while it has none.
+    :param private_network: name of its private network, '' if it shares none.
+    :param spot: whether the cloud may reclaim it.
+    :param created: seconds since the epoch; ``stopped`` is when it was stopped.
+    :param key: the cloud's name of its login key.
+    :param reason: why it ended, in the cloud's words.
+    """
+
+    id: str
+    region: str
+    state: MachineState
+    tags: Mapping[str, str]
+    kind: str = ''
+    spot: bool = False
+    address: str = ''
+    private_network: str = ''
+    private_ip: str = ''
+    created: Optional[float] = None
+    stopped: Optional[float] = None
+    image: str = ''
+    key: str = ''
+    reason: str = ''
+
+
+@dataclasses.dataclass(frozen=True)
+class Order:
+    """
+    A request for a machine, the same in every region and zone that is tried.
+
+    :param options: of the cloud's class, with the values for the region.
+    :param tags: for the machine and every resource beside it.
+    :param sources: networks (CIDR) that may reach the SSH port.
+    """
+
+    spec: MachineSpec
+    request: CreateRequest
+    options: Any
+    tags: Mapping[str, str]
+    user_data: bytes
+    sources: Sequence[str]
+
+    @property
+    def attempt(self) -> str:
+        """The name of the attempt, for names and tags of resources."""
+        return self.tags[TAG_ATTEMPT]
+
+    def token(self, place: Place) -> str:
+        """Return the idempotency token for one place; the same for the same place."""
+        words = f'fogros2:{self.request.token}:{"/".join(place)}'
+        return str(uuid.uuid5(uuid.NAMESPACE_URL, words))
+
+
+def attempt_of(token: str) -> str:
+    """Return the attempt's name, from which the token cannot be derived."""
+    return hashlib.sha256(b'fogros2 attempt\0' + token.encode()).hexdigest()[:16]
+
+
+def own_name(attempt: str) -> str:
+    """Return the name of the resources of an attempt (firewall, key)."""
+    return f'fogros2-{attempt}'
+
+
+def own_tags(
+    spec: MachineSpec, request: CreateRequest, options: VmOptions,
+) -> dict[str, str]:
+    """Return the tags of every resource that is created for a machine."""
+    tags = {**options.tags, 'Name': spec.name, **request.tags, TAG_NAME: spec.name,
+            TAG_ATTEMPT: attempt_of(request.token), TAG_USER: options.user,
+            TAG_DEPENDENCIES: request.dependencies, TAG_SSH_FROM: ' '.join(options.ssh_from)}
+    return {key: value for key, value in tags.items() if value}
+
+
+class VmCloud(abc.ABC):
+    """
+    The API of one cloud. All methods may be called by several threads at the same time.
+
+    A method raises :class:`CloudError` if the cloud refuses, with ``refused`` set to False if the
+    request may have had an effect, and PrerequisiteError if the cloud cannot be asked.
+    """
+
+    #: Name of the provider, and of the cloud for people.
+    name: ClassVar[str]
+    title: ClassVar[str]
+    options: ClassVar[type[VmOptions]]
+    regions: ClassVar[Regions]
+    #: Regular expression of the cloud's ids of machines.
+    id_form: ClassVar[str]
+    #: Region for requests that belong to no region.
+    base_region: ClassVar[str]
+    #: Name of a variable that lists the regions to search, such as 'eu-central-1 us-east-1'.
+    regions_variable: ClassVar[str] = ''
+    #: Set when the launch ends; calls then raise Cancelled.
+    cancel: Optional[threading.Event] = None
+
+    def until(self: Adapter, cancel: Optional[threading.Event]) -> Adapter:
+        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
+        other = copy.copy(self)
+        other.cancel = cancel
+        return other
+
+    def lasting(self: Adapter) -> Adapter:
+        """Return an adapter for clean-up, which ``cancel`` does not end."""
+        return self.until(None)
+
+    def hasty(self: Adapter) -> Adapter:
+        """Return an adapter with short time-outs, for values that are only displayed."""
+        return self
+
+    # -- the account ----------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def check_credentials(self) -> None:
+        """
+        Check that there are credentials, without a request.
+
+        :raises PrerequisiteError: there are none, or the SDK is not installed.
+        """
+
+    @abc.abstractmethod
+    def whoami(self, region: str) -> str:
+        """Return the account in a few words for people; make the smallest request."""
+
+    @abc.abstractmethod
+    def default_region(self) -> str:
+        """Return the region of the user's configuration, '' if there is none."""
+
+    def enabled_regions(self) -> list[str]:
+        """Return the regions that the account may use."""
+        return list(self.regions.enabled)
+
+    # -- types and prices -----------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def types(self, region: str) -> Iterable[MachineType]:
+        """Return the current types of a region."""
+
+    @abc.abstractmethod
+    def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
+        """Return the prices on demand in US dollars per hour, by type; of one type if named."""
+
+    def zones(self, region: str) -> dict[str, list[str]]:
+        """Return the zones of a region that have each type, by type."""
+        return {kind.name: [region] for kind in self.types(region)}
+
+    def spot_prices(
+        self, region: str, names: Optional[Sequence[str]],
+    ) -> dict[str, dict[str, Decimal]]:
+        """Return the spot prices in US dollars per hour, by type and zone; None: all types."""
+        return {}
+
+    def account_key(self) -> str:
+        """Return what distinguishes this account and endpoint from others in a cache."""
+        return ''
+
+    def architecture(self, region: str, types: Sequence[str]) -> str:
+        """Return x86_64 or arm64 if it is the same for all these types, else ''."""
+        found = {kind.arch for kind in self.types(region) if kind.name in types}
+        return found.pop() if len(found) == 1 else ''
+
+    # -- machines -------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def find(self, region: str, tags: Mapping[str, str]) -> Iterable[Vm]:
+        """Return the machines of FogROS2 that have all of ``tags``, in any state but deleted."""
+
+    @abc.abstractmethod
+    def get(self, region: str, vm: str) -> Optional[Vm]:
+        """
+        Return a machine, None if it is so new that the cloud does not report it yet.
+
+        :raises MachineNotFound: it does not exist (any more).
+        """
+
+    def prepare(self, region: str, order: Order, types: Sequence[str]) -> Mapping[str, Any]:
+        """
+        Look up what ``insert`` needs for each type, such as the image; create nothing.
+
+        :returns: by type; a type that the region does not have is left out.
+        :raises ConfigurationError: the region has none of the types, or an option does not fit.
+        """
+        return dict.fromkeys(types)
+
+    def begin(self, region: str, order: Order, created: list[str]) -> None:
+        """Create what a machine needs before it (firewall, key); append ids to ``created``."""
+
+    def undo_begin(
+        self, region: str, attempt: str, created: Sequence[str],
+    ) -> Iterator[tuple[str, Callable[[], None]]]:
+        """Yield the steps that delete what ``begin`` created: a name for people, a function."""
+        yield from ()
+
+    def places(self, region: str, order: Order) -> Iterator[str]:
+        """Yield the zones or subnets to try, '' for any; requests are made only when needed."""
+        yield ''
+
+    @abc.abstractmethod
+    def insert(
+        self, place: Place, order: Order, prepared: Any, created: Sequence[str],
+        tags: Mapping[str, str],
+    ) -> str:
+        """
+        Request a machine and return the cloud's id; the same token never creates two.
+
+        :param tags: of the machine: those of the order, the host key and the price.
+        :raises CloudError: with ``full`` if there is no capacity.
+        """
+
+    @abc.abstractmethod
+    def delete(self, machine: VmId) -> None:
+        """Delete a machine and everything of its attempt; return when all of it is gone."""
+
+    @abc.abstractmethod
+    def end_attempt(self, region: str, attempt: str) -> None:
+        """Delete the machines of an attempt whose creation failed, without waiting."""
+
+    @abc.abstractmethod
+    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
+        """Let only ``sources`` (CIDR) reach a TCP port of a machine; none closes it."""
+
+    @abc.abstractmethod
+    def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
+        """Add tags to a machine, or replace them."""
+
+    def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
+        """Change what happens when the machine shuts itself down (stop, or be deleted)."""
+
+    def stop(self, machine: VmId) -> None:
+        """Stop a machine and keep its disk."""
+        raise Unsupported(f"a machine at {self.title} can't be stopped")
+
+    def start(self, machine: VmId) -> None:
+        """Start a stopped machine."""
+        raise Unsupported(f"a machine at {self.title} can't be started")
+
+    def leftovers(self, region: str, now: float) -> Mapping[str, str]:
+        """Return attempts of which no machine is left, with the machine's name."""
+        return {}
+
+    def sweep(self, region: str, attempt: str) -> None:
+        """Delete what an attempt created besides its machine."""
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        """Start to make an image of a machine; return its id."""
+        raise Unsupported(f'FogROS2 makes no images at {self.title}')
+
+    def images(self, region: str) -> Iterable[Image]:
+        """Return the images of a region that FogROS2 has made."""
+        raise Unsupported(f'FogROS2 makes no images at {self.title}')
+
+    def delete_image(self, image_id: str) -> None:
+        """Delete an image and its snapshots; idempotent."""
+        raise Unsupported(f'FogROS2 makes no images at {self.title}')

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Create a machine: what it needs first, then one attempt after another to get capacity.
+
+Each place has its own idempotency token, derived from the request's token, so that a repeated
+request asks for the same machine. A failed creation deletes what it has created.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from decimal import Decimal
+import time
+from typing import Any, Optional
+
+from fogros2.errors import ConfigurationError, FogError, NameTaken, ProviderError
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    Order,
+    own_tags,
+    Place,
+    TAG_ATTEMPT,
+    TAG_HOST_KEY,
+    TAG_MADE,
+    TAG_PRICE,
+    VmCloud,
+    VmId,
+)
+from fogros2.provider.vm.host_key import one_time
+from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.user_data import user_data
+
+#: Returns the price of a type in a region in US dollars per hour, None if unknown.
+Price = Callable[[str, str], Optional[Decimal]]
+
+
+class Creation:
+    """
+    One request for a machine, over regions, types and zones.
+
+    :param cloud: its calls end with the launch.
+    :param lasting: the same cloud for clean-up, which continues after the launch's end.
+    :param sources: returns the networks that may log in, if ``ssh_from=`` names none.
+    """
+
+    def __init__(
+        self, cloud: VmCloud, lasting: VmCloud, spec: MachineSpec, request: CreateRequest,
+        options: VmOptions, *, sources: Callable[[], list[str]], price: Price,
+    ) -> None:
+        self._cloud = cloud
+        self._lasting = lasting
+        self._spec = spec
+        self._request = request
+        self._options = options
+        self._sources = sources
+        self._ask_price = price
+        self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
+        #: Whether a machine may exist although no answer said so.
+        self._unsure = False
+        #: Errors of undo steps.
+        self.undo_failures: list[FogError] = []
+
+    def run(self, regions: list[str]) -> VmId:
+        """
+        Create the machine in the first region that has capacity for one of the types.
+
+        :raises NameTaken: a machine of this name exists, created with another token.
+        :raises FogError: the first refusal; nothing is left behind.
+        """
+        try:
+            return self._in_regions(regions)
+        except FogError as error:
+            error.refused = not self._unsure
+            error.undo_failures = tuple(self.undo_failures)
+            raise
+
+    def _in_regions(self, regions: list[str]) -> VmId:
+        first: Optional[CloudError] = None
+        for region in regions:
+            try:
+                return self._in_region(region, self._options.in_region(region))
+            except ConfigurationError:
+                if first is None:
+                    raise
+                # a further region without the type: the first region's error counts
+            except CloudError as error:
+                if not error.full:
+                    raise
+                first = first or error
+        assert first is not None, 'there is a region to try'
+        raise first
+
+    def _in_region(self, region: str, options: VmOptions) -> VmId:
+        tags = own_tags(self._spec, self._request, options)
+        with ThreadPoolExecutor(4, 'fog-vm') as pool:
+            # all look-ups come before the first creation, at the same time
+            there = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
+            sources = pool.submit(lambda: list(options.ssh_from) or self._sources())
+            data = pool.submit(self._user_data, options)
+            order = Order(self._spec, self._request, options, tags, b'', ())
+            prepared = pool.submit(self._cloud.prepare, region, order, options.types)
+            found = there.result()
+            if found is not None:
+                return found
+            ready = prepared.result()
+            order = dataclasses.replace(
+                order, sources=sources.result(), user_data=data.result())
+        return self._make(region, order, ready)
+
+    def _existing(self, region: str, attempt: str) -> Optional[VmId]:
+        """Return the machine that an earlier call with this token created, or None."""
+        found = [*self._cloud.find(region, {TAG_NAME: self._spec.name})]
+        for vm in found:
+            if vm.tags[TAG_ATTEMPT] == attempt:
+                return VmId(region, vm.id, attempt)
+        for vm in found:
+            owner = vm.tags.get(TAG_ROBOT, '')
+            whose = f" of the robot '{owner}'" if owner else ''
+            raise NameTaken(
+                f"there is a machine '{self._spec.name}'{whose} in {region} already",
+                f'give the machine another name=, or: ros2 fog delete {self._spec.name}')
+        return None
+
+    def _user_data(self, options: VmOptions) -> bytes:
+        return user_data(
+            name=self._spec.name, user=options.user,
+            authorized_key=self._request.authorized_key,
+            host_key=one_time(self._request.token), agent_config=self._request.agent_config)
+
+    def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
+        created: list[str] = []
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._undo_begin, region, order.attempt, created)
+            # the answer to a successful request may be lost
+            undo.callback(self._undo, region, 'the instance', self._end, region, order.attempt)
+            self._cloud.begin(region, dataclasses.replace(
+                order, tags={**order.tags, TAG_MADE: str(int(time.time()))}), created)
+            vm = self._first_with_room(region, order, prepared, created)
+            undo.pop_all()
+            return VmId(region, vm, order.attempt)
+
+    def _end(self, region: str, attempt: str) -> None:
+        try:
+            self._lasting.end_attempt(region, attempt)
+        except FogError:
+            self._unsure = True  # the caller may find the machine by its tags
+            raise
+
+    def _undo_begin(self, region: str, attempt: str, created: list[str]) -> None:
+        for what, undo in self._lasting.undo_begin(region, attempt, created):
+            self._undo(region, what, undo)
+
+    def _undo(self, region: str, what: str, undo: Callable[..., None], *words: str) -> None:
+        """Run an undo step; record its error, so that the other steps run."""
+        try:
+            undo(*words)
+        except FogError as error:
+            self.undo_failures.append(ProviderError(
+                f"{what} of '{self._spec.name}' in {region} may be left: {error.args[0]}",
+                'ros2 fog gc deletes it, a quarter of an hour after it was made'))
+
+    def _first_with_room(
+        self, region: str, order: Order, prepared: Mapping[str, Any], created: list[str],
+    ) -> str:
+        refused: Optional[CloudError] = None
+        full: set[str] = set()
+        tags = {**order.tags, TAG_HOST_KEY: one_time(self._request.token).public}
+        for place in self._places(region, order, list(prepared)):
+            if place.kind in full:
+                continue
+            price = self._price(region, place.kind)
+            if self._too_dear(price):
+                continue
+            priced = {} if price is None else {TAG_PRICE: str(price)}
+            try:
+                return self._cloud.insert(
+                    place, order, prepared[place.kind], created, {**tags, **priced})
+            except FogError as error:
+                self._unsure = self._unsure or not error.refused
+                if not isinstance(error, CloudError) or not error.full:
+                    raise
+                # a quota holds for the whole region, a lack of machines for a zone
+                if error.full == 'region':
+                    full.add(place.kind)
+                refused = error
+        raise refused or CloudError(
+            f"no machine for '{self._spec.name}' in {region} is known to cost at most "
+            f'max_price={self._options.max_price}', 'ros2 fog price shows what there is',
+            full='zone')
+
+    def _price(self, region: str, kind: str) -> Optional[Decimal]:
+        if (region, kind) not in self._prices:
+            self._prices[region, kind] = self._ask_price(region, kind)
+        return self._prices[region, kind]
+
+    def _too_dear(self, price: Optional[Decimal]) -> bool:
+        """Return whether a price may be above the limit; the cloud checks a spot price itself."""
+        limit = self._options.max_price
+        if limit is None:
+            return False
+        return not self._options.spot if price is None else price > limit
+
+    def _places(self, region: str, order: Order, types: list[str]) -> Iterator[Place]:
+        """Yield the places: all zones of the first type, then of the next."""
+        zones: list[str] = []
+        more = self._cloud.places(region, order)
+        for kind in types:
+            yield from [Place(region, kind, zone) for zone in zones]
+            for zone in more:  # only while the first type is tried
+                zones.append(zone)
+                yield Place(region, kind, zone)

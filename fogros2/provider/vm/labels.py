@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Store tags as labels of a cloud that restricts their characters and their length."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+import re
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelRules:
+    """
+    What a cloud accepts as the value of a label; keys of FogROS2 are valid everywhere.
+
+    A character that is not accepted is stored as ``_`` and its code in hexadecimal digits with
+    another ``_``. A long value is split over labels with the keys ``key``, ``key_1``, ``key_2``.
+
+    :param plain: characters that are accepted as they are, as in a regular expression's ``[]``;
+        the digits, the letters a to f, and ``_`` must be accepted. ``_`` itself is always coded.
+    :param longest: maximum length of a value.
+    """
+
+    plain: str = 'a-z0-9-'
+    longest: int = 63
+
+    def encode(self, tags: Mapping[str, str]) -> dict[str, str]:
+        """Return tags as labels."""
+        labels: dict[str, str] = {}
+        for key, value in tags.items():
+            coded = re.sub(f'[^{self.plain}]', lambda found: f'_{ord(found[0]):x}_', value)
+            parts = [coded[start:start + self.longest]
+                     for start in range(0, len(coded), self.longest)] or ['']
+            labels.update((f'{key}_{index}' if index else key, part)
+                          for index, part in enumerate(parts))
+        return labels
+
+    def decode(self, labels: Mapping[str, str]) -> dict[str, str]:
+        """Return the tags that ``encode`` stored."""
+        tags: dict[str, str] = {}
+        for key in labels:
+            if re.fullmatch(r'.*_\d+', key) and key.rpartition('_')[0] in labels:
+                continue
+            coded, index = labels[key], 1
+            while f'{key}_{index}' in labels:
+                coded += labels[f'{key}_{index}']
+                index += 1
+            tags[key] = re.sub('_([0-9a-f]+)_', lambda found: chr(int(found[1], 16)), coded)
+        return tags

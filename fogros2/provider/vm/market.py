@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Types and prices of a cloud's regions, cached on disk for a day; choose the cheapest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from decimal import Decimal, InvalidOperation
+import hashlib
+import json
+from pathlib import Path
+import threading
+import time
+from typing import Any, Optional, Union
+
+from fogros2.errors import ConfigurationError, FogError, ProviderError, StoreError
+from fogros2.provider.offers import fits, MachineType, Offer, Offers, ranked, Wants
+from fogros2.provider.vm.cloud import VmCloud
+from fogros2.store import state_home, write_private
+
+#: Seconds for which an answer is used again.
+CACHE_AGE = 86400.0
+#: Maximum number of types in one request for spot prices.
+_NAMED_TYPES = 100
+
+
+class Market:
+    """
+    Types and prices of each region; thread-safe.
+
+    :param cache: folder of earlier answers, None for the one below the state folder.
+    :param clock: seconds since the epoch.
+    :param refresh: make new requests, whatever the cache has.
+    """
+
+    def __init__(
+        self, source: VmCloud, *, cache: Optional[Path] = None,
+        clock: Callable[[], float] = time.time, refresh: bool = False,
+    ) -> None:
+        self._source = source
+        self._cache = cache
+        self._clock = clock
+        self._refresh = refresh
+        self._known: dict[str, Any] = {}
+        self._locks: dict[str, threading.Lock] = {}
+        self._lock = threading.Lock()
+
+    def types(self, region: str) -> list[MachineType]:
+        """
+        Return the current types of a region.
+
+        :raises FogError: the cloud refused, or does not answer.
+        """
+        found = self._kept(f'types-{region}', lambda: [
+            dataclasses.asdict(kind) for kind in self._source.types(region)])
+        return [MachineType(**kind) for kind in found]
+
+    def zones(self, region: str) -> dict[str, list[str]]:
+        """Return the zones of a region that have each type."""
+        return dict(self._kept(f'zones-{region}', lambda: self._source.zones(region)))
+
+    def prices(self, region: str) -> dict[str, Decimal]:
+        """Return the price of each type in US dollars per hour."""
+        found = self._kept(f'prices-{region}', lambda: _plain(self._source.prices(region)))
+        return {name: Decimal(price) for name, price in found.items()}
+
+    def price(self, region: str, name: str) -> Optional[Decimal]:
+        """
+        Return the price of one type in US dollars per hour, None if it is not sold.
+
+        One request, unless the whole list is known.
+        """
+        listed = self._fresh(f'prices-{region}')
+        if listed is None:
+            listed = self._kept(f'price-{region}-{name}',
+                                lambda: _plain(self._source.prices(region, name)))
+        return Decimal(listed[name]) if name in listed else None
+
+    def spot(
+        self, region: str, names: Optional[Sequence[str]] = None,
+    ) -> dict[str, dict[str, Decimal]]:
+        """
+        Return the current spot price of each type by zone, in US dollars per hour.
+
+        :param names: these types only; None for all.
+        """
+        named = sorted(names) if names is not None and len(names) <= _NAMED_TYPES else None
+        key = f'spot-{region}'
+        if named is not None and self._fresh(key) is None:
+            key += '-' + hashlib.sha256(' '.join(named).encode()).hexdigest()[:12]
+        found = self._kept(key, lambda: {
+            name: _plain(zones)
+            for name, zones in self._source.spot_prices(region, named).items()})
+        return {name: {zone: Decimal(price) for zone, price in zones.items()}
+                for name, zones in found.items() if names is None or name in names}
+
+    def price_of(self, region: str, name: str, *, spot: bool = False) -> Decimal:
+        """
+        Return the price of a type in US dollars per hour; a spot type in its cheapest zone.
+
+        :raises ProviderError: the region does not sell it.
+        """
+        price = cheapest_zone(zones := self.spot(region, [name]).get(name, {}), zones) if spot \
+            else self.price(region, name)
+        if price is None:
+            raise ProviderError(
+                f"{self._source.title} tells no {'spot ' if spot else ''}price of {name} in "
+                f'{region}', 'ros2 fog price --region shows the types that a region has')
+        return price
+
+    # -- choosing -------------------------------------------------------------------------
+
+    def offers(self, region: str, asked: Wants, *, spot_too: bool = False) -> list[Offer]:
+        """
+        Return the types of one region that meet the requirements, the cheapest first.
+
+        :param spot_too: look up spot prices even if prices on demand are compared.
+        :raises FogError: the cloud refused, or does not answer.
+        """
+        with ThreadPoolExecutor(3, f'fog-{region}') as pool:  # about ten pages each
+            asking = (pool.submit(self.zones, region), pool.submit(self.types, region),
+                      pool.submit(self.prices, region))
+            zones, types, prices = (asking[0].result(), asking[1].result(), asking[2].result())
+        kinds = [kind for kind in types if fits(kind, asked) and kind.name in zones]
+        if not kinds:
+            return []
+        spot = self.spot(region, [kind.name for kind in kinds]) if asked.spot or spot_too else {}
+        return ranked([
+            Offer(region, kind, prices.get(kind.name),
+                  cheapest_zone(spot.get(kind.name, {}), zones[kind.name]),
+                  tuple(zones[kind.name])) for kind in kinds], asked.spot)
+
+    def choose(self, regions: Sequence[str], asked: Wants, *, spot_too: bool = False) -> Offers:
+        """
+        Return the types of several regions that meet the requirements, the cheapest first.
+
+        All regions are asked at the same time; the result names those that cannot be asked.
+
+        :raises ConfigurationError: nothing fits, or everything costs more than ``max_price``.
+        :raises FogError: no region could be asked.
+        """
+        found: list[Offer] = []
+        failed: list[tuple[str, FogError]] = []
+
+        def ask(region: str) -> Union[list[Offer], FogError]:
+            try:
+                return self.offers(region, asked, spot_too=spot_too)
+            except FogError as error:
+                return error
+
+        with ThreadPoolExecutor(min(16, max(1, len(regions))), 'fog-prices') as pool:
+            for region, answer in zip(regions, pool.map(ask, regions)):
+                if isinstance(answer, FogError):
+                    failed.append((region, answer))
+                else:
+                    found += answer
+        if failed and len(failed) == len(regions):
+            raise failed[0][1]
+        where = regions[0] if len(regions) == 1 else f'{len(regions)} regions'
+        if not found:
+            raise ConfigurationError(f'no {self._source.title} type in {where} has {asked}',
+                                     'ask for less, or in another region')
+        found = ranked(found, asked.spot)
+        cheapest = found[0]
+        if asked.max_price is not None:
+            found = [o for o in found if (o.cost(asked.spot) or Decimal(0)) <= asked.max_price]
+        if not found:
+            raise ConfigurationError(
+                f'nothing in {where} with {asked} costs at most ${asked.max_price} an hour',
+                f'the cheapest is {cheapest.type.name} in {cheapest.region} for '
+                f'${cheapest.cost(asked.spot)}')
+        return Offers(asked, tuple(found), tuple(regions),
+                      tuple((region, str(error)) for region, error in failed))
+
+    # -- cache ----------------------------------------------------------------------------
+
+    def _kept(self, key: str, ask: Callable[[], Any]) -> Any:
+        """Return a cached answer, or make the request, in one thread at a time."""
+        with self._lock:
+            lock = self._locks.setdefault(key, threading.Lock())
+        with lock:
+            found = self._fresh(key)
+            if found is None:
+                found = self._known[key] = ask()
+                self._keep(key, found)
+            return found
+
+    def _fresh(self, key: str) -> Any:
+        """Return an answer of less than a day ago, None if there is none."""
+        if key in self._known:
+            return self._known[key]
+        if self._refresh:
+            return None
+        try:
+            data = json.loads(self._path(key).read_text())
+            if data['source'] != self._source.account_key() \
+                    or not 0 <= self._clock() - float(data['time']) < CACHE_AGE:
+                return None
+            found = _checked(key, data['value'])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, InvalidOperation):
+            return None  # missing or damaged
+        self._known[key] = found
+        return found
+
+    def _keep(self, key: str, value: Any) -> None:
+        with contextlib.suppress(StoreError):  # without a cache the next launch takes longer
+            write_private(self._path(key), json.dumps({
+                'source': self._source.account_key(), 'time': self._clock(),
+                'value': value}).encode())
+
+    def _path(self, key: str) -> Path:
+        return (self._cache or state_home() / 'cache' / self._source.name) / f'{key}.json'
+
+
+def _checked(key: str, value: Any) -> Any:
+    """Return a cached value; raise an error if its form is not that of its key."""
+    kind = key.partition('-')[0]
+    if kind == 'types':
+        return [dataclasses.asdict(MachineType(**entry)) for entry in value]
+    for entry in value.values():
+        if kind == 'zones':
+            if not all(isinstance(zone, str) for zone in entry):
+                raise TypeError(key)
+        else:
+            for price in entry.values() if kind == 'spot' else (entry,):
+                Decimal(price)
+    return value
+
+
+def _plain(prices: Mapping[str, Decimal]) -> dict[str, str]:
+    return {name: str(price) for name, price in prices.items()}
+
+
+def cheapest_zone(zones: Mapping[str, Decimal], among: Iterable[str]) -> Optional[Decimal]:
+    """Return the lowest price in some zones, None if there is none."""
+    return min((zones[zone] for zone in among if zone in zones), default=None)

@@ -1,0 +1,426 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Provider of a cloud of virtual machines, on top of the cloud's adapter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from decimal import Decimal, InvalidOperation
+import os
+import re
+import threading
+import time
+from typing import Any, ClassVar, Optional, TypeVar
+
+from fogros2.errors import (
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import CreateRequest, Endpoint, Image, Machine, MachineSpec, MachineState
+from fogros2.provider import Capabilities, Provider, TAG_NAME
+from fogros2.provider.offers import Offers, Region, Wants
+from fogros2.provider.vm.address import RobotAddress
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    TAG_ATTEMPT,
+    TAG_DISK,
+    TAG_HOST_KEY,
+    TAG_PRICE,
+    TAG_USER,
+    Vm,
+    VmCloud,
+    VmId,
+)
+from fogros2.provider.vm.creation import Creation
+from fogros2.provider.vm.market import Market
+from fogros2.provider.vm.options import CHEAPEST, NEAREST, VmOptions
+from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM, END_COMMAND
+from fogros2.waiting import cancellable, wait_until
+
+T = TypeVar('T')
+
+#: One for all providers of this process: each machine of a launch would ask again.
+_ROBOT_ADDRESS = RobotAddress()
+#: Seconds in which a machine has to end or to stop; usually it is half a minute.
+END_TIMEOUT = 300.0
+ALL = 'all'
+#: Number of regions that are asked at the same time.
+PARALLEL = 20
+#: After the type of a spot machine, for people.
+_SPOT = ' spot'
+
+
+class VmProvider(Provider):
+    """
+    Virtual machines of one cloud.
+
+    :param cloud: the adapter; its calls are not cancelled.
+    """
+
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        firewall=True, one_time_host_key=True, choices=True, adopt=True, regions=True,
+        prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM)
+
+    def __init__(self, cloud: VmCloud) -> None:
+        self._cloud = cloud
+        self._searched: tuple[str, ...] = ()
+        #: Notes for people, by the cloud's id of the machine.
+        self._notes: dict[str, str] = {}
+
+    def _until(self) -> VmCloud:
+        """Return the adapter for a call that ends with the launch; later calls are clean-up."""
+        ending = self.cancel is None or self.cancel.is_set()
+        return self._cloud if ending else self._cloud.until(self.cancel)
+
+    # -- before a machine exists ----------------------------------------------------------------
+
+    def answers(self) -> str:
+        """Ask for the account."""
+        return self._cloud.whoami(self._base())
+
+    def check(self, spec: MachineSpec) -> None:
+        """Check options and credentials without a request."""
+        options = self._cloud.options.of(spec)
+        self._cloud.check_credentials()
+        region = self._region(options)
+        for one in (*((region,) if region != NEAREST else ()), *options.regions):
+            options.in_region(one)
+
+    def resolve(self, spec: MachineSpec) -> MachineSpec:
+        """Choose region and type; refuse a type that costs more than ``max_price``."""
+        return self._resolved(spec)
+
+    def _resolved(self, spec: MachineSpec) -> MachineSpec:
+        options = self._cloud.options.of(spec)
+        chosen: dict[str, Any] = {}
+        region = self._region(options)
+        if region == NEAREST:
+            among = options.common_regions()
+            region = self.nearest(among or ())
+            if not options.regions and not options.named_image:
+                chosen['regions'] = [one for one in self._cloud.regions.neighbours(region)
+                                     if among is None or one in among]
+        options = options.in_region(region)
+        kind = options.named_type
+        market = Market(self._cloud.until(self.cancel))
+        if options.chooses_type:
+            choice = market.choose([region], options.wants())
+            kind = choice.chosen.type.name
+            # if there is no capacity for the cheapest, the next cheapest are tried
+            chosen[options.TYPES] = list(options.further_types) or [
+                offer.type.name for offer in choice.offers[1:3]]
+        kind = kind or options.DEFAULT_TYPE
+        if options.max_price is not None and not options.chooses_type:
+            price = market.price_of(region, kind, spot=options.spot)
+            if price > options.max_price:
+                raise ConfigurationError(
+                    f'{kind} in {region} costs {price} US dollars an hour, more than max_price='
+                    f'{options.max_price}', 'ros2 fog price shows what is cheaper')
+        # a mapping stays: the launch may continue in another region
+        if not isinstance(spec.options.get(options.TYPE), Mapping):
+            chosen[options.TYPE] = kind
+        return dataclasses.replace(spec, options={**spec.options, **chosen, 'region': region})
+
+    def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
+        """Describe type and region, and what is tried if there is no capacity."""
+        options = self._cloud.options.parse(chosen.options)
+        options = options.in_region(options.region)
+        kinds = [kind for kind in options.further_types if kind != options.named_type]
+        more = [' or '.join(kinds), *([f'in {" or ".join(options.regions)}']
+                                      if options.regions else [])]
+        return [f'{options.named_type} in {options.region}',
+                *([f'without room there {", ".join(filter(None, more))}'] if any(more) else [])]
+
+    def architecture(self, spec: MachineSpec) -> str:
+        """Return the architecture of the types that a resolved spec may use, if it is one."""
+        options = self._cloud.options.parse(spec.options)
+        region = self._region(options)
+        arch = self._cloud.architecture(region, options.in_region(region).types)
+        return 'aarch64' if arch == 'arm64' else arch
+
+    def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
+        """Return the price of a machine; its disk and traffic cost extra."""
+        options = self._cloud.options.parse(spec.options)
+        region = self._region(options)
+        if region == NEAREST:
+            return None
+        options = options.in_region(region)
+        if options.named_type == CHEAPEST or options.chooses_type:
+            return None
+        return self._price(region, options.types[0], options.spot, self.cancel)
+
+    def _price(
+        self, region: str, kind: str, spot: bool, cancel: Optional[threading.Event],
+    ) -> Optional[Decimal]:
+        with contextlib.suppress(FogError):
+            return Market(self._cloud.until(cancel).hasty()).price_of(region, kind, spot=spot)
+        return None
+
+    # -- a machine's life -----------------------------------------------------------------------
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Request a machine where there is capacity; a failure leaves nothing behind."""
+        cancel, options = self.cancel, self._cloud.options.of(spec)
+        if options.chooses_type or self._region(options) == NEAREST:
+            spec = self._resolved(spec)
+            options = self._cloud.options.of(spec)
+        creation = Creation(
+            self._cloud.until(cancel), self._cloud.lasting(), spec, request, options,
+            sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
+            price=lambda region, kind: self._price(region, kind, options.spot, cancel))
+        machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
+        if creation.undo_failures:
+            self._notes[machine.vm] = '; '.join(map(str, creation.undo_failures))
+        return self._text(machine)
+
+    def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
+        """Replace tags, and what happens when the machine shuts itself down."""
+        machine, cloud = self._id(machine_id), self._until()
+        cloud.set_tags(machine, tags)
+        cloud.set_ending(machine, spec)
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the current state of a machine."""
+        machine = self._id(machine_id)
+        found = self._until().get(machine.region, machine.vm)
+        if found is None:
+            return Machine(machine_id, '', self.name, MachineState.PENDING, region=machine.region)
+        return dataclasses.replace(self.machine_of(found), id=machine_id)
+
+    def machine_of(self, vm: Vm) -> Machine:
+        """Convert the cloud's report of a machine."""
+        tags, running = vm.tags, vm.state is MachineState.RUNNING
+        key = tags.get(TAG_HOST_KEY)
+        shell = Endpoint('ssh', vm.address, user=tags.get(TAG_USER, 'ubuntu'), host_key=key) \
+            if running and vm.address and key else None
+        disk = tags.get(TAG_DISK, '')
+        return Machine(
+            self._text(VmId(vm.region, vm.id, tags.get(TAG_ATTEMPT, '0' * 16))),
+            tags.get(TAG_NAME, ''), self.name, vm.state, created=vm.created, shell=shell,
+            vpn_host=vm.address if running else '', private_network=vm.private_network,
+            private_ip=vm.private_ip, region=vm.region,
+            kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
+            disk_gb=int(disk) if disk.isdigit() else None, tags=tags, end_command=END_COMMAND,
+            cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped)
+
+    def capabilities_of(self, machine: Machine) -> Capabilities:
+        """Only a spot machine gets a preemption notice, and it cannot be stopped."""
+        if machine.kind.endswith(_SPOT):
+            return dataclasses.replace(self.capabilities, stop=False)
+        return dataclasses.replace(self.capabilities, preemption_notice=())
+
+    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
+        """Wait until a machine runs and has an address; the polls become rarer."""
+        machine = self._id(machine_id)
+        cloud = self._cloud.until(self.cancel)
+
+        def look() -> Optional[Machine]:
+            vm = cloud.get(machine.region, machine.vm)
+            if vm is None:
+                return None
+            if vm.state not in (MachineState.PENDING, MachineState.RUNNING):
+                raise ProviderError(
+                    f"'{name}' ({machine.vm}) ended while it was coming up: "
+                    f'{vm.reason or f"{cloud.title} gives no reason"}',
+                    f'the console of {cloud.title} has its system log')
+            found = self.machine_of(vm)
+            return dataclasses.replace(
+                found, id=machine_id, note=self._notes.get(machine.vm, ''),
+            ) if found.shell is not None else None
+
+        # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
+        return wait_until(
+            look, timeout=timeout, cancel=self.cancel, first=0.5, interval=1.5, longest=5.0,
+            what=f"'{name}' ({machine.vm}) to run")
+
+    def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """Yield the machines with all of ``tags``, of all regions at the same time."""
+        cloud = self._until()
+        for found in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
+            yield from map(self.machine_of, found)
+
+    def destroy(self, machine_id: str) -> None:
+        """Delete a machine and everything that was created for it."""
+        try:
+            machine = self._id(machine_id)
+        except MachineNotFound:
+            return
+        self._cloud.delete(machine)
+
+    def stop(self, machine_id: str) -> None:
+        """Stop a machine; its disk stays, and is billed."""
+        machine = self._id(machine_id)
+        found = self._cloud.get(machine.region, machine.vm)
+        if found is not None and found.spot:
+            raise Unsupported("a spot instance can't be stopped and started again",
+                              "use on_exit='delete' or 'keep', or spot=False")
+        self._cloud.stop(machine)
+
+    def start(self, machine_id: str) -> None:
+        """Start a stopped machine; wait for one that is still stopping."""
+        machine = self._id(machine_id)
+
+        def stopped() -> bool:
+            found = self._cloud.get(machine.region, machine.vm)
+            return found is None or found.state is not MachineState.STOPPING
+
+        wait_until(stopped, timeout=END_TIMEOUT, interval=1.0, longest=5.0,
+                   what=f'{machine.vm} in {machine.region} to be stopped')
+        self._cloud.start(machine)
+
+    def tidy(self) -> list[str]:
+        """Delete the firewalls and keys of machines that ended by themselves."""
+        def ask(region: str) -> list[str]:
+            found = self._cloud.leftovers(region, time.time())
+            for attempt in found:
+                self._cloud.sweep(region, attempt)
+            return [f"security group and key of '{name}' in {region}" for name in found.values()]
+        return [words for found in self._everywhere(self._cloud, ask) for words in found]
+
+    # -- its network ----------------------------------------------------------------------------
+
+    def robot_address(self) -> str:
+        """Return this computer's public address, or the one that the user has named."""
+        ending = self.cancel is None or self.cancel.is_set()
+        return self._address(None if ending else self.cancel)
+
+    def _address(self, cancel: Optional[threading.Event]) -> str:
+        return cancellable(_ROBOT_ADDRESS, cancel, what="asking for the robot's address",
+                           grace=lambda: 0.0)
+
+    def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        """Change the machine's own firewall."""
+        # a port is closed even if the launch ends
+        cloud = self._until() if sources else self._cloud
+        cloud.set_firewall(self._id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))
+
+    def pin(self, machine_id: str, host_key: str) -> None:
+        """Store the machine's new host key in its tags."""
+        self._until().set_tags(
+            self._id(machine_id), {TAG_HOST_KEY: ' '.join(host_key.split()[:2])})
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
+        """Make an image of a machine, which continues to run."""
+        return self._cloud.bake(self._id(machine_id), name, dependencies)
+
+    def images(self) -> Iterable[Image]:
+        """Return the images of FogROS2 of all regions."""
+        cloud = self._until()
+        found = self._everywhere(cloud, lambda region: list(cloud.images(region)))
+        return [image for images in found for image in images]
+
+    def delete_image(self, image_id: str) -> None:
+        """Delete an image and its snapshots."""
+        self._cloud.delete_image(image_id)
+
+    # -- regions and prices ---------------------------------------------------------------------
+
+    def nearest(self, names: Sequence[str] = ()) -> str:
+        """Return the region with the fastest response."""
+        return self._cloud.regions.nearest(names)
+
+    def regions(self, names: Sequence[str] = (), *, every: bool = False) -> list[Region]:
+        """Measure the regions."""
+        self._cloud.regions.check(names)
+        return self._cloud.regions.ranked(names, every=every)
+
+    def search_in(self, regions: Sequence[str]) -> None:
+        """Search these regions from now on; 'all': every region of the account."""
+        self._searched = tuple(regions)
+
+    def offers(
+        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
+    ) -> Offers:
+        """Return the types that fit, with prices on demand and spot prices."""
+        cloud = self._cloud.until(self.cancel)
+        # checked first: a measurement takes seconds, and is useless without credentials
+        cloud.check_credentials()
+        names = [name for name in regions if name]
+        if not names:
+            names = [cloud.default_region() or NEAREST]
+        if {ALL, '*'} & set(names):
+            names = cloud.enabled_regions()
+        named = list(dict.fromkeys(
+            self.nearest() if name == NEAREST else name for name in names))
+        return Market(cloud, refresh=refresh).choose(named, wanted, spot_too=True)
+
+    def _named_regions(self) -> list[str]:
+        """Return the regions that the user has named: by an option, else by the variable."""
+        return list(self._searched) or os.environ.get(
+            self._cloud.regions_variable, '').replace(',', ' ').split()
+
+    def _base(self) -> str:
+        """Return a region for requests that belong to no region."""
+        regions = [region for region in self._named_regions() if region != ALL]
+        return self._cloud.default_region() or (*regions, self._cloud.base_region)[0]
+
+    def _everywhere(self, cloud: VmCloud, question: Callable[[str], T]) -> Iterable[T]:
+        """
+        Ask all regions at the same time; return their answers.
+
+        A region that the account must not use has no machine of ours. Its refusal is an error
+        only if the user has named the region, or if no region answers.
+        """
+        regions = self._named_regions()
+        named = bool(regions) and ALL not in regions
+        if not named:
+            regions = sorted(cloud.enabled_regions())
+
+        def attempt(region: str) -> tuple[Optional[T], Optional[FogError]]:
+            try:
+                return question(region), None
+            except FogError as error:
+                return None, error
+
+        with ThreadPoolExecutor(min(PARALLEL, len(regions)), 'fog-regions') as pool:
+            answers = list(pool.map(attempt, regions))
+        found = [answer for answer, error in answers if answer is not None]
+        for _, error in answers:
+            denied = isinstance(error, CloudError) and error.denied
+            if error is not None and (named or not found or not denied):
+                raise error
+        return found
+
+    def _region(self, options: VmOptions) -> str:
+        """
+        Return the region of a machine, or 'nearest'.
+
+        :raises ConfigurationError: nobody has named a region.
+        """
+        region = options.region or self._cloud.default_region()
+        if not region:
+            raise ConfigurationError(
+                f'no region is named for {options.WHAT}',
+                f"region='{self._cloud.base_region}' or region='nearest' names one")
+        return region
+
+    # -- ids ------------------------------------------------------------------------------------
+
+    def _text(self, machine: VmId) -> str:
+        return f'{self.name}:{"/".join(machine)}'
+
+    def _id(self, text: str) -> VmId:
+        """
+        Parse a machine's id.
+
+        :raises MachineNotFound: not an id of this provider.
+        """
+        form = rf'{self.name}:([a-z0-9-]+)/({self._cloud.id_form})/([0-9a-f]{{16}})'
+        found = re.fullmatch(form, text)
+        if found is None:
+            raise MachineNotFound(f"'{text}' is no machine at {self._cloud.title}")
+        return VmId(*found.groups())
+
+
+def _dollars(text: str) -> Optional[Decimal]:
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return None

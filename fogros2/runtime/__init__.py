@@ -1,0 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot's side of a launch on launch's event loop: machines, remote processes, streams.
+
+In reading order: ``console`` shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an
+orderly shutdown, ``uncompressed`` warns of images that should be streamed, ``node_spec`` converts
+a process action to a NodeSpec, ``streaming`` collects the streams, ``republishers`` has the
+processes that FogROS2 adds, ``backlog`` holds a machine's events until launch takes them,
+``session`` is one machine of the launch, ``interruption`` handles its preemption, ``coordinator``
+connects the launch with its machines, ``remote_run`` follows one process on a machine,
+``foxglove`` runs the bridge, and ``remote_process`` is the action of a remote process.
+"""

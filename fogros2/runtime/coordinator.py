@@ -1,0 +1,556 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Connect a launch with its machines: one coordinator in each launch context.
+
+Cloud processes register here as launch executes them. When launch has executed everything that
+is due at that moment, the coordinator checks all new machines together, before any exists. Then
+it brings them up in parallel, in threads. When launch shuts down, for whatever reason, the
+coordinator keeps it alive until all processes have ended and the machines are taken down.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import functools
+import threading
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import Action, Event, EventHandler, LaunchContext
+from launch.actions import (
+    ExecuteLocal,
+    OpaqueFunction,
+    PopEnvironment,
+    PushEnvironment,
+    ResetEnvironment,
+)
+from launch.event_handlers import OnShutdown
+import launch.logging
+from launch.substitutions import SubstitutionFailure
+
+from fogros2.describe import values
+from fogros2.describe.keywords import ROBOT
+from fogros2.describe.machines import CloudInstance
+from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
+from fogros2.launch_internals import private, processes
+from fogros2.model import NodeSpec
+from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
+from fogros2.runtime.console import Console
+from fogros2.runtime.interruption import MachineInterrupted
+from fogros2.runtime.session import Session
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.deploy import Launch
+    from fogros2.describe.machines import SomeMachine
+    from fogros2.describe.overrides import Overrides
+    from fogros2.image_transport.streams import Entry
+    from fogros2.model import MachineSpec
+
+#: Returns the process of a node on a machine, by the machine's name.
+OnMachine = Callable[[NodeSpec, str], ExecuteLocal]
+
+#: Name of the coordinator in ``context.locals``.
+_LOCAL = 'fogros2'
+#: More than any launch has machines: each may block a thread.
+_THREADS = 128
+
+
+class Begin(Event):
+    """Everything that was due has executed: the machines requested meanwhile may come up."""
+
+    name = 'fogros2.Begin'
+
+
+class Failed(Event):
+    """
+    The deployment failed.
+
+    Its handler raises the error, so that ``ros2 launch`` exits with a status other than zero.
+    """
+
+    name = 'fogros2.Failed'
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__()
+        self.error = error
+
+
+class Coordinator:
+    """
+    The robot's side of a launch, on launch's event loop.
+
+    :param make_launch: creates the deployment (a :class:`fogros2.deploy.Launch`) for the first
+        machine.
+    """
+
+    def __init__(
+        self, context: LaunchContext,
+        make_launch: Optional[Callable[..., Launch]] = None,
+    ) -> None:
+        self.base_environment: dict[str, str] = {}
+        #: Done when the cloud is up (True: start the robot's processes) or never will be (False).
+        self.gate: Optional[asyncio.Future[bool]] = None
+        self._context = context
+        self._make_launch = make_launch or _make_launch
+        self._launch: Optional[Launch] = None
+        self._cancel = threading.Event()
+        self._console: Optional[Console] = None
+        self._instances: dict[str, CloudInstance] = {}
+        self._overrides: Optional[Overrides] = None
+        self._mentioned: list[SomeMachine] = []
+        self._whole = False
+        self._sessions: dict[str, Session] = {}
+        self._new: list[Session] = []
+        self._begun = True
+        self._late: set[str] = set()
+        self._streams = streaming.Streams()
+        self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
+        self._on_machine: OnMachine
+        self._dds: Optional[str] = None
+        self._down: Optional[asyncio.Task[None]] = None
+        #: The watch for uncompressed images, which ends with the launch.
+        self._watched: Optional[asyncio.Future[None]] = None
+        self._restore_signals: Callable[[], None] = _nothing
+        self._logger = launch.logging.get_logger('fogros2')
+        context.extend_globals({_LOCAL: self})
+        for handler in (
+            EventHandler(
+                matcher=lambda event: isinstance(event, Begin),
+                entities=OpaqueFunction(function=self._on_begin)),
+            EventHandler(
+                matcher=lambda event: isinstance(event, Failed),
+                entities=OpaqueFunction(function=self._on_failed)),
+            # launch asks the handlers that were registered last first: those of launch files
+            EventHandler(
+                matcher=lambda event: isinstance(event, MachineInterrupted),
+                entities=OpaqueFunction(function=self._on_interrupted)),
+            OnShutdown(on_shutdown=self._on_shutdown),
+        ):
+            context.register_event_handler(handler)
+
+    @classmethod
+    def of(cls, context: LaunchContext) -> Coordinator:
+        """Return the context's coordinator; create it if there is none."""
+        known: Optional[Coordinator] = context.get_locals_as_dict().get(_LOCAL)
+        return cls(context) if known is None else known
+
+    # -- what actions call ----------------------------------------------------------------------
+
+    @property
+    def launch(self) -> Launch:
+        """The deployment, which :meth:`engage` has created."""
+        assert self._launch is not None
+        return self._launch
+
+    def engage(self) -> None:
+        """
+        Create the deployment; from now on the launch's nodes get the DDS environment.
+
+        :raises FogError: the environment is unavailable, as for an unknown RMW_IMPLEMENTATION.
+        """
+        if self._launch is not None:
+            return
+        self._check_overrides(early=True)
+        context = self._context
+        self.base_environment = _environment_at_start(context)
+        self._console = Console()
+        self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
+        # includes what the launch file has set so far, such as ROS_DOMAIN_ID
+        self._launch = self._make_launch(
+            report=self._console, environment=dict(context.environment), cancel=self._cancel)
+        self._restore_signals = signals.take_over(context)
+        if self._dds is not None:
+            self._launch.use_dds(self._dds)
+        self._set_dds_environment()
+
+    def use_dds(self, name: str) -> None:
+        """
+        Select the middleware of all nodes; see :meth:`fogros2.deploy.Launch.use_dds`.
+
+        :raises DdsError: nodes of the launch already use another one.
+        """
+        self._dds = name
+        if self._launch is not None:
+            self._launch.use_dds(name)
+
+    def know(self, machine: Optional[SomeMachine]) -> None:
+        """Remember a machine that the launch mentions, so that nodes can refer to its name."""
+        if isinstance(machine, CloudInstance):
+            self._instances[machine.name] = machine
+
+    def override(
+        self, overrides: Overrides, machines: Iterable[SomeMachine], *, whole: bool,
+    ) -> None:
+        """
+        Create machines elsewhere than the launch file says.
+
+        :param machines: the known machines of the launch; ``whole`` if there are no others.
+        """
+        self._overrides = overrides
+        self._mentioned += machines
+        self._whole = whole
+        # an override without a machine is refused even if no machine is requested
+        self.begin()
+
+    def mention(self, machine: Optional[SomeMachine]) -> None:
+        """Remember that the launch has a machine, even if no process requests it."""
+        if machine is not None:
+            self._mentioned.append(machine)
+
+    def _check_overrides(self, *, early: bool) -> None:
+        """
+        Check that each override has a machine.
+
+        :param early: check only if all machines are already known.
+        """
+        if self._overrides is None or (early and not self._whole):
+            return
+        names = [self._resolved(
+            known.own_name if isinstance(known, CloudInstance) else known)
+            for known in (*self._instances.values(), *self._mentioned)]
+        if not early or None not in names:
+            self._overrides.check([name for name in names if name is not None])
+
+    def resolve(self, machine: SomeMachine) -> Union[CloudInstance, str]:
+        """Return a machine as it is, or its name resolved."""
+        if isinstance(machine, CloudInstance):
+            return machine
+        return str(values.resolve(self._context, machine))
+
+    def on_robot(self, machine: SomeMachine) -> bool:
+        """
+        Return whether a machine's processes run on the robot, because its provider is 'robot'.
+
+        :raises ConfigurationError: a wrong value, or an unknown name.
+        """
+        if self._overrides is None and all(
+                known.provider != ROBOT for known in self._instances.values()):
+            return False
+        machine = self.resolve(machine)
+        if isinstance(machine, str):
+            machine = self._by_name(machine)
+        return self._spec(machine).provider == ROBOT
+
+    def engage_for(self, machines: Iterable[Optional[SomeMachine]]) -> None:
+        """Create the deployment if one of the machines, or an unknown name, needs a provider."""
+        if any(self._may_be_made(machine) for machine in machines):
+            self.engage()
+
+    def _may_be_made(self, machine: Optional[SomeMachine]) -> bool:
+        name = machine.own_name if isinstance(machine, CloudInstance) else machine
+        name = self._resolved(name) or ''
+        override = self._overrides.of(name) if self._overrides is not None else None
+        if override is not None:
+            return not override.on_robot
+        if not isinstance(machine, CloudInstance):
+            machine = next((known for known in self._instances.values()
+                            if self._resolved(known.own_name) == name), None)
+        return machine is None or machine.provider != ROBOT
+
+    def _resolved(self, name: Optional[SomeSubstitutionsType]) -> Optional[str]:
+        """Resolve a name; return None if a substitution has no value yet."""
+        try:
+            resolved: Optional[str] = values.resolve(self._context, name)
+        except SubstitutionFailure:
+            return None
+        return resolved
+
+    def _spec(self, machine: CloudInstance) -> MachineSpec:
+        spec = machine.spec(self._context)
+        return spec if self._overrides is None else self._overrides.apply(spec, self._context)
+
+    def session(self, machine: SomeMachine) -> Session:
+        """
+        Return the session of a machine; the first call for a machine schedules its creation.
+
+        :raises ConfigurationError: a wrong value, an unknown name, or a duplicate name.
+        """
+        self.engage()
+        machine = self.resolve(machine)
+        if isinstance(machine, str):
+            machine = self._by_name(machine)
+        spec = self._spec(machine)
+        self._instances[spec.name] = machine
+        session = self._sessions.get(spec.name)
+        if session is None:
+            session = Session(
+                spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
+                changed=self._open_gate, preempted=self._preempted,
+                busy=functools.partial(private.waiting_events, self._context))
+            session.rename(self._streams.remappings(spec.name))
+            self._sessions[spec.name] = session
+            self._new.append(session)
+            self.launch.expect([spec.name])
+            self._set_dds_environment()
+            self.begin()
+        elif session.requested != spec:
+            raise ConfigurationError(f"two machines of this launch are called '{spec.name}'",
+                                     'give each a name= of its own')
+        session.add(machine)
+        return session
+
+    def stream_everywhere(self, entries: Sequence[Entry], namespace: str) -> None:
+        """
+        Stream topics between the robot and every machine of the launch.
+
+        :param entries: streams, resolved when a machine's process executes.
+        :param namespace: namespace of relative names.
+        :raises ConfigurationError: an unknown transport, or an invalid topic.
+        """
+        streaming.check(entries)
+        if entries:
+            self._stream_everywhere.append((entries, namespace))
+
+    def resolve_streams(self, entries: Sequence[Entry], namespace: str) -> list[Entry]:
+        """
+        Resolve streams; relative names are in the namespace.
+
+        :raises ConfigurationError: an unknown transport, or an invalid topic.
+        """
+        resolved = streaming.resolve(self._context, entries, namespace, self._source)
+        streaming.check(resolved)
+        return resolved
+
+    def _source(self, source: Optional[SomeMachine]) -> Optional[str]:
+        """Return the name of the machine that publishes, None for the robot."""
+        if source is None:
+            return None
+        # perhaps the launch runs nothing else there
+        self.know(source)
+        machine = self.resolve(source)
+        name = machine if isinstance(machine, str) else machine.spec(self._context).name
+        return None if self.on_robot(name) else name
+
+    def stream(
+        self, entries: Iterable[Entry], session: Session, on_machine: OnMachine,
+    ) -> list[ExecuteLocal]:
+        """
+        Stream topics to and from a machine, in addition to the streams of all machines.
+
+        :param on_machine: returns the process of a stream's node on a machine, by its name.
+        :return: the processes that this needs and no earlier stream did.
+        :raises ConfigurationError: an unknown transport, or contradictory streams.
+        """
+        wanted: list[Entry] = []
+        for everywhere, namespace in self._stream_everywhere:
+            wanted += self.resolve_streams(everywhere, namespace)
+        wanted += entries
+        if not wanted:
+            return []
+        away = [name for name, one in self._sessions.items() if one.interrupted]
+        wanted = [streaming.from_robot(entry, away) for entry in wanted]
+        new = self._streams.add(wanted, session.spec.name)
+        self._on_machine = on_machine
+        # another machine may be the source
+        self._rename_topics()
+        return [republishers.RobotRepublisher(spec, session.came_up) if machine is None else
+                on_machine(spec, machine) for machine, spec in new]
+
+    def _rename_topics(self) -> None:
+        for session in self._sessions.values():
+            session.rename(self._streams.remappings(session.spec.name))
+
+    def begin(self) -> None:
+        """Emit :class:`Begin`; launch handles it after everything that is due has executed."""
+        if self._begun:
+            self._begun = False
+            # launch handles events after its current visit, and not if that visit fails
+            self._context.emit_event_sync(Begin())
+
+    def hold(self) -> asyncio.Future[bool]:
+        """Return the gate; from now on it is closed until the cloud is up."""
+        if self.gate is None:
+            self.gate = self._context.asyncio_loop.create_future()
+            self.begin()
+        return self.gate
+
+    # -- coming up ------------------------------------------------------------------------------
+
+    def _by_name(self, name: str) -> CloudInstance:
+        for known, instance in list(self._instances.items()):
+            # a resolved name differs from the key of a name that was a substitution
+            if name in (known, instance.name):
+                return instance
+        raise ConfigurationError(
+            f"this launch has no machine named '{name}'",
+            did_you_mean(
+                name, self._instances,
+                'name one that the launch file describes before, or pass the machine itself'))
+
+    def _set_dds_environment(self) -> None:
+        environment = self.launch.robot_environment()
+        for kept in (self._context.environment, *private.kept_environments(self._context)):
+            kept.update(environment)
+        # these are not changes of the launch file, so they must not be sent to machines
+        self.base_environment.update(environment)
+        for action in processes.processes(self._context):
+            details, ended = action.process_details, private.completed(action)
+            if details is None or ended is None or ended.done():
+                continue
+            if details['env'].items() >= environment.items():
+                continue
+            if details.get('pid') is None:
+                # executed; starts when launch returns to its event loop
+                details['env'].update(environment)
+            elif details['name'] not in self._late:
+                self._late.add(details['name'])
+                self._logger.warning(
+                    f"{details['name']} runs already and so without the cloud's DDS settings: it "
+                    'may not see the cloud; use a FogROSLaunchDescription')
+
+    def _on_begin(self, context: LaunchContext) -> None:
+        self._begun = True
+        if context.is_shutdown:
+            return
+        self._check_overrides(early=False)
+        new, self._new = self._new, []
+        if new:
+            task = context.asyncio_loop.create_task(self._bring_up(new))
+            context.add_completion_future(task)
+            task.add_done_callback(self._raise_in_launch)
+            for session in new:
+                session.deployment = task
+        self._open_gate()
+
+    async def _bring_up(self, sessions: list[Session]) -> None:
+        try:
+            await asyncio.gather(*(session.choose() for session in sessions))
+            await self._in_thread(
+                self.launch.prepare, [session.spec for session in sessions],
+                {session.spec.name: session.programs for session in sessions},
+                {session.spec.name: session.images for session in sessions})
+        except FogError as error:
+            self._fail(error)
+            return
+        await asyncio.gather(*(self._up(session) for session in sessions))
+        if self._console is not None and all(session.running for session in sessions):
+            self._console.table()
+        if self._watched is None and not self._cancel.is_set():
+            self._watched = self._in_thread(
+                uncompressed.watch, functools.partial(
+                    uncompressed.carried, f'fog{self.launch.id}'),
+                self._crossing_images, self._logger.warning, self._cancel)
+
+    def _crossing_images(self) -> list[str]:
+        # copied, because this runs in a thread and the launch may add machines
+        machines = {name: session.node_names() for name, session in list(self._sessions.items())}
+        return uncompressed.crossing_images(
+            machines, {**self._context.environment, **self.launch.robot_environment()},
+            self._cancel)
+
+    async def _up(self, session: Session) -> None:
+        try:
+            running = await self._in_thread(self.launch.up, session.spec)
+        except FogError as error:
+            # end the launch at once, although other machines are still coming up
+            self._fail(error)
+            return
+        session.up(running)
+
+    def _raise_in_launch(self, task: asyncio.Task[None]) -> None:
+        # ``exception()`` of a cancelled task raises
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._fail(error)
+
+    def _open_gate(self) -> None:
+        if self.gate is None or self.gate.done() or not self._begun:
+            return
+        if not self._new and all(session.ready for session in self._sessions.values()):
+            self.gate.set_result(True)
+
+    # -- a machine is preempted -----------------------------------------------------------------
+
+    def _preempted(self, session: Session, reason: str) -> None:
+        if not self._context.is_shutdown:
+            self._context.emit_event_sync(
+                MachineInterrupted(session.spec.name, reason, session.lost))
+
+    def _on_interrupted(self, context: LaunchContext) -> list[Action]:
+        session = self._sessions.get(context.locals.event.machine)
+        if session is None or context.is_shutdown:
+            return []
+        new = interruption.react(
+            context.locals.event, session, self._streams, context, self._logger)
+        self._rename_topics()
+        at_once: asyncio.Future[bool] = context.asyncio_loop.create_future()
+        at_once.set_result(True)
+        return [
+            republishers.RobotRepublisher(spec, at_once) if name is None else
+            self._on_machine(spec, name) for name, spec in new]
+
+    # -- going down -----------------------------------------------------------------------------
+
+    def _fail(self, error: BaseException) -> None:
+        if isinstance(error, Cancelled):
+            return  # the shutdown of the launch has caused it
+        self._context.emit_event_sync(Failed(error))
+
+    def _on_failed(self, context: LaunchContext) -> None:
+        raise context.locals.event.error
+
+    def _on_shutdown(self, event: Event, context: LaunchContext) -> None:
+        if self._down is not None:
+            return
+        self._cancel.set()
+        if self.gate is not None and not self.gate.done():
+            self.gate.set_result(False)
+        for session in self._sessions.values():
+            session.give_up()
+        if self._launch is None:
+            return
+        self._down = context.asyncio_loop.create_task(self._take_down())
+        self._down.add_done_callback(self._taken_down)
+        context.add_completion_future(self._down)
+
+    async def _take_down(self) -> None:
+        # the VPN interface must stay while a node runs
+        sessions = self._sessions.values()
+        futures = [private.completed(action) for action in processes.processes(self._context)]
+        await _all_done({
+            *futures, *(session.deployment for session in sessions), self._watched})
+        await _all_done({request for session in sessions for request in session.requests})
+        for error in await self._in_thread(self.launch.down):
+            self._fail(error)
+        for line in cost.lines(self.launch.cost()):
+            self._logger.info(line)
+
+    def _taken_down(self, task: asyncio.Task[None]) -> None:
+        self._raise_in_launch(task)
+        if self._console is not None:
+            self._console.close()
+        self._pool.shutdown(wait=False)
+        self._restore_signals()
+
+    def _in_thread(self, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
+        future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(
+            self._pool, function, *args)
+        return future
+
+
+async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
+    waits = {future for future in futures if future is not None}
+    if waits:
+        await asyncio.wait(waits)
+
+
+def _nothing() -> None:
+    """Do nothing."""
+
+
+def _make_launch(**arguments: Any) -> Launch:
+    # imported for the first machine: it imports the SSH shell
+    from fogros2.deploy import Launch
+    return Launch(**arguments)
+
+
+def _environment_at_start(context: LaunchContext) -> dict[str, str]:
+    """Return the environment in which the launch was started, as ResetEnvironment restores it."""
+    PushEnvironment().execute(context)
+    ResetEnvironment().execute(context)
+    environment = dict(context.environment)
+    PopEnvironment().execute(context)
+    return environment

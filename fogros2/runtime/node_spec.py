@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Convert a process action, resolved on the robot, to the NodeSpec that a machine runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import os
+from pathlib import Path
+import re
+from typing import Optional
+
+from launch import LaunchContext, Substitution
+from launch.actions import ExecuteLocal
+from launch.conditions import evaluate_condition_expression
+from launch.substitutions import FindExecutable, SubstitutionFailure
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from launch_ros.substitutions import ExecutableInPackage
+
+from fogros2 import plan
+from fogros2.errors import ConfigurationError
+from fogros2.host import workspace
+from fogros2.host.programs import check_program
+from fogros2.launch_internals import private
+from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
+
+#: ROS arguments followed by a file name; the file is sent to the machine.
+_FILE_ARGUMENTS = ('--params-file', '--log-config-file')
+
+#: Variables that describe the robot's own system; a launch file's changes of them stay here.
+LOCAL_VARIABLES = frozenset({
+    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
+    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
+    'ROS_HOME', 'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
+})
+
+
+class ProgramName(Substitution):
+    """The name of a program, which is looked up on the machine where it will run."""
+
+    def __init__(
+        self, name: list[Substitution], package: list[Substitution], here: Substitution,
+    ) -> None:
+        super().__init__()
+        #: The substitution that looks it up on the robot.
+        self.here = here
+        self.name = name
+        self.package = package
+
+    def describe(self) -> str:
+        """Return the name's own description."""
+        return ' + '.join(part.describe() for part in self.name)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the name."""
+        return perform_substitutions(context, self.name)
+
+
+def use_names_of_programs(action: ExecuteLocal) -> None:
+    """Replace substitutions that look programs up on the robot by the names, in place."""
+    for argument in action.process_description.cmd:
+        for index, part in enumerate(argument):
+            if isinstance(part, ExecutableInPackage):
+                argument[index] = ProgramName(part.executable, part.package, part)
+            elif isinstance(part, FindExecutable):
+                argument[index] = ProgramName(
+                    normalize_to_list_of_substitutions(part.name), [], part)
+
+
+@contextlib.contextmanager
+def packages_of(folder: Optional[str]) -> Iterator[None]:
+    """Let substitutions find the packages of a workspace during the block, sourced or not."""
+    before = os.environ.get('AMENT_PREFIX_PATH')
+    known = before.split(os.pathsep) if before else []
+    more = [prefix for prefix in workspace.prefixes(folder) if prefix not in known]
+    if more:
+        os.environ['AMENT_PREFIX_PATH'] = os.pathsep.join([*more, *known])
+    try:
+        yield
+    finally:
+        if more and before is None:
+            del os.environ['AMENT_PREFIX_PATH']
+        elif more and before is not None:
+            os.environ['AMENT_PREFIX_PATH'] = before
+
+
+def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
+    """
+    Return the command of a prepared action for the robot.
+
+    :raises ConfigurationError: the program is not installed on the robot.
+    """
+    description = action.process_description
+    command = list(description.final_cmd or ())
+    first = len(command) - len(description.cmd)  # launch puts the prefix before the command
+    for index, argument in enumerate(description.cmd, first):
+        if any(isinstance(part, ProgramName) for part in argument):
+            try:
+                command[index] = perform_substitutions(context, [
+                    part.here if isinstance(part, ProgramName) else part for part in argument])
+            except (LookupError, SubstitutionFailure) as error:
+                raise ConfigurationError(
+                    f"{description.final_name} can't run on the robot, as on_interrupt='robot' "
+                    f'wants it to: {error}',
+                    "install it here too, or say on_interrupt='shutdown'") from error
+    return command
+
+
+def from_action(
+    action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str], spec: MachineSpec,
+    launch_id: str, image: str = '', image_options: Sequence[str] = (),
+    own_packages: bool = False,
+) -> NodeSpec:
+    """
+    Convert a prepared action to a NodeSpec.
+
+    If the node runs in an image, paths of the robot's ROS stay unchanged: only the machine knows
+    the image's content.
+
+    :param base: the environment before the launch changed it; changes are sent.
+    :param own_packages: whether the machine may have packages that the robot does not have.
+    :raises ConfigurationError: a package, an executable or a parameter file is missing.
+    """
+    description = action.process_description
+    texts = Texts(() if image else plan.ament_prefixes(base), spec.workspace)
+    final = list(description.final_cmd or ())
+    # launch puts the prefix before the command
+    count = len(final) - len(description.cmd)
+    prefix, final = final[:count], final[count:]
+    package = executable = ''
+    first = description.cmd[0]
+    if len(first) == 1 and isinstance(first[0], ProgramName) and first[0].package:
+        package = perform_substitutions(context, first[0].package)
+        executable = final.pop(0)
+        if not image and not own_packages:
+            check_program(package, executable, texts.prefixes, spec.workspace)
+    files: dict[str, Text] = {}
+    arguments = [texts.text(argument) for argument in final]
+    for index in range(1, len(final)):
+        if final[index - 1] in _FILE_ARGUMENTS:
+            key = f'{len(files)}-{os.path.basename(final[index])}'
+            files[key] = texts.text(_read(final[index]))
+            arguments[index] = ({'file': key},)
+    name = str(description.final_name)
+    return NodeSpec(
+        id=f'{name}.{launch_id}',
+        name=name,
+        package=package,
+        executable=executable,
+        arguments=tuple(arguments),
+        prefix=tuple(prefix),
+        files=files,
+        environment={
+            key: texts.text(value)
+            for key, value in _environment(action, context, base).items()},
+        cwd=description.final_cwd,
+        shell=action.shell,
+        emulate_tty=_emulate_tty(action, context),
+        respawn=bool(private.option(action, 'respawn')),
+        respawn_delay=private.option(action, 'respawn_delay') or 0.0,
+        respawn_max_retries=private.option(action, 'respawn_max_retries'),
+        sigterm_timeout=float(perform_substitutions(context, action.sigterm_timeout)),
+        sigkill_timeout=float(perform_substitutions(context, action.sigkill_timeout)),
+        image=image,
+        image_options=tuple(image_options),
+    )
+
+
+def _environment(
+    action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str],
+) -> dict[str, str]:
+    """Return the variables that the launch file set, for this process or for all processes."""
+    description = action.process_description
+    final: Mapping[str, str] = description.final_env or {}
+    if description.env is not None:
+        # a complete environment: the machine adds it to the variables that ROS needs there
+        return dict(final)
+    changed = {
+        key: value for key, value in final.items()
+        if base.get(key) != value and key not in LOCAL_VARIABLES}
+    for key, _ in description.additional_env or ():
+        name = perform_substitutions(context, key)
+        changed[name] = final[name]
+    return changed
+
+
+def _emulate_tty(action: ExecuteLocal, context: LaunchContext) -> bool:
+    configured: Optional[str] = context.launch_configurations.get('emulate_tty')
+    if configured is None:
+        return bool(action.emulate_tty)
+    return bool(evaluate_condition_expression(
+        context, normalize_to_list_of_substitutions(configured)))
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the file '{path}' of a cloud node can't be read: {error}",
+            'it is read here and travels to the machine') from error
+
+
+class Texts:
+    """
+    Replace the robot's package paths in texts by markers, which the machine resolves.
+
+    ``/opt/ros/jazzy/share/demo/rviz.yaml`` becomes ``({'share': 'demo'}, '/rviz.yaml')``, and a
+    path below ``lib/demo`` begins with ``{'prefix': 'demo'}``. The workspace has the same path on
+    the machine, so its paths stay unchanged.
+
+    :param prefixes: the robot's ament prefixes.
+    """
+
+    def __init__(self, prefixes: Sequence[str], workspace: Optional[str]) -> None:
+        self.prefixes = list(prefixes)
+        roots = sorted(
+            {prefix.rstrip('/') for prefix in prefixes if not _below(prefix, workspace)},
+            key=len, reverse=True)
+        self._pattern = re.compile(
+            r'(?<![\w.-])(?P<prefix>{})/(?P<kind>share|lib)/(?P<package>\w+)(?![\w.-])'.format(
+                '|'.join(re.escape(root) for root in roots) or r'(?!)'))
+
+    def text(self, text: str) -> Text:
+        """Return the text with markers, or the unchanged text if it needs none."""
+        parts: list[TextPart] = []
+        begin = 0
+        for match in self._pattern.finditer(text):
+            prefix, kind, package = match.group('prefix', 'kind', 'package')
+            if not Path(prefix, 'share/ament_index/resource_index/packages', package).exists():
+                continue
+            parts.append(text[begin:match.start()])
+            parts.append({'share' if kind == 'share' else 'prefix': package})
+            # the machine looks up the package's prefix; the rest of the path is the same there
+            begin = match.end() if kind == 'share' else match.end('prefix')
+        if not parts:
+            return text
+        return tuple(part for part in (*parts, text[begin:]) if part)
+
+
+def _below(path: str, folder: Optional[str]) -> bool:
+    return folder is not None and (path == folder or path.startswith(f'{folder}/'))
+

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Follow one process on a machine, from its execution to its end or its move to the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import re
+import signal
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import LaunchContext
+from launch.actions import ExecuteLocal
+from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
+import launch.logging
+
+from fogros2.events import Event, NodeExited, NodeOutput, NodeRefused, NodeStarted
+from fogros2.launch_internals import private
+from fogros2.model import NodeSpec
+
+if TYPE_CHECKING:
+    from fogros2.runtime.session import Session
+
+#: Messages of Qt, GTK and Tk that there is no screen.
+_NO_SCREEN = re.compile(
+    r'Qt platform plugin|could not connect to display|cannot open display|GTK backend|'
+    r'no \$DISPLAY environment variable', re.IGNORECASE)
+#: Seconds that the machine has, beyond a process's own time-outs, to report its end.
+GRACE = 10.0
+
+
+class RemoteRun:
+    """
+    One process on a machine, from its execution to its end.
+
+    launch's ExecuteLocal uses it as the subprocess's transport and protocol.
+
+    :param come_here: starts the process on the robot; None if it cannot run there.
+    """
+
+    def __init__(
+        self, action: ExecuteLocal, context: LaunchContext, session: Session, node: NodeSpec,
+        come_here: Optional[Callable[[LaunchContext], None]],
+    ) -> None:
+        completed = private.completed(action)
+        assert completed is not None
+        self.node = node
+        self.complete = completed
+        self._action = action
+        self._come_here = come_here
+        self.started = False
+        self.stopping = False
+        #: Whether it exited and its machine will restart it.
+        self.respawning = False
+        self._hinted = False
+        #: Whether it is moving to the robot; whether it runs there as launch's own process.
+        self._moving = self._here = False
+        self._context = context
+        self._session = session
+        self._details: dict[str, Any] = dict(action.process_details or {})
+        self._returncode: Optional[int] = None
+        self._logger = launch.logging.get_logger(f'{session.spec.name}.{node.name}')
+        if private.option(action, 'log_cmd'):
+            self._logger.info(f"process details: cmd='{' '.join(self._details['cmd'])}'")
+
+    # -- launch calls these as on a transport ---------------------------------------------------
+
+    def get_returncode(self) -> Optional[int]:
+        """Return the exit status, None until the process has ended."""
+        return self._returncode
+
+    def send_signal(self, number: Union[int, str]) -> None:
+        """Send the process a signal, given by number or name."""
+        name = number if isinstance(number, str) else signal.Signals(number).name
+        if self.started:
+            self._session.signal(self, name)
+        else:
+            self._logger.warning(f"'{name}' not sent: the process hasn't started yet")
+
+    def kill(self) -> None:
+        """Send SIGKILL to the process."""
+        self.send_signal(signal.SIGKILL)
+
+    def close(self) -> None:
+        """Do nothing: there is no transport to close."""
+
+    # -- ending ---------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """Stop the process by SIGINT, SIGTERM and SIGKILL, with its time-outs."""
+        if self.complete.done() or self.stopping:
+            return
+        self.stopping = True
+        if not self._session.stop(self) or self.respawning:
+            # nothing runs, so no exit will be reported
+            self.end()
+            return
+        self._context.asyncio_loop.call_later(self._patience, self.give_up)
+
+    @property
+    def _patience(self) -> float:
+        """Seconds until the machine has to have ended the process and reported it."""
+        return self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
+
+    def give_up(self) -> None:
+        """Stop waiting for a process whose end is overdue."""
+        if not self.complete.done() and not self._here:
+            self._logger.error(
+                f"machine '{self._session.spec.name}' did not report the end of the process; "
+                'its agent will end it')
+            self.end()
+
+    # -- on the robot instead -------------------------------------------------------------------
+
+    def move(self, *, stop: bool) -> None:
+        """
+        Move the process to the robot; launch sees a new start, and no exit before it.
+
+        A process that cannot move, such as a republisher, ends.
+
+        :param stop: whether the machine has to end it first; False if the machine is gone.
+        """
+        if self.complete.done() or self._here or (self._moving and stop):
+            return
+        if self._come_here is None or self.stopping:
+            if stop:
+                self.stop()
+            else:
+                self.end()
+            return
+        self._moving = True
+        if stop and self._session.stop(self) and not self.respawning:
+            self._context.asyncio_loop.call_later(self._patience, self._arrive)
+        else:
+            self._arrive()
+
+    def _arrive(self) -> None:
+        if not self._moving or self.complete.done() or self._come_here is None:
+            return
+        if self.stopping or self._context.is_shutdown:
+            self.end()
+            return
+        self._moving = False
+        self._here = True
+        self._session.forget(self)
+        self._come_here(self._context)
+
+    def unreported(self) -> None:
+        """Stop waiting for the remote process: the agent will not report its exit."""
+        if self._moving:
+            self._arrive()
+        else:
+            self.end()
+
+    def end(self) -> None:
+        """Complete launch's future: no more events will follow."""
+        if not self.complete.done():
+            self.complete.set_result(None)
+        self._session.forget(self)
+
+    # -- events of the agent --------------------------------------------------------------------
+
+    def on_event(self, event: Event) -> None:
+        """Turn an event of the agent into launch's event."""
+        handler = getattr(self, f"_on_{event['event']}", None)
+        if handler is not None and not self.complete.done() and not self._here:
+            handler(event)
+
+    def _on_started(self, event: NodeStarted) -> None:
+        self.started = True
+        self.respawning = False
+        details = self._action.process_details
+        assert details is not None
+        details['pid'] = event['pid']
+        if event['cmd']:
+            details['cmd'] = list(event['cmd'])
+        self._details = dict(details)
+        self._logger.info(f"process started with pid [{event['pid']}]")
+        self._context.emit_event_sync(ProcessStarted(**self._details))
+        if self.stopping:
+            self._session.stop(self)
+
+    def _on_output(self, event: NodeOutput) -> None:
+        if not self._hinted and _NO_SCREEN.search(event['text']):
+            self._hinted = True
+            self._logger.warning(
+                'the process opens a window, and a machine has no screen: run the node on the '
+                'robot, switch its window off, or set QT_QPA_PLATFORM=offscreen for it')
+        kind = ProcessStderr if event['stream'] == 'stderr' else ProcessStdout
+        self._details.setdefault('pid', 0)
+        self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))
+
+    def _on_exited(self, event: NodeExited) -> None:
+        if self._moving and not self.stopping:
+            self._arrive()
+            return
+        self._returncode = event['returncode']
+        self._details.setdefault('pid', 0)
+        pid = self._details['pid']
+        if self._returncode == 0:
+            self._logger.info(f'process has finished cleanly [pid {pid}]')
+        else:
+            command = ' '.join(word for word in self._details['cmd'] if word)
+            self._logger.error(
+                f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
+        self._context.emit_event_sync(
+            ProcessExited(returncode=self._returncode, **self._details))
+        self.respawning = event['respawns']
+        if not self.respawning or self.stopping:
+            self.end()
+
+    def _on_refused(self, event: NodeRefused) -> None:
+        if self._moving:
+            self._arrive()
+            return
+        hint = f" ({event['hint']})" if event['hint'] else ''
+        self._logger.error(f"process can't be started: {event['error']}{hint}")
+        self.end()
+
+    def on_stdin(self, event: object) -> None:
+        """Refuse input: the connection to a machine has no channel for it."""
+        if self._here:
+            return
+        self._logger.error('a process on a machine takes no input from launch')

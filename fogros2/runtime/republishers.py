@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes that FogROS2 adds to a launch: republishers of streams, helpers of machines."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Optional
+
+from launch import Substitution
+from launch.actions import ExecuteProcess
+from launch.substitutions import TextSubstitution
+from launch_ros.substitutions import ExecutableInPackage, FindPackagePrefix, FindPackageShare
+
+from fogros2.errors import ConfigurationError
+from fogros2.launch_internals import private
+from fogros2.model import NodeSpec, Text
+
+_PACKAGE_PATHS = {'share': FindPackageShare, 'prefix': FindPackagePrefix}
+
+
+class AddedProcess(ExecuteProcess):
+    """
+    A process that FogROS2 adds to the launch, such as an encoder of a stream.
+
+    It is a process action and not a :class:`launch_ros.actions.Node`: the namespaces, remappings
+    and parameters that a group sets for its nodes must not change it.
+    """
+
+    def __init__(self, spec: NodeSpec) -> None:
+        command: list[list[Substitution]] = [_substitutions(text) for text in spec.arguments]
+        if spec.package:
+            command.insert(0, [ExecutableInPackage(
+                package=spec.package, executable=spec.executable)])
+        environment: dict[Any, Any] = {  # a dict does not match launch's union type
+            key: _substitutions(value) for key, value in spec.environment.items()}
+        super().__init__(
+            cmd=command, name=spec.name, additional_env=environment, respawn=spec.respawn,
+            respawn_delay=spec.respawn_delay, sigterm_timeout=str(spec.sigterm_timeout),
+            sigkill_timeout=str(spec.sigkill_timeout))
+        #: The id of its node.
+        self.node = spec.id
+
+    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
+        """Return None: this process must not keep the launch alive when all others have ended."""
+        return None
+
+
+class RobotRepublisher(AddedProcess):
+    """A republisher on the robot; it starts when the machine at the other end is up."""
+
+    def __init__(self, spec: NodeSpec, up: asyncio.Future[bool]) -> None:
+        super().__init__(spec)
+        private.delay_start(self, lambda: asyncio.shield(up))
+
+
+def _substitutions(text: Text) -> list[Substitution]:
+    if isinstance(text, str):
+        return [TextSubstitution(text=text)]
+    found: list[Substitution] = []
+    for part in text:
+        if isinstance(part, str):
+            found.append(TextSubstitution(text=part))
+            continue
+        (kind, package), = part.items()
+        if kind not in _PACKAGE_PATHS:
+            raise ConfigurationError(
+                f"an image transport's node names a {kind} that travels",
+                'give its settings as parameters')
+        found.append(_PACKAGE_PATHS[kind](package))
+    return found

@@ -1,0 +1,386 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One machine of a launch: processes that wait for it, and processes that run on it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+import dataclasses
+import functools
+import logging
+from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
+
+import launch.logging
+
+from fogros2.describe import values
+from fogros2.errors import FogError
+from fogros2.events import Event
+from fogros2.model import MachineSpec, NodeSpec
+from fogros2.runtime import streaming, uncompressed
+from fogros2.runtime.backlog import Backlog
+
+if TYPE_CHECKING:
+    from fogros2.deploy import RunningMachine
+    from fogros2.describe.machines import CloudInstance
+
+T = TypeVar('T')
+
+#: Events of the agent about the machine, not about one process: log level and message.
+_NOTICES = {
+    'watchdog': (logging.ERROR, 'the agent ends everything: {reason}'),
+    'ending': (logging.WARNING, 'the agent was asked to end: {reason}'),
+    'end_failed': (logging.ERROR, 'the machine would not end: exit status {returncode}'),
+    'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
+    'launch_exited': (
+        logging.ERROR, 'the launch on the machine ended with exit status {returncode}'),
+    'gap': (logging.WARNING, '{count} events of the agent came too late for its log'),
+    'connection lost': (logging.WARNING, 'the connection is lost; its nodes run on'),
+    'connection back': (logging.INFO, 'the connection is back'),
+    'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
+}
+#: Exit status of processes whose end was not reported.
+_UNREPORTED = -9
+#: Events after which processes end because their machine ends. A session with on_interrupt
+#: 'robot' then holds exits back for so many seconds, until it knows whether the machine is gone.
+_LAST_EVENTS = ('watchdog', 'ending')
+_HOLD = 60.0
+
+
+class Run(Protocol):
+    """The interface of a process to its session; the event loop makes all calls."""
+
+    node: NodeSpec
+    started: bool
+    stopping: bool
+
+    def on_event(self, event: Event) -> None:
+        """Handle an event of the agent that names this process."""
+
+    def end(self) -> None:
+        """Stop waiting for events of the process: none will come."""
+
+    def unreported(self) -> None:
+        """Stop waiting for the remote process: the agent will not report its exit."""
+
+    def move(self, *, stop: bool) -> None:
+        """Move to the robot; with ``stop``, after the machine has ended the process."""
+
+
+class Session:
+    """
+    One machine of a launch, on the event loop.
+
+    :param in_thread: runs a blocking function in a thread.
+    :param fail: ends the launch because of an error.
+    :param changed: called when the machine came up or a process started or ended.
+    :param preempted: called with the session and a reason when the provider reclaims the
+        machine, or has done so.
+    :param busy: returns the number of events that launch has to process.
+    """
+
+    def __init__(
+        self, spec: MachineSpec, loop: asyncio.AbstractEventLoop, *,
+        in_thread: Callable[..., asyncio.Future[Any]],
+        fail: Callable[[BaseException], None], changed: Callable[[], None],
+        preempted: Callable[[Session, str], None], busy: Callable[[], int] = lambda: 0,
+    ) -> None:
+        #: The spec as the launch file gives it, with open choices.
+        self.requested = spec
+        self.spec = spec
+        #: The launch file's objects for the machine; notified when it is up.
+        self.instances: list[CloudInstance] = []
+        self.running: Optional[RunningMachine] = None
+        self.deployment: Optional[asyncio.Task[None]] = None
+        #: True when the machine is up, False when it never will be.
+        self.came_up: asyncio.Future[bool] = loop.create_future()
+        #: Whether containers and monitor of the machine have been requested.
+        self.has_helpers = False
+        #: New names of topics for its nodes, because of streams.
+        self.names: dict[str, str] = {}
+        self._loop = loop
+        self._in_thread = in_thread
+        self._fail = fail
+        self._changed = changed
+        self._preempted = preempted
+        #: Whether the provider reclaims the machine; it may still run.
+        self.interrupted = False
+        #: Whether the machine is gone.
+        self.lost = False
+        self._ending = False
+        self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
+        self._held: list[tuple[Run, Event]] = []
+        self._runs: dict[str, Run] = {}
+        self._waiting: list[Run] = []
+        self._to_stop: list[Run] = []
+        #: Topic names that the first loaded components got; None if none was loaded.
+        self._component_names: Optional[dict[str, str]] = None
+        #: Requests to the agent that are not answered yet.
+        self.requests: set[asyncio.Task[None]] = set()
+        # keeps requests to the agent in order
+        self._order = asyncio.Lock()
+        self._logger = launch.logging.get_logger('fogros2')
+
+    @property
+    def ready(self) -> bool:
+        """Whether the machine is up and all of its processes have started or ended."""
+        return self.running is not None and all(run.started for run in self._runs.values())
+
+    @property
+    def programs(self) -> Sequence[tuple[str, str]]:
+        """The (package, executable) pairs of the processes that wait for the machine."""
+        return sorted({
+            (run.node.package, run.node.executable) for run in self._waiting
+            if run.node.package and not run.node.image})
+
+    @property
+    def images(self) -> Sequence[str]:
+        """The container images of the processes that wait for the machine."""
+        return sorted({run.node.image for run in self._waiting if run.node.image})
+
+    def add(self, instance: CloudInstance) -> None:
+        """Add a launch file's object for this machine."""
+        if instance not in self.instances:
+            self.instances.append(instance)
+            if self.running is not None:
+                instance.is_up(self.running)
+
+    def rename(self, names: dict[str, str]) -> None:
+        """Rename topics for nodes that start from now on; warn of nodes that started before."""
+        new = [name for name in names if name not in self.names]
+        self.names = dict(names)
+        early = [run.node.name for run in self._runs.values()
+                 if run not in self._waiting and '--ros-args' in run.node.arguments]
+        if new and early:
+            self._logger.warning(
+                f"{self.spec.name}: {', '.join(early)} started before {', '.join(new)} became a "
+                'stream and get it unencoded; use a FogROSLaunchDescription, or add the stream to '
+                'the first node of the machine')
+        self._warn_of_components()
+
+    def names_for_components(self) -> dict[str, str]:
+        """Return the new topic names for components that are about to be loaded."""
+        self._component_names = dict(self.names) if self._component_names is None else {
+            name: new for name, new in self._component_names.items() if name in self.names}
+        return dict(self.names)
+
+    def _warn_of_components(self) -> None:
+        before = self._component_names
+        late = [name for name in self.names if before is not None and name not in before]
+        if late:
+            self._logger.warning(
+                f"{self.spec.name}: components were loaded before {', '.join(late)} became a "
+                'stream and get it unencoded; add the stream to the container')
+            self._component_names = None
+
+    def give_up(self) -> None:
+        """Stop waiting for the machine to come up, unless it is up."""
+        if not self.came_up.done():
+            self.came_up.set_result(False)
+
+    # -- processes ------------------------------------------------------------------------------
+
+    def node_names(self) -> list[str]:
+        """Return the ROS names of the machine's nodes."""
+        return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
+
+    def submit(self, run: Run) -> None:
+        """Start a process when the machine is up."""
+        self._runs[run.node.id] = run
+        if self.interrupted:
+            run.move(stop=False)
+            return
+        self._waiting.append(run)
+        if self.running is not None:
+            self._request(self._start_waiting)
+
+    def stop(self, run: Run) -> bool:
+        """Stop a process; return False if it does not run there and never will."""
+        if run in self._waiting or self.running is None or self.lost:
+            if run in self._waiting:
+                self._waiting.remove(run)
+            return False
+        for held in self._held:
+            if held[0] is run:
+                self._held.remove(held)
+                run.on_event(held[1])
+                return True
+        self._to_stop.append(run)
+        if len(self._to_stop) == 1:
+            self._request(self._stop_collected)
+        return True
+
+    def signal(self, run: Run, name: str) -> None:
+        """Send a process a signal."""
+        self._request(functools.partial(self._signal, run, name))
+
+    def forget(self, run: Run) -> None:
+        """Remove a process that has ended."""
+        self._runs.pop(run.node.id, None)
+        self._changed()
+
+    def open_port(
+        self, port: int, sources: Sequence[str], opened: Callable[[str, int], None],
+    ) -> None:
+        """Open a TCP port of the running machine; ``opened`` is called with host and port."""
+        async def open_port() -> None:
+            assert self.running is not None
+            opened(*await self._in_thread(self.running.open_port, port, sources))
+
+        self._request(open_port)
+
+    # -- the machine ----------------------------------------------------------------------------
+
+    async def choose(self) -> None:
+        """
+        Make the requests of choices such as 'nearest', and complete the spec.
+
+        :raises FogError: a choice cannot be made.
+        """
+        if any(callable(value) for value in self.requested.options.values()):
+            options = await self._in_thread(values.await_all, self.requested.options)
+            self.spec = dataclasses.replace(self.requested, options=options)
+
+    def up(self, running: RunningMachine) -> None:
+        """Start the waiting processes: the machine is up."""
+        self.running = running
+        if not self.came_up.done():
+            self.came_up.set_result(True)
+        for instance in self.instances:
+            instance.is_up(running)
+        self._request(self._subscribe)
+        self._request(self._start_waiting)
+        self._changed()
+
+    def _request(self, function: Callable[[], Any]) -> None:
+        task = self._loop.create_task(function())
+        self.requests.add(task)
+        task.add_done_callback(self._answered)
+
+    def _answered(self, task: asyncio.Task[None]) -> None:
+        self.requests.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._fail(error)
+
+    async def _subscribe(self) -> None:
+        assert self.running is not None
+        async with self._order:
+            await self._in_thread(self.running.subscribe, self._backlog.put)
+
+    async def _start_waiting(self) -> None:
+        # one request for all, so that many nodes start at once
+        runs, self._waiting = self._waiting, []
+        if not runs or self.running is None:
+            return
+        without_arguments = [
+            run.node.name for run in runs if '--ros-args' not in run.node.arguments]
+        if self.names and without_arguments:
+            self._logger.warning(
+                f"{self.spec.name}: {', '.join(without_arguments)} takes no ROS arguments and so "
+                f"does not use the stream of {', '.join(self.names)}; if it is a ROS node that "
+                "uses the topic, add '--ros-args' to its command")
+        try:
+            async with self._order:
+                await self._in_thread(
+                    self.running.start,
+                    [streaming.remapped(run.node, self.names) for run in runs])
+        except FogError:
+            for run in runs:
+                run.end()
+            raise
+
+    async def _stop_collected(self) -> None:
+        runs, self._to_stop = self._to_stop, []
+        assert self.running is not None
+        try:
+            async with self._order:
+                await self._in_thread(self.running.stop, [run.node.id for run in runs])
+        except FogError as error:
+            self._logger.error(f'{self.spec.name}: {error}; its agent ends the nodes by itself')
+            for run in runs:
+                run.unreported()
+
+    async def _signal(self, run: Run, name: str) -> None:
+        assert self.running is not None
+        try:
+            async with self._order:
+                await self._in_thread(self.running.signal, run.node.id, name)
+        except FogError as error:
+            self._logger.error(f'{self.spec.name}: {name} not sent to {run.node.name}: {error}')
+
+    # -- events of the agent --------------------------------------------------------------------
+
+    def _dropped(self, count: int) -> None:
+        self._logger.warning(
+            f'{self.spec.name}: {count} lines of output were dropped: they came faster than the '
+            f"launch shows them; 'ros2 fog logs {self.spec.name}' has the latest")
+
+    def _on_event(self, event: Event) -> None:
+        run = self._runs.get(str(event.get('node', '')))
+        if run is not None:
+            if event['event'] == 'exited' and self._ending and not run.stopping:
+                self._held.append((run, event))
+                return
+            run.on_event(event)
+            if event['event'] == 'started':
+                self._changed()
+            return
+        if event['event'] == 'notice' or event['event'] == 'lost':
+            self._interrupted(event['event'] == 'lost', event['reason'] or 'no reason')
+            return
+        kind: str = event['event']
+        if event['event'] == 'connection':
+            kind = f"connection {event['state']}"
+        if kind in _NOTICES:
+            level, text = _NOTICES[kind]
+            text = text.format_map(event)
+            if event['event'] == 'launch_exited' and event['said']:
+                text += f": {event['said']}"
+            self._logger.log(level, f'{self.spec.name}: {text}')
+        if kind in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
+            self._ending = True
+            self._loop.call_later(_HOLD, self._release_exits)
+        elif kind in ('launch_exited', 'connection absent') and not self._ending:
+            self._end_unreported(
+                event['returncode'] if event['event'] == 'launch_exited' else _UNREPORTED)
+
+    def _interrupted(self, lost: bool, reason: str) -> None:
+        first = not self.interrupted
+        self.interrupted, self.lost = True, self.lost or lost
+        self._ending = False
+        if first:
+            self._preempted(self, reason)
+        elif lost:
+            self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
+            self.move_all()
+
+    def move_all(self) -> None:
+        """Move all of the machine's processes to the robot."""
+        ended = [run for run, _ in self._held]
+        self._held.clear()
+        for run in list(self._runs.values()):
+            run.move(stop=not self.lost and run not in ended)
+
+    def end_all(self) -> None:
+        """End all processes of a machine that is gone, for launch."""
+        for run in list(self._runs.values()):
+            run.end()
+
+    def _release_exits(self) -> None:
+        """Report the exits that were held back: the machine is not known to be gone."""
+        self._ending = False
+        held, self._held = self._held, []
+        for run, event in held:
+            run.on_event(event)
+
+    def _end_unreported(self, returncode: int) -> None:
+        for run in list(self._runs.values()):
+            if run in self._waiting:
+                continue
+            node = run.node
+            if run.started:
+                run.on_event({'event': 'exited', 'node': node.id, 'name': node.name,
+                              'returncode': returncode, 'respawns': False})
+            else:
+                run.on_event({'event': 'refused', 'node': node.id, 'name': node.name,
+                              'error': 'the launch on the machine ended', 'hint': ''})

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collect the streams of a launch, and remap the topics of nodes that use them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+import dataclasses
+from typing import Any, Optional, TYPE_CHECKING
+
+from fogros2.describe import values
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport import streams, topics
+from fogros2.image_transport.streams import Entry, StreamTopic
+from fogros2.image_transport.topics import absolute, rewrite
+from fogros2.model import NodeSpec, Stream, Text
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+
+
+_RULE = ('-r', '--remap')
+_NAMESPACE = '__ns:='
+
+
+def check(entries: Iterable[Entry]) -> None:
+    """
+    Check entries, as far as they are plain texts already.
+
+    :raises ConfigurationError: see :func:`fogros2.image_transport.streams.stream`.
+    """
+    for entry in entries:
+        parts = (entry.topic, entry.transport, entry.direction) \
+            if isinstance(entry, StreamTopic) else entry
+        if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
+            # no machine has the name '', so it cannot be the source
+            streams.stream(_named(entry, '/'), '')
+
+
+def resolve(
+    context: LaunchContext, entries: Iterable[Entry], namespace: str,
+    source: Callable[[Any], Optional[str]],
+) -> list[Entry]:
+    """
+    Resolve the substitutions of entries, and expand their topics to full names.
+
+    :param namespace: namespace of relative names.
+    :param source: returns the name of the machine that a source means, None for the robot.
+    """
+    found: list[Entry] = []
+    for entry in entries:
+        if isinstance(entry, tuple):
+            entry = tuple(values.resolve(context, part) for part in entry)
+        elif isinstance(entry, StreamTopic):
+            entry = StreamTopic(
+                values.resolve(context, entry.topic), values.resolve(context, entry.transport),
+                values.resolve(context, entry.direction),
+                source=source(entry.source), **{
+                    key: _parameter(context, value) for key, value in entry.parameters.items()})
+        found.append(_named(entry, namespace))
+    return found
+
+
+class Streams:
+    """The streams of a launch, and the nodes of them that were returned already."""
+
+    def __init__(self) -> None:
+        self._streams: list[Stream] = []
+        self._handed_out: set[str] = set()
+
+    def add(self, entries: Iterable[Entry], machine: str) -> list[tuple[Optional[str], NodeSpec]]:
+        """
+        Add streams to and from ``machine``.
+
+        :return: the nodes that these streams need and no earlier stream did, each with the machine
+            that it runs on, None for the robot.
+        :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or images would
+            return to their source, or reach a host in two ways. Nothing is added then.
+        """
+        several = list(self._streams)
+        for entry in entries:
+            one = streams.stream(entry, machine)
+            if one not in several:
+                for other in several:
+                    _compare(one, other)
+                several.append(one)
+        streams.nodes(several)  # raises if a transport refuses them
+        self._streams = several
+        return self._not_handed_out()
+
+    def take_over(
+        self, machine: str,
+    ) -> tuple[list[str], list[tuple[Optional[str], NodeSpec]], list[str]]:
+        """
+        Replace a machine by the robot in all streams, because its nodes move there.
+
+        Streams between the two end. Streams between the machine and another machine become streams
+        between the robot and that machine.
+
+        :return: ids of nodes on other hosts that are no longer needed; new nodes, as from ``add``;
+            topics that cannot move, because the robot already streams them in another way.
+        """
+        before = self._nodes_elsewhere(machine)
+        several = [one for one in self._streams if machine not in (one.source, one.target)]
+        left: list[str] = []
+        for one in self._streams:
+            ends = {host for host in (one.source, one.target) if host != machine}
+            if len(ends) == 2 or ends == {None}:
+                continue  # another machine's stream, or one that ends
+            # keep the camera info's route: other nodes already use its name
+            moved = dataclasses.replace(
+                one, source=None if one.source == machine else one.source,
+                target=None if one.target == machine else one.target,
+                options={**one.options, 'camera_info': topics.carries_info(one)})
+            try:
+                for other in several:
+                    _compare(moved, other)
+                streams.nodes([*several, moved])
+            except ConfigurationError:
+                left.append(one.topic)
+            else:
+                several.append(moved)
+        self._streams = several
+        ended = sorted(before - self._nodes_elsewhere(machine))
+        self._handed_out -= set(ended)
+        return ended, self._not_handed_out(), left
+
+    def _not_handed_out(self) -> list[tuple[Optional[str], NodeSpec]]:
+        """Return nodes that are needed and were not returned before; remember them as returned."""
+        new = [(machine, spec) for machine, specs in streams.nodes(self._streams).items()
+               for spec in specs if spec.id not in self._handed_out]
+        self._handed_out |= {spec.id for _, spec in new}
+        return new
+
+    def _nodes_elsewhere(self, machine: str) -> set[str]:
+        return {spec.id for host, specs in streams.nodes(self._streams).items()
+                if host != machine for spec in specs}
+
+    def remappings(self, machine: str) -> dict[str, str]:
+        """Return the new names of streamed topics for nodes on a machine."""
+        return streams.remappings(self._streams, machine)
+
+
+def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
+    """
+    Rename topics for a process, even if it remaps them itself.
+
+    A program without ROS arguments is returned unchanged.
+
+    :param names: new topic names by full old names.
+    """
+    arguments = node.arguments
+    if not names or '--ros-args' not in arguments:
+        return node
+    indices: list[int] = []
+    namespace = '/'
+    ours = False
+    for index, argument in enumerate(arguments):
+        if argument in ('--ros-args', '--'):
+            ours = argument == '--ros-args'
+        elif ours and isinstance(argument, str) and ':=' in argument and index and (
+                arguments[index - 1] in _RULE):
+            if argument.startswith(_NAMESPACE):
+                namespace = argument[len(_NAMESPACE):]
+            elif not argument.startswith('__') and ':__' not in argument.partition(':=')[0]:
+                indices.append(index)
+    pairs: list[tuple[str, str]] = []
+    for index in indices:
+        rule = arguments[index]
+        assert isinstance(rule, str)
+        old, _, new = rule.partition(':=')
+        pairs.append((old, new))
+    rules = [f'{old}:={new}' for old, new in rewrite(pairs, names, namespace)]
+    rewritten: list[Text] = list(arguments)
+    for index, rule in zip(indices, rules):
+        rewritten[index] = rule
+    more = [argument for rule in rules[len(indices):] for argument in ('-r', rule)]
+    return dataclasses.replace(
+        node, arguments=(*rewritten, *(('--ros-args', *more) if more else ())))
+
+
+def _compare(one: Stream, other: Stream) -> None:
+    if one.topic != other.topic:
+        return
+    for host, end in ((one.source, other.target), (one.target, other.source)):
+        if host == end:
+            raise ConfigurationError(
+                f'{one.topic} is streamed both from {_host(host)} and to it',
+                'what comes in under that name would go out again: rename one of the two')
+    if (one.source, one.target) == (other.source, other.target) and (
+            one.transport != other.transport or one.options != other.options):
+        raise ConfigurationError(
+            f'{one.topic} is streamed to {_host(one.target)} twice, in different ways',
+            'use one transport with one set of parameters')
+
+
+def _host(machine: Optional[str]) -> str:
+    return 'the robot' if machine is None else f"'{machine}'"
+
+
+def _named(entry: Any, namespace: str) -> Any:
+    """Return an entry with its topic's full name; return an invalid entry unchanged."""
+    if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], str) and entry[0]:
+        return (absolute(entry[0], namespace), entry[1])
+    if isinstance(entry, StreamTopic) and isinstance(entry.topic, str) and entry.topic:
+        return _with_topic(entry, absolute(entry.topic, namespace))
+    return entry
+
+
+def _with_topic(entry: StreamTopic, topic: str) -> StreamTopic:
+    return StreamTopic(
+        topic, entry.transport, entry.direction, source=entry.source, **entry.parameters)
+
+
+def to_robot(entry: StreamTopic) -> StreamTopic:
+    """Turn a stream from another machine to this machine into a stream to the robot."""
+    return StreamTopic(entry.topic, entry.transport, 'to_robot', **entry.parameters)
+
+
+def from_robot(entry: Entry, away: Iterable[str]) -> Entry:
+    """Return a stream with the robot as its source, if its source is a preempted machine."""
+    if not isinstance(entry, StreamTopic) or entry.source not in away:
+        return entry
+    # the same form as a stream that ``take_over`` has moved
+    return StreamTopic(entry.topic, entry.transport, entry.direction, **{
+        'camera_info': False, **entry.parameters})
+
+
+def _parameter(context: LaunchContext, value: Any) -> Any:
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    text = values.resolve(context, value)
+    if not isinstance(text, str):
+        return text
+    # a substitution turns every value into a text; YAML finds its type, as in a parameter file
+    import yaml
+    typed = yaml.safe_load(text)
+    return typed if isinstance(typed, (bool, int, float)) else text

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A launch finds image topics that cross the VPN uncompressed, in the graph of real nodes."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import pytest
+
+from fogros2.runtime import uncompressed
+
+rclpy = pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is here')
+
+
+def test_image_topic_between_two_hosts_is_found() -> None:
+    from sensor_msgs.msg import Image
+
+    context = rclpy.context.Context()
+    rclpy.init(context=context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+    camera, slam = (rclpy.create_node(name, context=context) for name in ('camera', 'slam'))
+    camera.create_publisher(Image, '/camera/image_raw', 1)
+    slam.create_subscription(Image, '/camera/image_raw', lambda _: None, 1)
+    try:
+        found = uncompressed.crossing_images(
+            {'planner': ['slam']}, os.environ, threading.Event())
+        assert found == ['/camera/image_raw']
+        assert uncompressed.crossing_images({}, os.environ, threading.Event()) == []
+    finally:
+        camera.destroy_node()
+        slam.destroy_node()
+        rclpy.shutdown(context=context)

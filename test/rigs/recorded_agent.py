@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the agent of commit 326363e wrote and answered, recorded from a run of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parents[1] / 'unit' / 'agent_326363e'
+
+
+def events() -> list[dict[str, Any]]:
+    """Return its events: at least one of each kind."""
+    return [json.loads(line) for line in (FOLDER / 'events.jsonl').read_text().splitlines()]
+
+
+def answers() -> list[tuple[str, dict[str, Any]]]:
+    """Return its answers, each after the command."""
+    found = map(json.loads, (FOLDER / 'answers.jsonl').read_text().splitlines())
+    return [(one['command'], one['answer']) for one in found]
+
+
+def answer(command: str, **changes: Any) -> dict[str, Any]:
+    """Return an answer to a command, with changes."""
+    return {**next(said for asked, said in answers() if asked == command), **changes}

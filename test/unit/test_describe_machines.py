@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines as launch files write them: plain values, substitutions, mistakes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from fogros2.describe.machines import (
+    CloudInstance,
+    ContainerInstance,
+    parse_duration,
+    SSHInstance,
+)
+from fogros2.errors import ConfigurationError
+from fogros2.host.workspace import find_workspaces
+
+
+@pytest.fixture
+def context():
+    from launch import LaunchContext
+    return LaunchContext()
+
+
+def test_defaults(context):
+    spec = ContainerInstance(name='planner', ros_workspace='').spec(context)
+    assert (spec.name, spec.provider, spec.workspace) == ('planner', 'container', None)
+    assert (spec.on_exit, spec.lifetime, spec.robot_timeout) == ('delete', 8 * 3600, 120)
+    assert (spec.bootstrap, spec.options, spec.environment) == ('auto', {}, {})
+
+
+def test_everything_that_a_container_takes(context):
+    machine = ContainerInstance(
+        ros_workspace='/robot/ws', launch_foxglove=True, name='planner',
+        on_exit='keep', lifetime='1h30m', robot_timeout=30, bootstrap='none',
+        environment={'A': '1'}, image='ros:jazzy',
+        engine='docker', network='net', ip='198.51.100.7', cpus=1.5, memory='2g',
+        ports=['8080:80'], mounts=['/a:/b'], user='me',
+        gpus='all', devices=['/dev/video0'], containers=True, isolated='true')
+    machine.add_docker_container('docker run hello-world')
+    spec = machine.spec(context)
+    assert spec.options == {
+        'image': 'ros:jazzy', 'engine': 'docker', 'network': 'net', 'ip': '198.51.100.7',
+        'cpus': 1.5, 'memory': '2g', 'ports': ['8080:80'], 'mounts': ['/a:/b'], 'user': 'me',
+        'gpus': 'all', 'devices': ['/dev/video0'], 'containers': True, 'isolated': True}
+    assert (spec.workspace, spec.on_exit, spec.lifetime) == ('/robot/ws', 'keep', 5400)
+    assert (spec.robot_timeout, spec.bootstrap, spec.environment) == (30, 'none', {'A': '1'})
+    assert spec.launch_foxglove and spec.containers == ('docker run hello-world',)
+
+
+def test_ssh(context):
+    spec = SSHInstance('host.example', 'me', 2222, '~/.ssh/k', 'ssh-ed25519 AAAA',
+                       name='lab', ros_workspace='').spec(context)
+    assert spec.provider == 'ssh'
+    assert spec.options == {
+        'host': 'host.example', 'user': 'me', 'port': 2222, 'key': '~/.ssh/k',
+        'host_key': 'ssh-ed25519 AAAA'}
+
+
+def test_substitutions_are_resolved_when_executed(context):
+    from launch.substitutions import LaunchConfiguration
+    context.launch_configurations.update(
+        name='slam', memory='4g', cpus='2', exit='stop', life='2h', w='/w')
+    machine = ContainerInstance(
+        ros_workspace=LaunchConfiguration('w'), name=[LaunchConfiguration('name'), '-1'],
+        memory=LaunchConfiguration('memory'), cpus=LaunchConfiguration('cpus'),
+        on_exit=LaunchConfiguration('exit'),
+        lifetime=LaunchConfiguration('life'), mounts=[['/', LaunchConfiguration('name'), ':/x']],
+        environment={'NAME': LaunchConfiguration('name')})
+    assert 'name' in machine.name
+    spec = machine.spec(context)
+    assert (spec.name, machine.name, spec.on_exit, spec.lifetime) == (
+        'slam-1', 'slam-1', 'stop', 7200)
+    assert spec.options == {'memory': '4g', 'cpus': 2.0, 'mounts': ['/slam:/x']}
+    assert spec.environment == {'NAME': 'slam'} and spec.workspace == '/w'
+    # once: a machine doesn't change when the configuration does
+    context.launch_configurations['name'] = 'other'
+    assert machine.spec(context) is spec
+
+
+@pytest.mark.parametrize(('make', 'message'), [
+    (lambda: ContainerInstance(imge='x'),
+     "ContainerInstance has no attribute 'imge' (did you mean 'image'?)"),
+    (lambda: ContainerInstance(lifetme=3), "did you mean 'lifetime'?"),
+    (lambda: SSHInstance('host', hostkey='k'), "did you mean 'host_key'?"),
+    (lambda: ContainerInstance(zzz=1), 'there are: apt, bootstrap, containers, cpus'),
+    (lambda: ContainerInstance(name='two words'), "'two words' is no name for a machine"),
+    (lambda: ContainerInstance(name='$(reboot)'), 'is no name for a machine'),
+    (lambda: ContainerInstance(name='x' * 41), 'is no name for a machine'),
+    (lambda: ContainerInstance(name=''), 'is no name for a machine'),
+    (lambda: ContainerInstance(on_exit='delet'), "did you mean 'delete'?"),
+    (lambda: ContainerInstance(bootstrap='pip'), 'use one of auto, apt, embedded, none'),
+    (lambda: ContainerInstance(on_exit='keep'), "a machine with on_exit='keep' needs a name"),
+    (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
+    (lambda: ContainerInstance(robot_timeout=0), 'is no duration'),
+    (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
+    (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
+    (lambda: ContainerInstance(apt=['libzbar0 -y']), 'no name of a Debian package'),
+    (lambda: ContainerInstance(pip=['fogros2']), "'fogros2' is part of FogROS2"),
+    (lambda: ContainerInstance().apt_install('--yes x'), 'no name of a Debian package'),
+    (lambda: ContainerInstance().pip_install('-r all.txt'), 'names no Python package'),
+])
+def test_mistakes_are_found_where_they_are_written(make, message):
+    with pytest.raises(ConfigurationError) as caught:
+        make()
+    assert message in str(caught.value)
+
+
+def test_packages_of_fogros2s_methods_are_the_keywords(context):
+    from launch.substitutions import TextSubstitution
+    machine = ContainerInstance(
+        apt=['libzbar0', TextSubstitution(text='g++')], pip=['pyzbar>=0.1'])
+    machine.apt_install('ffmpeg libzbar0')
+    machine.pip_install("'qrcode>=7,<8' pyzbar")
+    spec = machine.spec(context)
+    assert spec.apt == ('libzbar0', 'g++', 'ffmpeg')
+    assert spec.pip == ('pyzbar>=0.1', 'qrcode>=7,<8', 'pyzbar')
+
+
+def test_mistakes_in_substitutions(context):
+    from launch.substitutions import LaunchConfiguration
+    context.launch_configurations['x'] = 'no such thing'
+    context.launch_configurations['keep'] = 'keep'
+    for arguments in ({'on_exit': LaunchConfiguration('keep')},
+                      {'cpus': LaunchConfiguration('x')},
+                      {'name': LaunchConfiguration('x')},
+                      {'on_exit': LaunchConfiguration('x')},
+                      {'lifetime': LaunchConfiguration('x')}):
+        with pytest.raises(ConfigurationError):
+            ContainerInstance(**arguments).spec(context)
+
+
+@pytest.mark.parametrize(('value', 'seconds'), [
+    (90, 90), (0.5, 0.5), ('90', 90), ('8h', 28800), ('1h30m', 5400), ('2d', 172800),
+    ('1.5h', 5400), ('45 s', 45),
+])
+def test_durations_have_at_most_two_units(value, seconds):
+    assert parse_duration('lifetime', value) == seconds
+
+
+@pytest.mark.parametrize('value', ['', 'h', '-1', '0', 'inf', '8 hours', 'nan', -3])
+def test_no_durations(value):
+    with pytest.raises(ConfigurationError):
+        parse_duration('lifetime', value)
+
+
+def test_names_of_their_own_differ():
+    names = {ContainerInstance().name for _ in range(50)}
+    assert len(names) == 50
+
+
+def test_a_provider_of_somebody_elses(context):
+    class Mine(CloudInstance):
+        provider = 'mine'
+
+        def __init__(self, zone, **common):
+            super().__init__(options={'zone': zone}, **common)
+
+    assert Mine('b', name='m', ros_workspace='').spec(context).options == {'zone': 'b'}
+    with pytest.raises(ConfigurationError, match="did you mean 'zone'"):
+        Mine('b', zon=1)
+
+
+@pytest.mark.parametrize('isolated', [False, True])
+@pytest.mark.parametrize('variable', ['COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'])
+def test_the_workspace_is_found(tmp_path, variable, isolated):
+    install = tmp_path / 'ws/install'
+    (install / 'demo').mkdir(parents=True)
+    (install / '.colcon_install_layout').write_text('isolated\n')
+    first = install / 'demo' if isolated else install
+    environment = {variable: f'{first}{os.pathsep}/opt/ros/jazzy'}
+    # an installed distribution may have the marker, but no sources beside it
+    assert find_workspaces(environment) == []
+    (tmp_path / 'ws/src').mkdir()
+    assert find_workspaces(environment) == [str(tmp_path / 'ws')]
+    assert find_workspaces({}) == []
+    # ROS 2 that was built from source is the system, not a workspace
+    (first.parent / 'ros_environment' if isolated else install).joinpath(
+        'share/ros_environment').mkdir(parents=True)
+    assert find_workspaces(environment) == []
+
+
+def test_info(context):
+    machine = ContainerInstance(
+        ros_workspace='/ws', working_dir_base='there', name='planner')
+    assert machine.info() == {
+        'name': 'planner', 'cloud_service_provider': 'container', 'ros_workspace': '/ws',
+        'working_dir': 'there', 'ssh_key_path': None, 'public_ip': None, 'vpn_ip': None}
+    assert machine.info(flush_to_disk=True)['name'] == 'planner'
+
+
+def test_importing_fogros2_loads_nothing():
+    """Machines can be written down without launch, SSH or YAML."""
+    code = (
+        'import sys; before = set(sys.modules); import fogros2; '
+        'from fogros2 import ContainerInstance, SSHInstance, CloudInstance, FogError; '
+        'ContainerInstance(); dir(fogros2); '
+        "print([m for m in sys.modules if m.split('.')[0] in "
+        "('launch', 'launch_ros', 'rclpy', 'paramiko', 'boto3', 'yaml')])")
+    result = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True,
+        cwd=Path(__file__).parents[2])
+    assert result.stdout.strip() == '[]'
+
+
+def test_public_names():
+    import fogros2
+    assert set(fogros2.__all__) <= set(dir(fogros2))
+    with pytest.raises(AttributeError, match='no attribute'):
+        assert fogros2.CludNode

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events and answers: what passes the check, and what an agent of commit 326363e sends."""
+
+from __future__ import annotations
+
+import json
+import typing
+
+import pytest
+
+from fogros2 import events
+from fogros2.agent import server
+from fogros2.agent.journal import Journal
+from rigs import recorded_agent
+
+
+def test_events_of_the_first_agent_are_valid():
+    recorded = recorded_agent.events()
+    assert [events.event(event) for event in recorded] == recorded
+    kinds = {typing.get_args(typing.get_type_hints(kind)['event'])[0]
+             for kind in typing.get_args(events.AgentEvent)}
+    assert {event['event'] for event in recorded} == kinds
+
+
+@pytest.mark.parametrize(('command', 'answer'), recorded_agent.answers())
+def test_answers_of_the_first_agent_are_valid(command, answer):
+    assert events.answer(command, answer) == answer
+
+
+def test_heartbeat_of_the_first_agent_is_valid():
+    """It returned the datagram as it was, without its clock."""
+    assert events.heartbeat({'launch': 'abc', 'n': 1, 't': 5.5})['t'] == 5.5
+
+
+def test_journal_of_the_first_agent_is_continued(tmp_path):
+    data = (recorded_agent.FOLDER / 'events.jsonl').read_bytes()
+    (tmp_path / 'events.jsonl').write_bytes(data)
+    journal = Journal(str(tmp_path), 1 << 20)
+    assert (journal.first, journal.next) == (1, 19)
+    assert json.loads(journal.read(journal.find(18))[0])['event'] == 'end_failed'
+    journal.append([b'"event":"ending","reason":"x"}\n'])
+    assert journal.read(0)[0].startswith(data) and journal.next == 20
+
+
+def test_agent_resumes_the_settings_of_the_first_agent(tmp_path):
+    (tmp_path / 'agent').mkdir()
+    saved = json.loads((recorded_agent.FOLDER / 'config.json').read_text())
+    (tmp_path / 'agent' / 'config.json').write_text(json.dumps(saved))
+    agent = server.Agent({
+        'machine': 'planner', 'launch': 'first', 'directory': str(tmp_path / 'agent')})
+    agent.open()
+    assert {key: agent.config[key] for key in server.RESUMED} == {
+        key: saved[key] for key in server.RESUMED}
+
+
+@pytest.mark.parametrize('value', [0, -1, 2 ** 53])
+def test_number_in_range_is_valid(value):
+    assert events.event({'event': 'end_failed', 'returncode': value})
+
+
+@pytest.mark.parametrize(('value', 'text'), [
+    (2 ** 53 + 1, 'a number out of range'), (float('nan'), 'a number out of range'),
+    (float('-inf'), 'a number out of range'), (1.5, 'float'), (True, 'bool'), (None, 'NoneType')])
+def test_invalid_number_is_named(value, text):
+    with pytest.raises(events.InvalidMessage) as caught:
+        events.event({'event': 'end_failed', 'returncode': value})
+    assert str(caught.value) == f"field 'returncode': expected int, got {text}"
+
+
+def test_field_inside_a_list_is_named():
+    status = recorded_agent.answer('status')
+    status['nodes'] = [{**status['nodes'][0], 'restarts': 'x'}]
+    with pytest.raises(events.InvalidMessage, match="field 'nodes.restarts': expected int"):
+        events.answer('status', status)
+    status['nodes'] = 7
+    with pytest.raises(events.InvalidMessage, match="field 'nodes': expected list, got int"):
+        events.answer('status', status)
+
+
+def test_missing_field_is_named():
+    with pytest.raises(events.InvalidMessage, match="field 'hint' is missing"):
+        events.event({'event': 'refused', 'node': 'n', 'name': 'n', 'error': 'x'})
+
+
+def test_events_and_fields_of_a_newer_agent_are_ignored():
+    assert events.event({'event': 'unheard of', 'seq': 3}) is None
+    assert events.event({'event': 'ending', 'reason': 'x', 'new': [{}]}) is not None

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each private part of launch that is used is there, and does what it is used for."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import inspect
+from pathlib import Path
+
+from launch import LaunchContext, LaunchService
+from launch.actions import ExecuteLocal, ExecuteProcess, TimerAction
+from launch.utilities import AsyncSafeSignalManager
+import pytest
+
+from fogros2.launch_internals import components, private
+
+
+def test_methods():
+    assert inspect.iscoroutinefunction(getattr(ExecuteLocal, private.EXECUTE_PROCESS))
+    assert inspect.iscoroutinefunction(getattr(TimerAction, private.WAIT_TO_FIRE))
+    assert list(inspect.signature(ExecuteLocal._shutdown_process).parameters) == [
+        'self', 'context', 'send_sigint']
+
+
+def test_options():
+    action = ExecuteProcess(
+        cmd=['true'], respawn=True, respawn_delay=2.0, respawn_max_retries=3, log_cmd=True)
+    action.prepare(LaunchContext())
+    names = ('respawn', 'respawn_delay', 'respawn_max_retries', 'log_cmd')
+    assert [private.option(action, name) for name in names] == [True, 2.0, 3, True]
+    assert private.transport(action) is None
+
+
+def test_completed():
+    loop = asyncio.new_event_loop()
+    context = LaunchContext()
+    context._set_asyncio_loop(loop)
+    action = ExecuteProcess(cmd=['true'])
+    assert private.completed(action) is None
+    setattr(action, private.EXECUTE_PROCESS, _do_nothing)
+    action.execute(context)
+    assert private.completed(action) is action.get_asyncio_future() is not None
+    loop.run_until_complete(asyncio.gather(*asyncio.all_tasks(loop)))
+    loop.close()
+
+
+async def _do_nothing(context: LaunchContext) -> None:
+    """Start no process."""
+
+
+def test_output_format():
+    action = ExecuteProcess(cmd=['true'])
+    private.prefix_output(action, 'planner')
+    assert vars(action)['_ExecuteLocal__output_format'] == (
+        '[planner.{this.process_description.final_name}] {line}')
+
+
+@pytest.mark.parametrize('begins', [True, False])
+def test_delayed_process_starts_only_if_allowed(begins):
+    loop = asyncio.new_event_loop()
+    context = LaunchContext()
+    context._set_asyncio_loop(loop)
+    action = ExecuteProcess(cmd=['true'])
+    started = []
+
+    async def start(context):
+        started.append(context)
+
+    async def until():
+        return begins
+
+    setattr(action, private.EXECUTE_PROCESS, start)
+    private.delay_start(action, until)
+    action.execute(context)
+    loop.run_until_complete(asyncio.gather(*asyncio.all_tasks(loop)))
+    assert (bool(started), private.completed(action).done()) == (begins, not begins)
+    loop.close()
+
+
+def test_methods_that_are_replaced_exist():
+    assert hasattr(ExecuteProcess, private.EXECUTE_PROCESS)
+    assert hasattr(TimerAction, private.WAIT_TO_FIRE)
+
+
+def test_kept_environments():
+    context = LaunchContext()
+    before = len(private.kept_environments(context))
+    assert before >= 1  # what ResetEnvironment returns to
+    context._push_environment()
+    assert len(private.kept_environments(context)) == before + 1
+    context._pop_environment()
+
+
+def test_the_signal_manager():
+    assert private.signal_manager() is None
+    loop = asyncio.new_event_loop()
+    with AsyncSafeSignalManager(loop) as manager:
+        assert private.signal_manager() is manager
+    assert private.signal_manager() is None
+    loop.close()
+
+
+def test_handlers_of_the_context_can_be_gone_through():
+    context = LaunchService().context
+    assert len(tuple(context._event_handlers)) >= 2
+
+
+def test_remappings_of_components():
+    pytest.importorskip('launch_ros', reason='launch_ros is not installed')
+    from launch_ros.actions import LoadComposableNodes
+    from launch_ros.descriptions import ComposableNode
+    node = ComposableNode(package='demo', plugin='demo::View', remappings=[('a', 'b')])
+    load = LoadComposableNodes(target_container='/box', composable_node_descriptions=[node])
+    assert components.of(load) == [node]
+    before = node.remappings
+    components.set_remappings(node, None)
+    assert node.remappings is None
+    components.set_remappings(node, before)
+    assert node.remappings is before
+
+
+def test_other_packages_use_no_private_parts():
+    objects = (LaunchContext(), ExecuteProcess(cmd=['true']), TimerAction(period=1.0, actions=[]))
+    parts = {name for thing in objects for name in dir(thing)
+             if name.startswith('_') and not name.startswith('__')}
+    fogros2 = Path(private.__file__).parents[1]
+    for path in fogros2.rglob('*.py'):
+        if path.parent.name != 'launch_internals':
+            used = {getattr(node, 'attr', None) or getattr(node, 'name', None)
+                    for node in ast.walk(ast.parse(path.read_text()))} & parts
+            # a class may have private parts of its own
+            assert not {name for name in used if f'self.{name}' not in path.read_text()}, path

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Remappings of nodes whose topics are streamed, and streams that contradict each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+pytest.importorskip('launch', reason='neither ROS 2 nor the embedded default is installed')
+from launch import LaunchContext
+from launch.substitutions import LaunchConfiguration
+
+from fogros2 import plugin_system, StreamTopic
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.compressed import Compressed
+from fogros2.image_transport.h264 import H264
+from fogros2.model import NodeSpec
+from fogros2.runtime import streaming
+
+PLUGINS: dict[str, Any] = {'h264': H264, 'compressed': Compressed}
+NAMES = {'/camera': '/fogros2/m/camera', '/arm/camera': '/fogros2/m/arm/camera'}
+OURS = ('--ros-args', '-r', '/camera:=/fogros2/m/camera',
+        '-r', '/arm/camera:=/fogros2/m/arm/camera')
+
+
+@pytest.fixture(autouse=True)
+def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let two transports be installed, whatever this environment has."""
+    monkeypatch.setattr(plugin_system, 'names', lambda group: sorted(PLUGINS))
+    monkeypatch.setattr(plugin_system, 'load', lambda group, name: PLUGINS[name])
+
+
+def remapped(*arguments: Any) -> tuple[Any, ...]:
+    node = NodeSpec('id', 'name', 'p', 'e', arguments)
+    result = streaming.remapped(node, NAMES)
+    assert dataclasses.replace(result, arguments=arguments) == node
+    return result.arguments
+
+
+def test_topics_of_their_own_name() -> None:
+    assert remapped('--ros-args') == ('--ros-args', *OURS)
+
+
+def test_programs_that_are_no_nodes() -> None:
+    for arguments in ((), ('sleep', '60'), ('-r', 'image:=/camera')):
+        assert remapped(*arguments) == arguments
+
+
+def test_what_the_user_remapped_is_rewritten_in_its_place() -> None:
+    assert remapped('--ros-args', '-r', 'image:=/camera', '--remap', 'x:=/y') == (
+        '--ros-args', '-r', 'image:=/fogros2/m/camera', '--remap', 'x:=/y', *OURS)
+
+
+def test_relative_names_are_in_the_node_s_namespace() -> None:
+    assert remapped('--ros-args', '-r', '__ns:=/arm', '-r', 'image:=camera', '-r', 'x:=/camera') \
+        == ('--ros-args', '-r', '__ns:=/arm', '-r', 'image:=/fogros2/m/arm/camera',
+            '-r', 'x:=/fogros2/m/camera', *OURS)
+    # the namespace counts wherever it stands
+    assert remapped('--ros-args', '-r', 'image:=camera', '-r', '__ns:=/arm')[2] == (
+        'image:=/fogros2/m/arm/camera')
+
+
+def test_a_topic_that_the_node_calls_otherwise_already_stays_so() -> None:
+    assert remapped('--ros-args', '-r', '/camera:=/other') == (
+        '--ros-args', '-r', '/camera:=/other', '--ros-args', '-r',
+        '/arm/camera:=/fogros2/m/arm/camera')
+    assert remapped('--ros-args', '-r', '__ns:=/arm', '-r', 'camera:=/other')[-1] == (
+        '/camera:=/fogros2/m/camera')
+
+
+def test_what_is_no_remapping_stays() -> None:
+    words = ('-r', 'a:=/camera', '--ros-args', '-r', '__node:=camera', '-p', 'topic:=/camera',
+             '--params-file', ({'file': '0-x.yaml'},), '--', '-r', 'b:=/camera')
+    assert remapped(*words) == (*words, *OURS)
+
+
+def test_a_rule_for_one_node_of_several() -> None:
+    assert remapped('--ros-args', '-r', 'one:image:=/camera')[2] == (
+        'one:image:=/fogros2/m/camera')
+
+
+def test_nodes_are_handed_out_once() -> None:
+    streams = streaming.Streams()
+    names = [(machine, spec.name) for machine, spec in streams.add([('/camera', 'h264')], 'a')]
+    assert names == [(None, 'camera_h264_encoder'), ('a', 'camera_h264_decoder')]
+    assert streams.add([('/camera', 'h264')], 'a') == []
+    assert [(machine, spec.name) for machine, spec in streams.add([('/camera', 'h264')], 'b')] == [
+        ('b', 'camera_h264_decoder')]
+    assert streams.remappings('b') == {
+        '/camera': '/fogros2/b/camera', '/camera_info': '/fogros2/b/camera_info'}
+    assert streams.remappings('c') == {}
+
+
+@pytest.mark.parametrize(('first', 'second', 'machine', 'said'), [
+    (('/a', 'h264'), StreamTopic('/a', 'h264', 'to_robot'), 'one', "from 'one' and to it"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', 'to_robot'), 'two', 'from the robot and to it'),
+    (StreamTopic('/a', source='two'), StreamTopic('/a', source='one'), 'two',
+     "from 'one' and to it"),
+    (('/a', 'h264'), ('/a', 'compressed'), 'one', "to 'one' twice"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'one', "to 'one' twice"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'two', 'different parameters')])
+def test_streams_that_contradict_each_other(
+    first: Any, second: Any, machine: str, said: str,
+) -> None:
+    streams = streaming.Streams()
+    streams.add([first], 'one')
+    with pytest.raises(ConfigurationError, match=said):
+        streams.add([second], machine)
+    # the wrong one isn't there now
+    assert len(streams.add([('/b', 'h264')], 'two')) == 2
+
+
+def test_the_robot_stands_for_a_machine_that_is_taken_away() -> None:
+    streams = streaming.Streams()
+    streams.add([('/a', 'h264'), StreamTopic('/back', 'h264', 'to_robot'),
+                 StreamTopic('/map', 'h264', source='other', camera_info=True)], 'gone')
+    streams.add([('/a', 'h264'), StreamTopic('/seen', 'h264', source='gone')], 'other')
+    before = streams.remappings('other')
+    ended, new, left = streams.take_over('gone')
+    # /a goes to the other one as before, /map is encoded there as before
+    assert ended == ['other/seen_h264_decoder_from_gone', 'robot/back_h264_decoder_from_gone']
+    assert sorted((str(machine), spec.id) for machine, spec in new) == [
+        ('None', 'robot/map_h264_decoder_from_other'), ('None', 'robot/seen_h264_encoder'),
+        ('other', 'other/seen_h264_decoder')]
+    assert left == [] and streams.remappings('other') == before
+    # of camera info as before, too: the other's nodes have one name for it, and no new one
+    words = {spec.id: spec.arguments for _, spec in new}
+    assert 'camera_info:=true' in words['robot/map_h264_decoder_from_other']
+    assert 'camera_info:=false' in words['other/seen_h264_decoder']
+    assert streams.take_over('gone') == ([], [], [])
+    # its name has no stream left, so another launch of it would begin anew
+    assert streams.remappings('gone') == {}
+
+
+def test_stream_with_another_transport_is_not_reused() -> None:
+    streams = streaming.Streams()
+    streams.add([StreamTopic('/a', 'h264', source='gone')], 'other')
+    streams.add([StreamTopic('/a', 'h264', bitrate=1_000_000)], 'third')
+    ended, new, left = streams.take_over('gone')
+    assert (ended, new, left) == (['other/a_h264_decoder_from_gone'], [], ['/a'])
+
+
+def test_entries_are_resolved_when_executed() -> None:
+    context = LaunchContext()
+    context.launch_configurations.update(topic='camera', rate='1000000', transport='h264')
+    entries = [
+        (LaunchConfiguration('topic'), LaunchConfiguration('transport')),
+        StreamTopic('/b', LaunchConfiguration('transport'),  # type: ignore[arg-type]
+                    bitrate=LaunchConfiguration('rate'), lossless=True, preset='fast')]
+    streaming.check(entries)  # type: ignore[arg-type]
+    assert streaming.resolve(context, entries, '/arm', lambda _: None) == [  # type: ignore[arg-type]
+        ('/arm/camera', 'h264'),
+        StreamTopic('/b', 'h264', bitrate=1_000_000, lossless=True, preset='fast')]
+
+
+@pytest.mark.parametrize('entry', ['/camera', ('/camera',), ('/camera', 'vhs'), ('/a b', 'h264'),
+                                   StreamTopic('/camera', 'h264', 'up')])  # type: ignore
+def test_plain_nonsense_is_found_at_once(entry: Any) -> None:
+    with pytest.raises(ConfigurationError):
+        streaming.check([entry])

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nearest region, over a network that a test makes up, and over sockets of the loopback."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+
+import pytest
+
+from fogros2.errors import PrerequisiteError, ProviderError
+from fogros2.provider.aws.regions import api_host, REGIONS
+from fogros2.provider.offers import Region
+from fogros2.provider.vm import regions
+
+AWS = regions.Regions('AWS', REGIONS, api_host)
+
+
+def connector(seconds: dict[str, list[float]]) -> regions.Connector:
+    """Return one that takes these times for each region in turn; inf is no connection."""
+    left = {api_host(name): list(times) for name, times in seconds.items()}
+
+    def connect(host: str, port: int, timeout: float) -> float:
+        assert port == 443
+        took = left[host].pop(0) if left.get(host) else math.inf
+        if took > timeout:
+            raise TimeoutError('timed out')
+        return took
+
+    return connect
+
+
+def test_the_median_decides_and_not_the_mean_nor_the_best() -> None:
+    found = AWS.measure(['us-west-1', 'us-west-2', 'eu-west-1'], connect=connector({
+        'us-west-1': [0.010, 0.040, 0.041], 'us-west-2': [0.020, 0.021, 1.9],
+        'eu-west-1': [0.150, 0.150, 0.150]}))
+    assert [(one.region, round(one.milliseconds or 0)) for one in found] == [
+        ('us-west-2', 21), ('us-west-1', 40), ('eu-west-1', 150)]
+    assert found[0].place == 'Oregon'
+
+
+def test_regions_that_do_not_answer_come_last() -> None:
+    found = AWS.measure(['us-west-1', 'us-west-2', 'sa-east-1'], connect=connector({
+        'us-west-1': [5.0], 'us-west-2': [0.3, 3.0], 'sa-east-1': [0.2, 0.2, 0.2]}))
+    assert [(one.region, one.milliseconds) for one in found] == [
+        ('sa-east-1', 200.0), ('us-west-2', 300.0), ('us-west-1', None)]
+
+
+def test_a_region_that_hangs_holds_nobody_up() -> None:
+    over = threading.Event()
+
+    def connect(host: str, port: int, timeout: float) -> float:
+        if 'us-east-1' in host:
+            over.wait(30)
+        return 0.05
+
+    begin = time.monotonic()
+    found = AWS.measure(['us-east-1', 'us-west-1'], connect=connect, deadline=0.2)
+    assert time.monotonic() - begin < 5
+    assert [one.region for one in found] == ['us-west-1', 'us-east-1']
+    over.set()
+
+
+def test_who_wants_the_nearest_alone_waits_for_no_far_one() -> None:
+    over = threading.Event()
+
+    def connect(host: str, port: int, timeout: float) -> float:
+        if 'us-east-1' in host:
+            over.wait(30)
+        return 0.05
+
+    begin = time.monotonic()
+    found = AWS.measure(['us-east-1', 'us-west-1', 'xx'], connect=connect, deadline=20,
+                            grace=0.1)
+    assert time.monotonic() - begin < 10
+    assert found[0].region == 'us-west-1' and found[-1].milliseconds is None
+    over.set()
+
+
+def test_all_are_asked_at_once() -> None:
+    together = threading.Barrier(len(AWS.enabled), timeout=20)
+
+    def connect(host: str, port: int, timeout: float) -> float:
+        together.wait()
+        return 0.1
+
+    found = AWS.measure(connect=connect, attempts=1, deadline=30)
+    assert {one.milliseconds for one in found} == {100.0} and len(found) == len(AWS.enabled)
+
+
+def test_geolocation_only_where_nobody_answers() -> None:
+    asked = []
+
+    def locate() -> tuple[float, float]:
+        asked.append(1)
+        return 48.2, 16.4  # Vienna
+
+    measured = AWS.ranked(['us-west-1', 'eu-central-1'], locate=locate, connect=connector({
+        'us-west-1': [0.1] * 3}))
+    assert measured[0].region == 'us-west-1' and not asked
+    placed = AWS.ranked(connect=connector({}), locate=locate)
+    assert placed[0] == Region('eu-central-1', 'Frankfurt', None, placed[0].distance_km)
+    assert placed[0].distance_km == pytest.approx(600, abs=30) and asked
+
+
+def test_table_without_any_answer_is_an_error() -> None:
+    def lost() -> tuple[float, float]:
+        raise ProviderError('nobody knows')
+
+    with pytest.raises(ProviderError, match='none of 2 AWS regions answers; nobody knows'):
+        AWS.ranked(['us-west-1', 'us-west-2'], connect=connector({}), locate=lost)
+    with pytest.raises(ProviderError, match='xx-1'):
+        AWS.ranked(['xx-1'], connect=connector({}), locate=lambda: (0.0, 0.0))
+
+
+def test_the_nearest_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = []
+
+    def ranked(names: tuple[str, ...], grace: float) -> list[Region]:
+        measured.append(names)
+        return [Region('eu-west-3', 'Paris', 12.0)]
+
+    own = regions.Regions('AWS', REGIONS, api_host)
+    monkeypatch.setattr(own, 'ranked', ranked)
+    threads = [threading.Thread(target=own.nearest) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert own.nearest() == 'eu-west-3' and len(measured) == 1
+    own.nearest(['us-west-1'])
+    assert measured == [own.enabled, ('us-west-1',)]
+
+
+def test_a_connection_is_timed_without_its_look_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = socket.getaddrinfo
+
+    def slow(*words: object, **more: object) -> object:
+        time.sleep(0.3)
+        return real('127.0.0.1', port, type=socket.SOCK_STREAM)
+
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        port = server.getsockname()[1]
+        monkeypatch.setattr(socket, 'getaddrinfo', slow)
+        assert regions.connect_time('ec2.nowhere.amazonaws.com', port, 2.0) < 0.25
+    with pytest.raises(OSError):
+        regions.connect_time('ec2.nowhere.amazonaws.com', port, 2.0)
+
+
+def test_the_api_s_host() -> None:
+    assert api_host('eu-west-1') == 'ec2.eu-west-1.amazonaws.com'
+    assert api_host('cn-north-1') == 'ec2.cn-north-1.amazonaws.com.cn'
+
+
+def test_distances() -> None:
+    assert regions.distance_km((0, 0), (0, 180)) == pytest.approx(math.pi * 6371)
+    assert regions.distance_km((52.5, 13.4), (52.5, 13.4)) == 0
+    # Berlin to New York
+    assert regions.distance_km((52.52, 13.41), (40.71, -74.01)) == pytest.approx(6385, abs=10)
+
+
+class Answer:
+    def __init__(self, body: object) -> None:
+        self.body = body
+
+    def raise_for_status(self) -> None:
+        pass
+
+    def json(self) -> object:
+        return self.body
+
+
+def test_geolocation_reads_what_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    import requests
+    monkeypatch.setattr(requests, 'get', lambda url, timeout: Answer({'loc': '48.2085,16.3721'}))
+    assert regions.geolocate() == (48.2085, 16.3721)
+    for body in ({'loc': 'moon'}, {}, [], {'loc': '1,2,3'}):
+        monkeypatch.setattr(requests, 'get', lambda url, timeout, body=body: Answer(body))
+        with pytest.raises(ProviderError, match='where this computer is'):
+            regions.geolocate()
+
+    def refuse(url: str, timeout: float) -> Answer:
+        raise requests.ConnectionError('no route')
+
+    monkeypatch.setattr(requests, 'get', refuse)
+    with pytest.raises(ProviderError, match='does not answer either'):
+        regions.geolocate()
+
+
+def test_without_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__('sys').modules, 'requests', None)
+    with pytest.raises(PrerequisiteError, match='requests'):
+        regions.geolocate()
+
+
+def test_botocore_knows_the_same_regions() -> None:
+    import boto3
+    if tuple(map(int, boto3.__version__.split('.')[:2])) < (1, 40):
+        pytest.skip(f'boto3 {boto3.__version__} is older than the youngest regions')
+    known = set(boto3.session.Session().get_available_regions('ec2'))
+    assert set(REGIONS) <= known
