@@ -18,7 +18,8 @@ from fogros2.deploy import Launch
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.steps.arming import Arming
 from fogros2.errors import AgentError, FogError
-from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
+from fogros2.model import Command, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.process import run
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
@@ -72,13 +73,19 @@ def arm(start, machine, robot):
     """Return the machine's agent, or why it isn't to be had."""
     context, job = robot
     job.machine, job.shell = machine, LocalShell(Endpoint('local'), name=job.name)
+    # an install that takes 30 s was seen once: show what it waits for
+    waiting = threading.Timer(20, lambda: print(run(Command(
+        ('ps', '-eo', 'pid,ppid,stat,wchan:24,args', '--forest')), timeout=10).stdout))
     start.wait(10)
+    waiting.start()
     try:
         Arming(context, job).arm()
         return job.agent
     except FogError as error:
         job.undo.close()
         return error
+    finally:
+        waiting.cancel()
 
 
 def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):

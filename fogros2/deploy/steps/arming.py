@@ -44,20 +44,21 @@ mv -f -- "$aside" "$3"
 python3 -IS "$3" serve --detach --config "$4"
 """
 
-# Remove the agent. A released agent has exited; an agent that was never reached still runs.
+# Remove the agent. A released agent is about to exit; an agent that was never reached still runs.
 # Another robot's agent stays: its configuration names its launch.
 # $1 folder, $2 launch, $3 our configuration.
 _REMOVE = """\
 running() { [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }
 rm -f -- "$3"
 if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
-    grep -qsF "\\"launch\\": \\"$2\\"" "$1/config.json" || exit 0
-    kill -s TERM $pid; n=0
+    owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
+    case $owner in ''|"$2") ;; *) exit 0 ;; esac
+    kill -s TERM $pid 2>/dev/null || :
+    n=0
     while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
-else
-    # another robot may be about to start one
-    for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
 fi
+# another robot may be about to start one
+for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
 rm -rf -- "$1"
 # the folder of all agents goes with the last one
 rmdir -- "${1%/*}" 2>/dev/null || :
