@@ -4,7 +4,7 @@ The service: machines in memory, over HTTP on the loopback, without any real mac
 
 It refuses what a real service refuses: a wrong token, a label with other characters than
 ``a-z0-9_-`` or with more than 63, a type or a zone that it does not have. A new machine is
-pending for two reports; a deleted one is reported once more; a full zone refuses.
+pending for one report; a deleted one is reported once more; a full zone refuses.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Meadow:
             raise Refusal(409, 'exhausted')
         number = next(self._numbers)
         machine = self.machines[f'm-{number:x}'] = {
-            **body, 'id': f'm-{number:x}', 'region': region, 'state': 'pending', 'reports': 2,
+            **body, 'id': f'm-{number:x}', 'region': region, 'state': 'pending', 'reports': 1,
             'address': f'198.51.100.{number % 250 + 1}', 'created': time.time()}
         return machine
 
@@ -91,7 +91,7 @@ class Meadow:
         elif action == 'stop':
             machine['state'] = 'stopped'
         elif action == 'start':
-            machine['state'], machine['reports'] = 'pending', 2
+            machine['state'], machine['reports'] = 'pending', 1
         elif action == 'labels':
             self._check_labels(body)
             machine['labels'] = {**machine['labels'], **body}
