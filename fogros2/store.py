@@ -17,6 +17,7 @@ import json
 import os
 from pathlib import Path
 import re
+import secrets
 import shutil
 import tempfile
 from typing import Any, Optional
@@ -98,6 +99,7 @@ class Record:
     :param armed: when its lifetime last restarted; a launch that reuses the machine restarts it.
     :param launch: id of the launch that uses the machine, '' for none.
     :param last: id of the launch that used it last; the agent may not know that launch's end.
+    :param robot: see :func:`robot_id`; '' in older records. It differs in a copied state folder.
     :param asked: the provider's options as requested; in ``spec`` all open choices ('cheapest',
         'nearest') are made. None in older records, where they are the same.
     :param pid: process of that launch; ``pid_start`` (clock ticks) and ``boot`` (id of the boot)
@@ -124,6 +126,7 @@ class Record:
     machine_id: Optional[str] = None
     launch: str = ''
     last: str = ''
+    robot: str = ''
     pid: int = 0
     pid_start: int = 0
     boot: str = ''
@@ -257,8 +260,65 @@ class Store:
 
 
 def robot_name() -> str:
-    """Return this robot's name in tags: host name and user id."""
+    """Return this robot's name: host name and user id. Cloned robots have the same name."""
     return f'{os.uname().nodename}-{os.getuid()}'
+
+
+def robot_id() -> str:
+    """
+    Return this robot's id in tags: its name, and random digits that belong to this computer.
+
+    The digits are in the file ``robot.json`` of the configuration folder, with the computer's
+    machine-id and one MAC address. A copy of the file on another computer gets new digits.
+
+    :raises StoreError: the file can't be written.
+    """
+    base = os.environ.get('XDG_CONFIG_HOME') or os.path.expanduser('~/.config')
+    error: Optional[OSError] = None
+    for folder in (Path(base) / 'fogros2', state_home()):
+        try:
+            return f'{robot_name()}-{_digits(folder)}'
+        except OSError as problem:
+            error = problem
+    assert error is not None
+    raise _not_written(state_home() / 'robot.json', error) from error
+
+
+def _digits(folder: Path) -> str:
+    """Return the random digits of a ``robot.json``; renew them if another computer made them."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    machine = Path('/etc/machine-id')
+    machine_id = machine.read_text().strip() if machine.exists() else ''
+    addresses = mac_addresses()
+    with open(folder / 'robot.json', 'a+',
+              opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        try:
+            known = json.load(file)
+            digits, bound = str(known['digits']), (known['machine_id'], known['mac'])
+        except (ValueError, LookupError, TypeError):
+            digits, bound = '', ('', '')
+        if digits and bound[0] == machine_id and bound[1] in (addresses or ['']):
+            return digits
+        digits = secrets.token_hex(4)
+        file.truncate(0)
+        json.dump({'digits': digits, 'machine_id': machine_id,
+                   'mac': addresses[0] if addresses else ''}, file)
+        return digits
+
+
+def mac_addresses(folder: Path = Path('/sys/class/net')) -> list[str]:
+    """Return the MAC addresses of this computer, those that belong to hardware first."""
+    found = []
+    for path in folder.iterdir() if folder.is_dir() else []:
+        with contextlib.suppress(OSError):
+            address = (path / 'address').read_text().strip()
+            # 0: the address is the device's own, not a random one
+            own = (path / 'addr_assign_type').read_text().strip() == '0'
+            if len(address) == 17 and address.strip('0:'):
+                found.append((not (path / 'device').exists(), not own, path.name, address))
+    return [address for *_, address in sorted(found)]
 
 
 def write_private(path: Path, data: bytes) -> None:

@@ -65,6 +65,7 @@ def state_home(
     """Give each test a state folder of its own, so that none sees the user's machines."""
     path = tmp_path_factory.mktemp('state')
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(path))
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path_factory.mktemp('config')))
     yield path
     shutil.rmtree(path, ignore_errors=True)
 

@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import math
 from pathlib import Path
 import re
 import shutil
@@ -30,16 +31,21 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Machine, MachineState, VpnInterface
 from fogros2.report import Reporter
-from fogros2.store import process_alive, Record, Store
+from fogros2.shell import Shell
+from fogros2.store import process_alive, Record, robot_id, Store
 from fogros2.vpn import helped, Vpn
-from fogros2.waiting import Timeouts
-from ros2fog_cli.api import machines
+from fogros2.waiting import Timeouts, wait_until
+from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
 
 #: Seconds for which gc keeps a stopped machine by default; see ``--keep-stopped``.
 KEEP_STOPPED = 7 * 86400.0
 #: Seconds after the end of its lifetime in which a machine may still be deleting itself.
 GRACE = 60.0
+#: Time-out in seconds of a machine's answer about its launch.
+ANSWER = 5.0
+#: Age in seconds of the last heartbeat at which a launch counts as gone: three are missing.
+GONE = 7.0
 #: Age in seconds after which gc deletes a launch's folder that has no process file.
 FOLDER_AGE = 86400.0
 
@@ -72,8 +78,11 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
                 f"the provider '{entry.provider}' of '{entry.name}' can't be asked",
                 '--force forgets the machine here; it may go on by itself')
         if entry.machine is not None:
-            if not entry.machine.owned and entry.record is not None:
-                _leave(entry.record, force=force)
+            if entry.record is not None:
+                if not entry.machine.owned:
+                    _leave(entry.record, force=force)
+                elif not force:
+                    _check_unused(entry, entry.record)
             _destroy(entry.machine)
         record = entry.record
         if record is None:
@@ -123,6 +132,67 @@ def _destroy(machine: Machine) -> None:
                             f'ros2 fog delete {machine.name} tries again')
 
 
+def _check_unused(entry: Entry, record: Record) -> None:
+    """
+    Check that no launch on another computer uses a machine of which this robot has a record.
+
+    :raises NameTaken: the agent gets heartbeats of a launch.
+    """
+    if _sure(record) or entry.machine is None or entry.machine.state is not MachineState.RUNNING:
+        return
+    used = False
+    with contextlib.suppress(FogError), reach.session(entry, timeout=ANSWER) as shell, \
+            _agent(record, shell) as client:
+        used = client is not None and _hears_launch(client)
+    if used:
+        raise _used(record)
+
+
+def _sure(record: Record) -> bool:
+    """
+    Return whether a record tells if the machine's launch lives.
+
+    A record of an older version, or in a copied state folder, may be another computer's: then
+    the machine's agent has to be asked.
+    """
+    return record.robot == robot_id()
+
+
+def _hears_launch(client: AgentClient) -> bool:
+    """Return whether an agent gets heartbeats."""
+    ages: list[float] = []
+
+    def decided() -> bool:
+        age = client.status(timeout=ANSWER)['heartbeat_age']
+        ages.append(math.inf if age is None else age)
+        return ages[-1] > GONE or ages[-1] < ages[0]
+
+    wait_until(decided, timeout=2 * GONE, interval=1.0, what='a heartbeat')
+    return ages[-1] <= GONE
+
+
+def _used(record: Record) -> NameTaken:
+    return NameTaken(f"a launch on another computer uses the machine '{record.name}'",
+                     'end that launch, or delete with --force')
+
+
+@contextlib.contextmanager
+def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
+    """Yield a client of the agent that a record names, None if the agent has ended."""
+    if not record.agent or not record.agent_program or shell.run(
+            # An agent that ended deleted its program; a request would wait for seconds.
+            Command(('test', '-e', record.agent_program), what='look for the agent'),
+            timeout=Timeouts().command, check=False).returncode != 0:
+        yield None
+        return
+    client = AgentClient(shell, record.agent, agent_path=record.agent_program,
+                         python=record.python)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
 def _leave(record: Record, *, force: bool) -> None:
     """Remove the agent, its nodes and the VPN from a computer that FogROS2 does not own."""
     if record.shell is None:
@@ -130,21 +200,14 @@ def _leave(record: Record, *, force: bool) -> None:
     timeouts = Timeouts()
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
-        if record.agent and record.agent_program and shell.run(
-                # An agent that ended deleted its program; a request would wait for seconds.
-                Command(('test', '-e', record.agent_program), what='look for the agent'),
-                timeout=timeouts.command, check=False).returncode == 0:
-            client = AgentClient(shell, record.agent, agent_path=record.agent_program,
-                                 python=record.python)
-            try:
+        with _agent(record, shell) as client, contextlib.suppress(AgentError):
+            if client is not None:  # else the agent ended by itself
                 launch = client.status()['launch']
                 if launch not in ('', record.launch, record.last):
                     return  # our agent is gone, and another robot uses the computer now
+                if not force and not _sure(record) and _hears_launch(client):
+                    raise _used(record)
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
-            except AgentError:
-                pass  # the agent ended by itself
-            finally:
-                client.close()
         if record.vpn is not None:
             vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
             for command in vpn.down(record.vpn):

@@ -22,7 +22,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Machine, MachineState
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
-from fogros2.store import Record, robot_name, Store
+from fogros2.store import Record, robot_id, robot_name, Store
 from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
@@ -78,12 +78,13 @@ class Entry:
     @property
     def robot(self) -> str:
         """The robot that created the machine, '' if unknown."""
-        return self._known.tags.get(TAG_ROBOT, robot_name() if self.record is not None else '')
+        noted = '' if self.record is None else self.record.robot or robot_name()
+        return self._known.tags.get(TAG_ROBOT, noted)
 
     @property
     def own(self) -> bool:
-        """Whether the machine belongs to this robot."""
-        return self.robot in ('', robot_name())
+        """Whether the machine belongs to this robot; older versions used its name in tags."""
+        return self.robot in ('', robot_name(), robot_id())
 
     @property
     def created(self) -> Optional[float]:
@@ -260,7 +261,7 @@ def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Reco
     if record is None:
         return None
     if record.damage:
-        return record if machine.tags.get(TAG_ROBOT, robot_name()) == robot_name() else None
+        return record if Entry('', '', machine).own else None
     if record.machine_id is None:
         # the launch was killed after the provider had created the machine, before it saved the id
         launch = machine.tags.get(TAG_LAUNCH)

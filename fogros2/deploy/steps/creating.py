@@ -31,7 +31,7 @@ from fogros2.provider import (
     TAG_ON_EXIT,
     TAG_ROBOT,
 )
-from fogros2.store import robot_name, this_process
+from fogros2.store import robot_id, this_process
 
 
 class Creation(Step):
@@ -78,6 +78,11 @@ class Creation(Step):
         if not context.store.exists(job.name):
             return None  # ``create`` finds and refuses a machine without a record
         before = context.store.load(job.name)
+        if before.robot not in ('', robot_id()):
+            raise NameTaken(
+                f"the machine '{job.name}' belongs to the robot {before.robot}: the state folder "
+                'is a copy, or this computer has another network card',
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
         if before.launch_alive:
             raise NameTaken(
                 f"the launch with process {before.pid} has the machine '{job.name}'",
@@ -152,7 +157,7 @@ class Creation(Step):
         } if context.capabilities.agent_directory else {}
         dependencies = self._dependencies()
         tags = {
-            TAG_NAME: job.name, TAG_ROBOT: robot_name(), **self._tags(),
+            TAG_NAME: job.name, TAG_ROBOT: robot_id(), **self._tags(),
             **({TAG_DEPENDENCIES: dependencies} if dependencies else {}),
         }
         can = context.capabilities
@@ -194,7 +199,7 @@ class Creation(Step):
         context, job = self._context, self._job
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
-            launch=context.launch, last=context.launch, **this_process(),
+            launch=context.launch, last=context.launch, robot=robot_id(), **this_process(),
             robot_vpn=context.vpn.interface, monitor=0, monitor_open='')
 
     def _login_key(self) -> str:
