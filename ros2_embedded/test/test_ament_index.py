@@ -33,14 +33,14 @@ def overlay(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_what_is_installed_is_found():
+def test_installed_packages_are_found():
     assert {'rclpy', 'std_msgs', 'launch', 'launch_ros'} <= set(get_packages_with_prefixes())
     share = Path(get_package_share_directory('rclpy'))
     assert share.is_dir() and share.parent.parent == Path(get_package_prefix('rclpy'))
     assert (share / 'package.xml').is_file()
 
 
-def test_overlays_come_first(overlay):
+def test_overlay_comes_first(overlay):
     assert get_search_paths()[0] == str(overlay)
     assert '/no/such/prefix' not in get_search_paths()
     assert get_package_prefix('my_robot') == get_package_prefix('rclpy') == str(overlay)
@@ -53,7 +53,7 @@ def test_overlays_come_first(overlay):
         get_package_share_directory('rclpy')
 
 
-def test_what_is_not_there(overlay):
+def test_missing_package_or_resource_is_an_error(overlay):
     with pytest.raises(PackageNotFoundError, match="package 'nothing' not found, searching"):
         get_package_prefix('nothing')
     with pytest.raises(ValueError, match="'not a name' is not a valid package name"):

@@ -87,7 +87,7 @@ def underlay(tmp_path_factory):
     return root, workspace(root, 'fog_colcon_test', 'underlay')
 
 
-def test_a_package_is_built_found_run_and_launched(underlay):
+def test_package_is_built_found_run_and_launched(underlay):
     root, setup = underlay
     prefix = f'{root}/install/fog_colcon_test'
     assert run(f'{setup}; ros2 pkg prefix fog_colcon_test', root) == f'{prefix}\n'
@@ -97,7 +97,7 @@ def test_a_package_is_built_found_run_and_launched(underlay):
     assert '] underlay from /renamed' in out
 
 
-def test_an_overlay_comes_first_and_leaves_the_rest(underlay, tmp_path):
+def test_overlay_hides_the_package_of_its_underlay(underlay, tmp_path):
     root, setup = underlay
     over = workspace(tmp_path, 'fog_colcon_test', 'overlay', setup)
     assert run(f'{over}; ros2 run fog_colcon_test say', tmp_path) == 'overlay from /sayer\n'

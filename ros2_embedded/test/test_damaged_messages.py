@@ -44,13 +44,13 @@ def test_any_bytes_are_a_message_or_an_error(kind, data):
 
 @quick
 @given(strategies.binary(max_size=8))
-def test_what_is_not_little_endian_cdr_is_an_error(head):
+def test_other_encoding_than_little_endian_cdr_is_an_error(head):
     if head[:2] != b'\0\1':
         with pytest.raises(RCLError):
             deserialize_message(head + bytes(64), String)
 
 
-def test_lengths_beyond_the_message_take_no_memory():
+def test_length_beyond_the_message_is_an_error():
     for count in (2 ** 32 - 1, 2 ** 31, 17):
         for kind in (String, UInt8MultiArray, TFMessage, JointState):
             with pytest.raises(RCLError):
@@ -71,7 +71,7 @@ def node():
     context.try_shutdown()
 
 
-def test_a_node_survives_what_it_cannot_read(node, capfd):
+def test_node_drops_a_damaged_message(node, capfd):
     got = []
     node.create_subscription(Path, 'noise', got.append, 100)
     publisher = node.create_publisher(Path, 'noise', 100)
@@ -93,7 +93,7 @@ def test_a_node_survives_what_it_cannot_read(node, capfd):
     assert "Dropped a message on topic 'noise'" in capfd.readouterr().err
 
 
-def test_a_server_survives_what_it_cannot_read(node, capfd):
+def test_server_drops_a_damaged_request(node, capfd):
     from rclpy._dds import Policies, Writer
 
     def add(request, response):

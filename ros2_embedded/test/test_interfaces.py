@@ -51,7 +51,7 @@ PACKAGES = {
 
 
 @pytest.mark.parametrize('package', PACKAGES)
-def test_every_package_has_its_interfaces(package):
+def test_each_interface_package_can_be_used(package):
     name = f'{package}/{PACKAGES[package]}'
     if '/srv/' in name:
         kind = get_service(name)
@@ -62,7 +62,7 @@ def test_every_package_has_its_interfaces(package):
         assert deserialize_message(serialize_message(message), type(message)) == message
 
 
-def test_names_that_are_no_interfaces_are_refused():
+def test_unknown_interface_is_refused():
     with pytest.raises(ImportError):
         from std_msgs.msg import Strong  # noqa: F401
     with pytest.raises(AttributeError):
@@ -75,7 +75,7 @@ def test_names_that_are_no_interfaces_are_refused():
         get_service('std_msgs/msg/String')
 
 
-def test_defaults():
+def test_new_message_has_default_values():
     assert String().data == ''
     assert Quaternion().w == 1.0 and Quaternion().x == 0.0
     assert Quaternion.W__DEFAULT == 1.0
@@ -88,13 +88,13 @@ def test_defaults():
     assert PoseStamped().header is not pose.header
 
 
-def test_constants_are_what_their_fields_take():
+def test_constant_has_the_type_of_its_field():
     assert DiagnosticStatus.STALE == b'\x03'
     assert DiagnosticStatus(level=DiagnosticStatus.WARN).level == b'\x01'
     assert NavSatStatus.STATUS_NO_FIX == -1
 
 
-def test_keyword_constructor():
+def test_constructor_takes_fields_as_keywords():
     stamp = Time(sec=3, nanosec=5)
     header = Header(stamp=stamp, frame_id='map')
     assert header.stamp.nanosec == 5 and header.frame_id == 'map'
@@ -115,12 +115,12 @@ def test_keyword_constructor():
     (lambda: ParameterValue(string_array_value='ab'), 'must be a set or sequence'),
     (lambda: ParameterDescriptor(integer_range=[3]), 'with length <= 1'),
 ])
-def test_wrong_types_are_refused_in_ros_words(make, text):
+def test_wrong_field_type_is_refused_with_the_text_of_ros2(make, text):
     with pytest.raises(AssertionError, match=text):
         make()
 
 
-def test_sequences_of_numbers_are_arrays():
+def test_number_sequence_is_an_array():
     image = Image(data=[1, 2, 255])
     assert isinstance(image.data, array.array) and image.data.typecode == 'B'
     image.data = bytes([7, 8])
@@ -141,7 +141,7 @@ def test_sequences_of_numbers_are_arrays():
     assert Polygon().points == []
 
 
-def test_field_types():
+def test_message_lists_its_field_types():
     assert String.get_fields_and_field_types() == {'data': 'string'}
     assert CameraInfo.get_fields_and_field_types()['k'] == 'double[9]'
     assert Image.get_fields_and_field_types()['data'] == 'sequence<uint8>'
@@ -152,7 +152,7 @@ def test_field_types():
     assert '_data' in String.__slots__
 
 
-def test_equality_text_and_copies():
+def test_messages_compare_print_copy_and_pickle():
     one = Header(frame_id='map')
     assert one == Header(frame_id='map') and one != Header() and one != 'map'
     assert repr(String(data='x')) == "std_msgs.msg.String(data='x')"
@@ -164,7 +164,7 @@ def test_equality_text_and_copies():
     assert pickle.loads(pickle.dumps(String(data='x'))) == String(data='x')  # noqa: S301
 
 
-def test_services():
+def test_service_has_request_and_response_classes():
     assert AddTwoInts.Request(a=1, b=2).b == 2
     assert AddTwoInts.Response().sum == 0
     assert Trigger.Response(success=True).success and SetBool.Request().data is False
@@ -183,7 +183,7 @@ def test_services():
     (ByteMultiArray(data=[b'\x01', b'\xff']),
      '00010000 00000000 00000000 02000000 01ff'),
 ])
-def test_bytes_on_the_wire(message, data):
+def test_message_is_serialized_as_cdr(message, data):
     expected = bytes.fromhex(data.replace(' ', ''))
     written = serialize_message(message)
     assert written[:len(expected)] == expected
@@ -191,7 +191,7 @@ def test_bytes_on_the_wire(message, data):
     assert deserialize_message(written, type(message)) == message
 
 
-def test_alignment_after_strings_and_sequences():
+def test_fields_are_aligned_after_strings_and_sequences():
     cloud = PointCloud2(header=Header(frame_id='four'), height=1, width=2, data=[1, 2, 3],
                         is_dense=True)
     values = ParameterValue(string_value='abc', integer_array_value=[-1, 2 ** 40],
@@ -201,7 +201,7 @@ def test_alignment_after_strings_and_sequences():
         assert deserialize_message(serialize_message(message), type(message)) == message
 
 
-def test_wide_strings():
+def test_wide_string_is_serialized_as_utf16():
     for text, written in (('', '00000000'), ('a', '0100000061000000'),
                           ('€𝄞', '03000000ac20000034d800001edd0000')):
         data = serialize_message(WString(data=text))
@@ -209,7 +209,7 @@ def test_wide_strings():
             deserialize_message(data, WString).data == text
 
 
-def test_damaged_bytes_are_an_error_not_a_crash():
+def test_damaged_bytes_raise_an_error():
     numbers = random.Random(7)
     whole = serialize_message(PointCloud2(header=Header(frame_id='map'), data=[1] * 20))
     for _ in range(300):
@@ -222,7 +222,7 @@ def test_damaged_bytes_are_an_error_not_a_crash():
             assert not isinstance(error, (MemoryError, SystemError))
 
 
-def test_yaml_and_dictionaries():
+def test_message_is_converted_to_yaml_and_dictionary():
     header = Header(stamp=Time(sec=1, nanosec=2), frame_id='map')
     assert message_to_yaml(header) == 'stamp:\n  sec: 1\n  nanosec: 2\nframe_id: map\n'
     assert list(message_to_ordereddict(header)) == ['stamp', 'frame_id']
@@ -233,7 +233,7 @@ def test_yaml_and_dictionaries():
     assert message_to_ordereddict(header, no_str=True)['frame_id'] == '<string length: <3>>'
 
 
-def test_fields_from_dictionaries():
+def test_message_fields_are_set_from_a_dictionary():
     pose = PoseStamped()
     set_message_fields(pose, {'header': {'stamp': {'sec': 9}}, 'pose': {'position': {'x': 1.5}}})
     assert pose.header.stamp.sec == 9 and pose.pose.position.x == 1.5

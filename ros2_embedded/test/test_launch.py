@@ -90,7 +90,7 @@ def test_entities_are_visited_depth_first_and_in_order():
     assert notes == [1, 2, 3, 4, 5]
 
 
-def test_conditions_decide_when_the_action_is_visited():
+def test_condition_is_evaluated_at_the_visit():
     notes = []
 
     def conditional(what, condition):
@@ -106,12 +106,12 @@ def test_conditions_decide_when_the_action_is_visited():
 
 @pytest.mark.parametrize('text, value', [('true', True), (' True', True), ('1', True),
                                          ('FALSE', False), ('0', False)])
-def test_condition_expressions(text, value):
+def test_condition_text_is_true_or_false(text, value):
     assert evaluate_condition_expression(
         LaunchContext(), [TextSubstitution(text=text)]) is value
 
 
-def test_a_condition_that_is_neither_true_nor_false_is_refused():
+def test_unknown_condition_text_is_refused():
     with pytest.raises(InvalidConditionExpressionError, match="expected one of .* got 'maybe'"):
         evaluate_condition_expression(LaunchContext(), [TextSubstitution(text='maybe')])
 
@@ -138,7 +138,7 @@ def test_scoped_group_restores_configurations_and_environment(monkeypatch):
         ('outer', 'outer', 'outer'), ('inner', 'outer', 'inner')]
 
 
-def test_environment_and_configuration_actions(monkeypatch):
+def test_actions_change_environment_and_configurations(monkeypatch):
     monkeypatch.setenv('FOG_PATH', 'b')
     monkeypatch.setenv('FOG_GONE', 'x')
     monkeypatch.delenv('FOG_NEW', raising=False)
@@ -158,7 +158,7 @@ def test_environment_and_configuration_actions(monkeypatch):
     assert notes == [['a-b:c', None, 'n'], ['b', 'x', None], None, {'b': '1'}]
 
 
-def test_arguments(capsys):
+def test_declared_arguments_are_checked(capsys):
     notes = []
     assert run(
         SetLaunchConfiguration('given', 'g'),
@@ -192,7 +192,7 @@ def test_exception_is_logged_in_one_line_and_ends_with_status_1(capsys):
     assert notes == [text]
 
 
-def test_handlers_get_events_newest_first_and_handle_once_goes():
+def test_newest_event_handler_is_called_first():
     notes = []
 
     def handler(what, **kwargs):
@@ -208,7 +208,7 @@ def test_handlers_get_events_newest_first_and_handle_once_goes():
     assert notes == ['once', 'first', 'first']
 
 
-def test_locals_last_as_long_as_an_event():
+def test_context_locals_end_with_their_event():
     notes = []
 
     def look(context):
@@ -226,7 +226,7 @@ def test_locals_last_as_long_as_an_event():
         _ = LaunchContext().locals.nothing
 
 
-def test_timers_and_shutdown():
+def test_timer_action_runs_and_is_cancelled():
     notes = []
     assert run(
         TimerAction(period=60.0, actions=[note(notes, 'never')]),
@@ -241,7 +241,7 @@ def test_timers_and_shutdown():
         TimerAction(period=1.0, actions=None)
 
 
-def test_the_launch_waits_for_completion_futures():
+def test_launch_waits_for_completion_futures():
     notes = []
 
     def start(context):
@@ -252,7 +252,7 @@ def test_the_launch_waits_for_completion_futures():
     assert notes == ['done']
 
 
-def test_service_runs_again_and_takes_events_of_other_threads():
+def test_service_runs_twice_and_takes_events_of_threads():
     service = LaunchService(noninteractive=True)
     notes = []
     assert service.event_loop is None and service.shutdown() is None
@@ -269,7 +269,7 @@ def test_service_runs_again_and_takes_events_of_other_threads():
     assert notes == [1, 2]
 
 
-def test_run_async_beside_other_coroutines():
+def test_launch_runs_beside_other_coroutines():
     async def both():
         service = LaunchService(noninteractive=True)
         service.include_launch_description(LaunchDescription([LogInfo(msg='in loop')]))
@@ -290,7 +290,7 @@ def test_run_async_beside_other_coroutines():
         asyncio.set_event_loop(asyncio.new_event_loop())
 
 
-def test_shutdown_while_the_loop_is_paused():
+def test_launch_shuts_down_while_its_loop_is_paused():
     async def begin():
         service.include_launch_description(LaunchDescription([]))
         task = asyncio.get_running_loop().create_task(
@@ -323,7 +323,7 @@ def generate_launch_description():
 '''
 
 
-def test_include(tmp_path, capsys):
+def test_included_launch_file_gets_its_arguments(tmp_path, capsys):
     path = tmp_path / 'inner.launch.py'
     path.write_text(PYTHON_FILE)
     notes = []
@@ -339,7 +339,7 @@ def test_include(tmp_path, capsys):
             "'no description given'), given: []") in capsys.readouterr().out
 
 
-def test_this_launch_file(tmp_path):
+def test_launch_file_knows_its_own_path(tmp_path):
     path = tmp_path / 'a.launch.py'
     path.write_text('import launch\ndef generate_launch_description():\n'
                     '    return launch.LaunchDescription()\n')
@@ -356,7 +356,7 @@ def test_this_launch_file(tmp_path):
     ('x = 1', r"does not contain the required function 'generate_launch_description\(\)'"),
     ('import nothing_of_the_kind', "ModuleNotFoundError: No module named 'nothing_of_the_kind'"),
 ])
-def test_broken_launch_files(tmp_path, content, expected, capsys):
+def test_broken_launch_file_is_reported(tmp_path, content, expected, capsys):
     path = tmp_path / 'broken.launch.py'
     path.write_text(content)
     with pytest.raises(InvalidLaunchFileError, match=expected):
@@ -373,7 +373,7 @@ def test_broken_launch_files(tmp_path, content, expected, capsys):
      '    return LaunchDescription([IncludeLaunchDescription(__file__)])\n'),
     ('loop.launch.xml', '<launch><include file="$(dirname)/loop.launch.xml"/></launch>'),
     ('loop.launch.yaml', 'launch: [include: {file: $(dirname)/loop.launch.yaml}]')])
-def test_circular_includes(tmp_path, capsys, name, content):
+def test_circular_include_is_reported(tmp_path, capsys, name, content):
     (tmp_path / name).write_text(content)
     assert run(IncludeLaunchDescription(str(tmp_path / name))) == 1
     assert 'maximum recursion depth exceeded' in capsys.readouterr().out
@@ -387,7 +387,7 @@ def test_circular_includes(tmp_path, capsys, name, content):
     ('launch.utilities.type_utils', 'SomeValueType'), ('launch.events', 'ExecutionComplete'),
     ('launch_ros.parameter_descriptions', 'Parameter'), ('rclpy.clock', 'JumpThreshold'),
     ('rclpy.logging', 'initialize'), ('rosidl_runtime_py', 'message_to_csv')])
-def test_missing_dependency_is_named(tmp_path, capsys, module, name):
+def test_missing_class_names_ros2(tmp_path, capsys, module, name):
     path = tmp_path / 'asks.launch.py'
     path.write_text(f'from {module} import {name}\n')
     assert run(IncludeLaunchDescription(str(path))) == 1
@@ -406,7 +406,7 @@ def test_missing_dependency_is_named(tmp_path, capsys, module, name):
     'rclpy.action', 'rclpy.guard_condition', 'rclpy.wait_for_message', 'rclpy.waitable',
     'example_interfaces.action', 'tf2_msgs.action', 'launch_ros.parameters_type',
     'rosidl_runtime_py.get_interfaces', 'launch_testing', 'launch_pytest'])
-def test_modules_that_are_lacking_are_named(module):
+def test_missing_module_names_the_embedded_default(module):
     with pytest.raises(ImportError, match=f'{module} is not part of the embedded default'):
         importlib.import_module(module)
 
@@ -415,13 +415,13 @@ def test_modules_that_are_lacking_are_named(module):
 @pytest.mark.parametrize('module, name', [
     ('launch.actions.opaque_coroutine', 'launch.actions.OpaqueCoroutine'),
     ('launch_ros.actions.ros_timer', 'launch_ros.actions.ROSTimer')])
-def test_modules_of_lacking_classes_name_the_class(module, name):
+def test_module_of_a_missing_class_names_the_class(module, name):
     with pytest.raises(ImportError, match=f'{name} is not part of the embedded default'):
         importlib.import_module(module)
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
-def test_actions_alone_are_refused_by_name():
+def test_missing_action_interfaces_are_named():
     done = subprocess.run(
         [sys.executable, '-c', 'from example_interfaces.action import Fibonacci'],
         capture_output=True, text=True, timeout=60)
@@ -430,7 +430,7 @@ def test_actions_alone_are_refused_by_name():
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None, reason='ROS 2 has them')
-def test_what_nodes_lack_is_named():
+def test_missing_node_method_is_named():
     from rclpy.node import Node
     node = Node.__new__(Node)
     with pytest.raises(AttributeError, match='create_guard_condition is not part of the embedded'):
@@ -438,7 +438,7 @@ def test_what_nodes_lack_is_named():
     assert not hasattr(node, 'never_heard_of')
 
 
-def test_declared_arguments_of_what_is_nested(tmp_path):
+def test_nested_launch_arguments_are_listed(tmp_path):
     path = tmp_path / 'inner.launch.py'
     path.write_text(PYTHON_FILE)
     description = LaunchDescription([
@@ -451,14 +451,14 @@ def test_declared_arguments_of_what_is_nested(tmp_path):
         ('a', False), ('b', False), ('c', True), ('word', False)]
 
 
-def test_deprecated_description(capsys):
+def test_deprecated_launch_description_is_reported(capsys):
     description = LaunchDescription(deprecated_reason='old')
     assert (description.deprecated, description.deprecated_reason) == (True, 'old')
     assert run(description) == 0
     assert 'deprecated launch description: old' in capsys.readouterr().out
 
 
-def test_introspection():
+def test_launch_description_is_printed_as_a_tree():
     process = ExecuteProcess(cmd=['ls', LaunchConfiguration('what')], cwd='/')
     text = LaunchIntrospector().format_launch_description(LaunchDescription([
         LogInfo(msg=['a', 'b']), process, EmitEvent(event=Asked()),
@@ -473,7 +473,7 @@ def test_introspection():
     assert lines[5].startswith('OnProcessExit(') and lines[6:] == ["LogInfo('bye')"]
 
 
-def test_utilities():
+def test_launch_utilities_normalize_and_check():
     context = LaunchContext()
     subs = launch.utilities.normalize_to_list_of_substitutions(['a', TextSubstitution(text='b')])
     assert perform_substitutions(context, subs) == 'ab'
@@ -488,7 +488,7 @@ def test_utilities():
         launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
 
 
-def test_helpers_of_utilities():
+def test_smaller_helpers_of_launch_work():
     from launch.utilities import type_utils
     from launch_ros.utilities.namespace_utils import is_namespace_absolute, is_root_namespace
     from launch_ros.utilities.track_node_names import add_node_name, get_node_name_count
@@ -509,7 +509,7 @@ def test_helpers_of_utilities():
     assert get_node_name_count(context, '/a') == 2
 
 
-def test_deep_module_paths():
+def test_module_paths_of_ros2_can_be_imported():
     code = textwrap.dedent('''
         import launch_ros.actions.push_ros_namespace, launch.actions.shutdown_action
         import launch.conditions.if_condition, launch.event_handlers.on_process_io
@@ -529,7 +529,7 @@ def test_deep_module_paths():
     assert os.spawnl(os.P_WAIT, sys.executable, sys.executable, '-c', code) == 0
 
 
-def test_looking_for_a_module_while_another_thread_imports_one():
+def test_modules_are_found_while_a_thread_imports():
     """As an import would, the name puts another one into the package while it is looked at."""
     class Importing(str):
         def replace(self, *args):

@@ -77,7 +77,7 @@ def on_exit(action, notes):
         target_action=action, on_exit=lambda event, context: notes.append(event.returncode)))
 
 
-def test_start_output_and_exit(capsys):
+def test_process_reports_start_output_and_exit(capsys):
     notes = []
     action = python(
         'import sys; print("out"); print("err", file=sys.stderr); print("end", end=""); '
@@ -112,7 +112,7 @@ def test_output_goes_to_the_log_and_errors_to_the_screen(capsys, tmp_path):
     assert 'process has finished cleanly' in log and 'process has finished cleanly' in out
 
 
-def test_output_destinations(capsys, tmp_path):
+def test_output_goes_where_it_is_configured(capsys, tmp_path):
     assert run(
         python('print("full")', output='full', name='a'),
         python('print("dict")', output={'stdout': 'own_log', 'stderr': {'screen'}}, name='b'),
@@ -129,13 +129,13 @@ def test_output_destinations(capsys, tmp_path):
         launch.logging.get_output_loggers('x', 'never')
 
 
-def test_the_environment_overrides_the_output(capsys, monkeypatch):
+def test_environment_overrides_the_output(capsys, monkeypatch):
     monkeypatch.setenv('OVERRIDE_LAUNCH_PROCESS_OUTPUT', 'both')
     assert run(python('print("hello")')) == 0
     assert '] hello' in capsys.readouterr().out
 
 
-def test_command_directory_environment_and_shell(capsys, monkeypatch, tmp_path):
+def test_process_has_its_directory_environment_and_shell(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv('FOG_OUTER', 'outer')
     show = ('import os; print(os.environ.get("FOG_OUTER"), os.environ.get("FOG_SET"), '
             'os.environ.get("FOG_MORE"), os.getcwd())')
@@ -155,7 +155,7 @@ def test_command_directory_environment_and_shell(capsys, monkeypatch, tmp_path):
     assert 'shell s' in lines and 'local hero' in lines
 
 
-def test_prefix_and_its_filter():
+def test_launch_prefix_has_a_filter():
     context = LaunchContext()
 
     def command(*cmd, **kwargs):
@@ -171,7 +171,7 @@ def test_prefix_and_its_filter():
     assert command('/bin/cat', name='dog') == (['/bin/cat'], 'dog')
 
 
-def test_process_is_described_by_substitutions_before_it_runs():
+def test_process_has_substitutions_until_it_runs():
     action = ExecuteProcess(
         cmd=['ls', LaunchConfiguration('a')], name='n', respawn=LaunchConfiguration('r'))
     assert [[sub.describe() for sub in word] for word in action.cmd] == [
@@ -187,14 +187,14 @@ def test_process_is_described_by_substitutions_before_it_runs():
         action.get_stdout()
 
 
-def test_cached_output():
+def test_output_is_kept_on_request():
     action = python('import sys; print("a\\nb", end=""); print("c", file=sys.stderr)',
                     cached_output=True)
     assert run(action) == 0
     assert (action.get_stdout(), action.get_stderr()) == ('a\nb', 'c\n')
 
 
-def test_a_terminal_is_emulated_on_demand(capsys):
+def test_terminal_is_emulated_on_request(capsys):
     show = 'import sys; print(sys.stdout.isatty(), sys.stderr.isatty())'
     assert run(python(show, output='screen'),
                python(show, output='screen', emulate_tty=True)) == 0
@@ -204,7 +204,7 @@ def test_a_terminal_is_emulated_on_demand(capsys):
     assert '] True True' in capsys.readouterr().out
 
 
-def test_what_can_not_start_is_reported_and_the_launch_goes_on(capsys):
+def test_launch_goes_on_after_a_failed_start(capsys):
     notes = []
     action = ExecuteProcess(cmd=['/no/such/executable'])
     assert run(on_exit(action, notes), action, python('pass', output='screen')) == 0
@@ -214,13 +214,13 @@ def test_what_can_not_start_is_reported_and_the_launch_goes_on(capsys):
     assert 'process has finished cleanly' in out and notes == []
 
 
-def test_an_action_executes_once(capsys):
+def test_process_executes_only_once(capsys):
     action = python('pass')
     assert run(action, action) == 1
     assert 'executed more than once' in capsys.readouterr().out
 
 
-def test_on_exit_and_required_processes(capsys):
+def test_end_of_a_required_process_ends_the_launch(capsys):
     other = python(SLEEPER)
     action = python('pass', on_exit=[LogInfo(msg='exited'), Shutdown()])
     assert run(other, when_ready(other, [action])) == 0
@@ -230,7 +230,7 @@ def test_on_exit_and_required_processes(capsys):
     assert other.return_code == -signal.SIGINT
 
 
-def test_respawn():
+def test_process_respawns_as_often_as_allowed():
     notes = []
     often = python('print("x", flush=True)', respawn=True, respawn_delay=0.01,
                    respawn_max_retries=2)
@@ -255,7 +255,7 @@ def test_shutdown_during_the_delay_ends_respawning():
     assert notes == [0]
 
 
-def test_signals_escalate(capsys):
+def test_signals_escalate_to_sigkill(capsys):
     action = python(SLEEPER, 'SIGINT', 'SIGTERM', sigterm_timeout='0.2', sigkill_timeout='0.3')
     assert run(action, when_ready(action, [Shutdown()])) == 0
     assert action.return_code == -signal.SIGKILL
@@ -284,7 +284,7 @@ def test_one_process_is_shut_down(matcher):
     assert action.return_code == -signal.SIGINT
 
 
-def test_one_process_is_signalled(capsys):
+def test_one_process_gets_a_signal(capsys):
     action = python(SLEEPER)
     event = SignalProcess(signal_number=signal.SIGUSR1, process_matcher=matches_action(action))
     assert event.signal_name == 'SIGUSR1' and event.signal == signal.SIGUSR1
@@ -295,21 +295,21 @@ def test_one_process_is_signalled(capsys):
         SignalProcess(signal_number=2, process_matcher=matches_action(action))
 
 
-def test_a_shutdown_reaches_a_process_that_is_still_starting():
+def test_shutdown_reaches_a_starting_process():
     # no Python: one that is interrupted before it is up exits with 1
     action = ExecuteProcess(cmd=['sleep', '30'])
     assert run(action, Shutdown()) == 0
     assert action.return_code in (None, -signal.SIGINT)
 
 
-def test_nothing_starts_after_a_shutdown():
+def test_no_process_starts_after_a_shutdown():
     action = python('pass')
     assert run(Shutdown(), OpaqueFunction(function=lambda context: context._set_is_shutdown(
         True)), action) == 0
     assert action.return_code is None
 
 
-def test_handlers_refuse_what_is_no_process():
+def test_handler_refuses_an_action_without_a_process():
     with pytest.raises(TypeError, match="action_matcher must be an 'ExecuteLocal' instance"):
         OnProcessExit(target_action=LogInfo(msg=''), on_exit=[])
     with pytest.raises(TypeError, match="expected all items in 'on_exit'|'on_event'"):
@@ -369,7 +369,7 @@ def test_sigint_shuts_down_in_order_with_status_0(tmp_path):
     assert "sending signal 'SIGINT'" in out and 'exit code -2' in out
 
 
-def test_a_terminal_interrupts_processes_itself(tmp_path):
+def test_launch_sends_no_second_sigint_in_a_terminal(tmp_path):
     with Script(tmp_path, noninteractive=False) as script:
         os.killpg(script.process.pid, signal.SIGINT)
         status, out = script.finish()
@@ -377,7 +377,7 @@ def test_a_terminal_interrupts_processes_itself(tmp_path):
     assert "sending signal 'SIGINT'" not in out
 
 
-def test_a_second_sigint_is_ignored(tmp_path):
+def test_second_sigint_is_ignored(tmp_path):
     with Script(tmp_path, ignored=['SIGINT']) as script:
         script.process.send_signal(signal.SIGINT)
         while '] ignored' not in (line := script.process.stdout.readline()):

@@ -92,7 +92,7 @@ def command(*settings, configurations=None, **kwargs):
     return words(action, context), action
 
 
-def test_a_node_runs(capsys):
+def test_node_runs_with_its_arguments(capsys):
     action = Node(package='pkg', executable='exe', name='n', namespace='/ns',
                   arguments=['a b', LaunchConfiguration('x', default='y')],
                   ros_arguments=['--log-level', 'info'],
@@ -121,13 +121,13 @@ def test_a_node_runs(capsys):
      ['--ros-args', '-r', '<name>', '-r', 'a:=1', '-r', '/b:=c'],
      '<node_namespace_unspecified>/n'),
 ])
-def test_names_and_remappings(kwargs, expected, name):
+def test_command_line_has_names_and_remappings(kwargs, expected, name):
     got, action = command(configurations={'i': '1'}, **kwargs)
     assert got == expected and action.node_name == name
     assert action.node_package == 'pkg' and action.node_executable == 'exe'
 
 
-def test_before_it_executes_a_node_has_no_name():
+def test_node_has_no_name_before_it_executes():
     action = Node(executable='exe')
     with pytest.raises(RuntimeError, match="cannot access 'node_name' before executing action"):
         _ = action.node_name
@@ -137,14 +137,14 @@ def test_before_it_executes_a_node_has_no_name():
 @pytest.mark.parametrize('kwargs', [
     {'name': 'a b'}, {'name': '1a'}, {'name': 'a/b'}, {'namespace': '/1'},
     {'namespace': '/a//b'}, {'name': 'x' * 300}])
-def test_invalid_names_are_refused(kwargs, capsys):
+def test_invalid_node_name_or_namespace_is_refused(kwargs, capsys):
     with pytest.raises(Exception, match='Invalid n'):
         command(**kwargs)
     assert 'Error while expanding or validating node name or namespace for' in (
         capsys.readouterr().out)
 
 
-def test_namespaces_are_pushed_in_their_scope():
+def test_pushed_namespace_ends_with_its_group():
     context = LaunchContext()
     nodes = [Node(executable='exe', name='n', namespace=ns) for ns in (None, 'x', '/y')]
     outer = Node(executable='exe', name='n')
@@ -185,7 +185,7 @@ def plain(value):
     return [plain(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
-def test_parameters_of_a_dictionary():
+def test_parameter_dictionary_becomes_a_file():
     i = LaunchConfiguration('i')
     got, _ = command(name='n', configurations={'i': '7', 'empty': ''}, parameters=[{
         'int': 1, 'float': 1.5, 'bool': True, 'str': 'true', 'empty': '', 'subst': i,
@@ -202,7 +202,7 @@ def test_parameters_of_a_dictionary():
         'nested.7x': 2, 'nothing': ''}}}
 
 
-def test_parameter_files(tmp_path, capsys):
+def test_parameter_file_is_passed_or_substituted(tmp_path, capsys):
     file = tmp_path / 'p.yaml'
     file.write_text('/**: {ros__parameters: {a: $(var i)}}')
     substituted = ParameterFile(file, allow_substs=True)
@@ -220,7 +220,7 @@ def test_parameter_files(tmp_path, capsys):
     assert load(substituted.evaluate(context)) == {'/**': {'ros__parameters': {'a': 8}}}
 
 
-def test_bad_parameters():
+def test_invalid_parameters_are_refused():
     with pytest.raises(TypeError, match="'parameters' to be one of"):
         Node(executable='exe', parameters={'a': 1})
     with pytest.raises(TypeError, match='Expecting list of parameters'):
@@ -237,7 +237,7 @@ def test_bad_parameters():
         normalize_remap_rule(('a',))
 
 
-def test_parameter_descriptions():
+def test_parameter_value_has_the_requested_type():
     context = LaunchContext()
     value = ParameterValue(LaunchConfiguration('x', default='1'), value_type=float)
     assert value.evaluate(context) == 1.0 and value.value == 1.0
@@ -250,12 +250,12 @@ def test_parameter_descriptions():
 @pytest.mark.parametrize('base, name, expected', [
     (None, None, None), (None, 'a', 'a'), ('/', 'a', '/a'), ('/a', 'b/', '/a/b'),
     ('/a', '/b', '/b'), ('a', None, 'a'), ('', 'a', 'a')])
-def test_namespaces(base, name, expected):
+def test_namespaces_are_joined(base, name, expected):
     assert prefix_namespace(base, name) == expected
     assert make_namespace_absolute('a') == '/a' and make_namespace_absolute(None) is None
 
 
-def test_packages(prefix):
+def test_substitutions_find_packages_and_executables(prefix):
     context = LaunchContext()
     assert FindPackagePrefix('pkg').perform(context) == str(prefix)
     assert FindPackageShare(['p', 'kg']).perform(context) == str(prefix / 'share' / 'pkg')
@@ -268,7 +268,7 @@ def test_packages(prefix):
         FindPackageShare('no').perform(context)
 
 
-def test_same_names_are_reported(capsys):
+def test_two_nodes_of_one_name_are_reported(capsys):
     service = LaunchService(noninteractive=True)
     service.include_launch_description(LaunchDescription([
         Node(package='pkg', executable='exe', name='n', namespace='/') for _ in range(2)]))
@@ -277,7 +277,7 @@ def test_same_names_are_reported(capsys):
             'context') in capsys.readouterr().out
 
 
-def test_the_log_directory_is_set(tmp_path, monkeypatch):
+def test_log_directory_is_set(tmp_path, monkeypatch):
     context = LaunchContext()
     monkeypatch.setenv('ROS_LOG_DIR', '/somewhere')
     SetROSLogDir(['sub', LaunchConfiguration('x', default='1')]).execute(context)
@@ -328,7 +328,7 @@ launch:
 
 @pytest.mark.parametrize('name, content', [('a.launch.xml', XML), ('a.launch.yaml', YAML)],
                          ids=['xml', 'yaml'])
-def test_nodes_in_launch_files(tmp_path, capsys, name, content):
+def test_xml_and_yaml_describe_a_node(tmp_path, capsys, name, content):
     (tmp_path / name).write_text(content)
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {level: $(var level)}}')
     contents = []
@@ -379,7 +379,7 @@ def test_composable_nodes_are_described(tmp_path):
         LoadComposableNodes(target_container=5, composable_node_descriptions=[])
 
 
-def test_lifecycle_events():
+def test_lifecycle_events_match_their_node():
     action = LifecycleNode(package='pkg', executable='exe', name='n', namespace='')
     visit(LaunchContext(), action)
     assert matches_node_name('n')(action) and matches_node_name('/n')(action)
@@ -395,7 +395,7 @@ def test_lifecycle_events():
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
                     reason='ROS 2 leaves its parameter files')
-def test_parameter_files_go_with_the_process(tmp_path):
+def test_parameter_files_are_deleted_at_exit(tmp_path):
     code = '''
 import glob, sys
 from launch import LaunchContext

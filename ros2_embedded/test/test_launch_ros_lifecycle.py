@@ -59,7 +59,7 @@ def _log_into(tmp_path, monkeypatch):
     launch.logging.reset()
 
 
-def test_a_node_is_configured_and_activated(tmp_path, capsys):
+def test_launch_configures_and_activates_a_node(tmp_path, capsys):
     path = tmp_path / 'managed'
     path.write_text(NODE)
     path.chmod(0o755)

@@ -77,7 +77,7 @@ A = LaunchConfiguration('a')
     (EqualsSubstitution('a', 'b'), 'false'), (NotEqualsSubstitution('a', 'b'), 'true'),
     (NotEqualsSubstitution('1.0', '1'), 'false'),
 ])
-def test_values(context, substitution, text):
+def test_substitution_returns_its_value(context, substitution, text):
     assert substitution.perform(context) == text
     assert context.perform_substitution(substitution) == text
 
@@ -93,12 +93,12 @@ def test_values(context, substitution, text):
     (Command('true', on_stderr='what'), "expected 'on_stderr' to be one of"),
     (NotSubstitution('maybe'), 'Failed to convert|Cannot convert'),
 ])
-def test_failures(context, substitution, error):
+def test_failing_substitution_has_a_reason(context, substitution, error):
     with pytest.raises(SubstitutionFailure, match=error):
         substitution.perform(context)
 
 
-def test_what_depends_on_the_computer(context, tmp_path):
+def test_substitutions_read_files_and_find_programs(context, tmp_path):
     (tmp_path / 'file').write_text('content')
     assert FileContent(str(tmp_path / 'file')).perform(context) == 'content'
     assert os.access(FindExecutable(name='sh').perform(context), os.X_OK)
@@ -113,11 +113,11 @@ def test_what_depends_on_the_computer(context, tmp_path):
     (Command('ls'), "Command('ls')"), (FindExecutable(name='a'), "FindExec('a')"),
     (PythonExpression('1 + 1', ['os', 'sys']), "PythonExpr('1 + 1', ['os', 'sys'])"),
 ])
-def test_descriptions(substitution, text):
+def test_substitution_describes_itself(substitution, text):
     assert substitution.describe() == text
 
 
-def test_wrong_arguments():
+def test_wrong_argument_of_a_substitution_is_refused():
     with pytest.raises(TypeError, match='TextSubstitution expected Text object'):
         TextSubstitution(text=1)
 
@@ -138,14 +138,14 @@ def test_wrong_arguments():
     ('$(var a)$(var a)', '11'), ('$(var a ignored)', '1'), ("$(eval 'os.sep' 'os, sys')", '/'),
     ('$(eval "1 + 1" "")', '2'),
 ])
-def test_texts_with_substitutions(context, text, expected):
+def test_text_with_substitutions_is_parsed(context, text, expected):
     assert perform_substitutions(context, parse_substitution(text)) == expected
 
 
 @pytest.mark.parametrize('text', [
     '$(var a', '$(', '$()', "$(var 'a)", '$(var  a)', '$(1a)', '$(no-such-thing)', '$(var)',
     '$(var a b c)', '$(dirname x)'])
-def test_texts_that_are_refused(text):
+def test_invalid_substitution_text_is_refused(text):
     with pytest.raises(Exception, match='.'):
         parse_substitution(text)
 
@@ -154,7 +154,7 @@ def test_texts_that_are_refused(text):
     ('1', int, 1), ('1', float, 1.0), ('1', str, '1'), ('1', bool, True), ('false', bool, False),
     ('1', None, 1), ('a', None, 'a'), ('[1, 2]', None, [1, 2]), ('[1, 2]', List[int], [1, 2]),
     ('[a, b]', List[str], ['a', 'b']), ('1.5', None, 1.5), ('true', None, True)])
-def test_texts_as_types(text, data_type, value):
+def test_text_is_converted_to_a_type(text, data_type, value):
     assert coerce_to_type(text, data_type) == value
     assert type(coerce_to_type(text, data_type)) is type(value)
     assert is_instance_of(value, data_type)
@@ -163,12 +163,12 @@ def test_texts_as_types(text, data_type, value):
 @pytest.mark.parametrize('text, data_type', [
     ('x', int), ('1.5', int), ('2', bool), ('[1, a]', List[int]), ('1', List[int]),
     ('{a: 1}', None), ('[1, a]', None), ('x', dict)])
-def test_texts_of_other_types(text, data_type):
+def test_text_of_another_type_is_refused(text, data_type):
     with pytest.raises(ValueError):
         coerce_to_type(text, data_type)
 
 
-def test_typed_values(context):
+def test_typed_substitutions_are_resolved(context):
     assert get_typed_value(['1', '2'], List[int]) == [1, 2]
     with pytest.raises(TypeError):
         get_typed_value(['1'], int)
@@ -247,7 +247,7 @@ def launch_file(path):
 @pytest.mark.parametrize('name, content', [
     ('a.launch.xml', XML), ('a.xml', XML), ('a_launch.yaml', YAML), ('a.launch.yml', YAML),
     ('a.launch', XML)], ids=lambda value: value.partition('\n')[0])
-def test_launch_files(context, tmp_path, monkeypatch, capsys, name, content):
+def test_xml_and_yaml_launch_files_run(context, tmp_path, monkeypatch, capsys, name, content):
     monkeypatch.delenv('FOG_XML', raising=False)
     (tmp_path / name).write_text(content)
     assert launch_file(tmp_path / name) == 0
@@ -269,7 +269,7 @@ def test_launch_files(context, tmp_path, monkeypatch, capsys, name, content):
     ('<launch><executable cmd="a" respawn_delay="-1"/></launch>', 'non-negative value'),
     ('<launch><log message="a" if="1" unless="1"/></launch>', "can't be used simultaneously"),
 ])
-def test_bad_launch_files(context, tmp_path, capsys, content, error):
+def test_invalid_launch_file_is_reported(context, tmp_path, capsys, content, error):
     path = tmp_path / 'bad.launch.xml'
     path.write_text(content)
     assert launch_file(path) == 1
@@ -285,14 +285,14 @@ def test_bad_launch_files(context, tmp_path, capsys, content, error):
      r'ParserError: while parsing a flow mapping\n  in ".*bad.launch.yaml", line 2, column 8'),
     ('bad.launch.py', 'import launch\ndef f(:\n',
      r'SyntaxError: invalid syntax \(bad.launch.py, line 2\)')])
-def test_syntax_errors_have_file_and_line(context, tmp_path, capsys, name, content, error):
+def test_syntax_error_has_file_and_line(context, tmp_path, capsys, name, content, error):
     (tmp_path / name).write_text(content)
     assert launch_file(tmp_path / name) == 1
     out = capsys.readouterr().out
     assert re.search(error, out) and name in out
 
 
-def test_actions_can_be_exposed(context, tmp_path, capsys):
+def test_exposed_action_is_an_element(context, tmp_path, capsys):
     @expose_action('fog_test_action')
     class Exposed(LogInfo):
         @classmethod
@@ -313,7 +313,7 @@ def test_actions_can_be_exposed(context, tmp_path, capsys):
         expose_action('fog_test_other')(object)
 
 
-def test_parser_reads_open_files_and_knows_its_names(tmp_path):
+def test_parser_reads_an_open_file(tmp_path):
     assert Parser.is_filename_valid('x.launch.xml') and Parser.is_filename_valid('x.yaml')
     assert not Parser.is_filename_valid('x.launch.py')
     assert set(Parser.get_available_extensions()) >= {'xml', 'yaml'}

@@ -98,7 +98,7 @@ def world(context):
 
 # --- contexts -----------------------------------------------------------------------------------
 
-def test_init_and_shutdown():
+def test_context_is_initialized_and_shut_down_once():
     context = Context()
     assert not context.ok()
     with pytest.raises(NotInitializedException):
@@ -116,7 +116,7 @@ def test_init_and_shutdown():
     rclpy.try_shutdown(context=context)
 
 
-def test_domain_ids():
+def test_invalid_domain_id_is_refused():
     context = Context()
     rclpy.init(context=context, args=[], domain_id=7)
     assert context.get_domain_id() == 7
@@ -134,12 +134,12 @@ def test_domain_ids():
     ['--ros-args', '-r', 'a:=b c'], ['--ros-args', '-r', '1a:=b'], ['--ros-args', '-r', 'a:='],
     ['--ros-args', '-p', 'x:={y: 1}'], ['--ros-args', '-p', 'x:=[1, y]'],
     ['--ros-args', '--what']])
-def test_bad_arguments_are_refused(args):
+def test_invalid_ros_arguments_are_refused(args):
     with pytest.raises(RuntimeError):
         Context().init(args=args)
 
 
-def test_arguments_that_are_not_ros_ones():
+def test_ros_arguments_are_removed_from_a_command_line():
     from rclpy.utilities import remove_ros_args
     assert remove_ros_args(['me', '--x', '--ros-args', '-r', 'a:=b', '--', 'y']) == \
         ['me', '--x', 'y']
@@ -147,7 +147,7 @@ def test_arguments_that_are_not_ros_ones():
 
 # --- names --------------------------------------------------------------------------------------
 
-def test_node_names(world):
+def test_node_has_a_valid_name_and_namespace(world):
     node = world.node('one', namespace='/robot')
     assert (node.get_name(), node.get_namespace()) == ('one', '/robot')
     assert node.get_fully_qualified_name() == '/robot/one'
@@ -161,7 +161,7 @@ def test_node_names(world):
             world.node('three', namespace=namespace)
 
 
-def test_topic_names(world):
+def test_topic_name_is_resolved_or_refused(world):
     node = world.node('me', namespace='/here')
     assert node.resolve_topic_name('chatter') == '/here/chatter'
     assert node.resolve_topic_name('/chatter') == '/chatter'
@@ -179,7 +179,7 @@ def test_topic_names(world):
         node.count_publishers('a b')
 
 
-def test_remappings(context):
+def test_names_are_remapped_by_arguments(context):
     made = Context()
     made.init(args=['--ros-args', '-r', '__node:=new', '-r', '__ns:=/space', '-r',
                     'chatter:=talk', '-r', 'new:only:=/mine', '-r', 'other:only:=/theirs',
@@ -204,7 +204,7 @@ def test_remappings(context):
 
 # --- topics -------------------------------------------------------------------------------------
 
-def test_publish_and_subscribe(world):
+def test_subscription_receives_messages_in_order(world):
     node, got = world.node(), []
     publisher = node.create_publisher(String, 'chatter', 10)
     subscription = node.create_subscription(String, 'chatter', got.append, 10)
@@ -223,7 +223,7 @@ def test_publish_and_subscribe(world):
         publisher.publish(String())
 
 
-def test_raw_messages_and_message_info(world):
+def test_subscription_receives_raw_bytes_and_timestamps(world):
     node, raw, info = world.node(), [], []
     publisher = node.create_publisher(String, 'chatter', 10)
     node.create_subscription(String, 'chatter', raw.append, 10, raw=True)
@@ -241,7 +241,7 @@ def test_raw_messages_and_message_info(world):
         node.create_subscription(String, 'chatter', lambda: None, 10)
 
 
-def test_late_subscriptions_get_what_is_transient_local(world):
+def test_late_subscription_receives_transient_local_messages(world):
     node, got, volatile = world.node(), [], []
     latched = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(String, 'map', latched)
@@ -274,7 +274,7 @@ def test_incompatible_quality_of_service_is_reported(world, capfd):
         'received from it. Last incompatible policy: RELIABILITY' in text for text in heard))
 
 
-def test_matches_and_deadlines_are_reported(world):
+def test_matches_and_missed_deadlines_are_reported(world):
     node, matched, missed = world.node(), [], []
     profile = QoSProfile(depth=1, deadline=Duration(nanoseconds=50_000_000))
     publisher = node.create_publisher(String, 'x', profile)
@@ -289,7 +289,7 @@ def test_matches_and_deadlines_are_reported(world):
     node.destroy_subscription(subscription)
 
 
-def test_profiles():
+def test_quality_of_service_profile_is_checked():
     assert QoSProfile(depth=3).history == HistoryPolicy.KEEP_LAST
     assert QoSProfile(depth=3).reliability == ReliabilityPolicy.RELIABLE
     assert QoSProfile(depth=3) == QoSProfile(depth=3) != QoSProfile(depth=4)
@@ -309,7 +309,7 @@ def test_profiles():
     assert qos_check_compatible(strict, sensor)[0] != QoSCompatibility.ERROR
 
 
-def test_contradictory_profiles_are_reported():
+def test_incompatible_profiles_are_explained():
     def said(publisher, subscription):
         return qos_check_compatible(QoSProfile(depth=1, **publisher),
                                     QoSProfile(depth=1, **subscription))
@@ -332,7 +332,7 @@ def test_contradictory_profiles_are_reported():
         'system_default;WARNING: Volatile publisher, but subscription is system_default;')
 
 
-def test_a_wrong_class_is_refused(world):
+def test_wrong_interface_class_is_refused(world):
     node = world.node()
     for wrong in (int, Trigger):
         with pytest.raises(Exception, match='.'):
@@ -352,7 +352,7 @@ def add(request, response):
     return response
 
 
-def test_services_and_clients(world):
+def test_client_calls_a_service(world):
     server, caller = world.node('server'), world.node('caller')
     service = server.create_service(AddTwoInts, 'add', add)
     client = caller.create_client(AddTwoInts, 'add')
@@ -368,7 +368,7 @@ def test_services_and_clients(world):
     world.until(lambda: not client.service_is_ready())
 
 
-def test_two_clients_get_their_own_responses(world):
+def test_each_client_gets_its_own_response(world):
     node = world.node()
     node.create_service(AddTwoInts, 'add', add)
     clients = [node.create_client(AddTwoInts, 'add') for _ in range(2)]
@@ -379,7 +379,7 @@ def test_two_clients_get_their_own_responses(world):
     assert [future.result().sum for future in futures] == [0, 1]
 
 
-def test_synchronous_call(world):
+def test_synchronous_call_returns_the_response(world):
     server, caller = world.node('server'), world.node('caller')
     server.create_service(AddTwoInts, 'add', add)
     client = caller.create_client(AddTwoInts, 'add')
@@ -392,7 +392,7 @@ def test_synchronous_call(world):
     assert not thread.is_alive()
 
 
-def test_a_service_that_awaits_another(world):
+def test_service_callback_awaits_another_service(world):
     node = world.node()
     from rclpy.callback_groups import ReentrantCallbackGroup
     group = ReentrantCallbackGroup()
@@ -414,7 +414,7 @@ def test_a_service_that_awaits_another(world):
 
 # --- timers and clocks --------------------------------------------------------------------------
 
-def test_timers(world):
+def test_timer_ticks_is_canceled_and_reset(world):
     node, ticks = world.node(), []
     timer = node.create_timer(0.02, lambda: ticks.append(time.monotonic()))
     assert timer.timer_period_ns == 20_000_000 and not timer.is_canceled()
@@ -438,7 +438,7 @@ def test_timers(world):
     assert node.destroy_timer(timer) and not node.destroy_timer(timer)
 
 
-def test_missed_ticks_are_not_made_up_for(world):
+def test_timer_skips_missed_ticks(world):
     node, ticks = world.node(), []
     node.create_timer(0.02, lambda: ticks.append(1))
     time.sleep(0.2)
@@ -446,7 +446,7 @@ def test_missed_ticks_are_not_made_up_for(world):
     assert 1 <= len(ticks) <= 6
 
 
-def test_durations_and_times():
+def test_durations_and_times_are_calculated():
     assert Duration(seconds=1.5, nanoseconds=1).nanoseconds == 1_500_000_001
     assert Duration(seconds=1) < Duration(seconds=2) and Infinite > Duration(seconds=2)
     assert Duration(seconds=-1).to_msg().sec == -1
@@ -464,7 +464,7 @@ def test_durations_and_times():
         Time(seconds=-1)
 
 
-def test_clocks(context):
+def test_clock_sleeps_in_steady_and_simulated_time(context):
     assert isinstance(Clock(clock_type=ClockType.ROS_TIME), ROSClock)
     steady = Clock(clock_type=ClockType.STEADY_TIME)
     before = steady.now()
@@ -488,7 +488,7 @@ def test_clocks(context):
     assert not simulated.sleep_for(Duration(seconds=60), context)
 
 
-def test_a_simulators_clock_drives_time_and_timers(world):
+def test_simulated_clock_drives_time_and_timers(world):
     from rclpy.parameter import Parameter
     node, ticks = world.node(parameter_overrides=[Parameter('use_sim_time', value=True)]), []
     clock = world.node('simulator').create_publisher(ClockMessage, '/clock', 10)
@@ -512,7 +512,7 @@ def test_a_simulators_clock_drives_time_and_timers(world):
     timer.cancel()
 
 
-def test_rate(context):
+def test_rate_sleeps_for_its_period(context):
     node = rclpy.create_node('slow', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -531,7 +531,7 @@ def test_rate(context):
 
 # --- executors ----------------------------------------------------------------------------------
 
-def test_spin_once_does_one_thing(world):
+def test_spin_once_runs_one_callback(world):
     node, called = world.node(), []
     timers = [node.create_timer(0.01, lambda: called.append(True)) for _ in range(2)]
     time.sleep(0.02)
@@ -544,7 +544,7 @@ def test_spin_once_does_one_thing(world):
         timer.cancel()
 
 
-def test_an_exception_of_a_callback_is_raised_by_spin(world):
+def test_spin_raises_the_exception_of_a_callback(world):
     node = world.node()
 
     def fail():
@@ -555,7 +555,7 @@ def test_an_exception_of_a_callback_is_raised_by_spin(world):
         world.until(lambda: False)
 
 
-def test_futures_and_coroutines(world):
+def test_executor_runs_coroutines_that_await_futures(world):
     world.node()
     future, steps = rclpy.task.Future(), []
 
@@ -580,7 +580,7 @@ def test_futures_and_coroutines(world):
     assert called == [3] and other.done() and not other.cancelled()
 
 
-def test_spin_until_future_complete(world):
+def test_spin_until_future_complete_ends_in_time(world):
     node = world.node()
     future = rclpy.task.Future()
     before = time.monotonic()
@@ -591,7 +591,7 @@ def test_spin_until_future_complete(world):
     assert future.result() == 1
 
 
-def test_callback_groups_decide_which_callbacks_run_in_parallel(context):
+def test_callback_group_decides_what_runs_in_parallel(context):
     from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
     for group, together in ((ReentrantCallbackGroup(), 2), (MutuallyExclusiveCallbackGroup(), 1)):
         node = rclpy.create_node('busy', context=context)
@@ -618,7 +618,7 @@ def test_callback_groups_decide_which_callbacks_run_in_parallel(context):
         assert most[0] >= together if together == 2 else most[0] == 1
 
 
-def test_a_group_of_ones_own_may_change_its_mind(world):
+def test_custom_callback_group_delays_a_callback(world):
     from rclpy.callback_groups import CallbackGroup
 
     class Tokens(CallbackGroup):
@@ -640,7 +640,7 @@ def test_a_group_of_ones_own_may_change_its_mind(world):
     world.until(lambda: len(calls) == 3)
 
 
-def test_adding_and_removing_nodes(world):
+def test_node_belongs_to_one_executor(world):
     node = world.node()
     assert node.executor is world.executor and not world.executor.add_node(node)
     other = SingleThreadedExecutor(context=world.context)
@@ -651,7 +651,7 @@ def test_adding_and_removing_nodes(world):
     other.shutdown()
 
 
-def test_shutdown_ends_spinning(context):
+def test_shutdown_ends_spin(context):
     node = rclpy.create_node('still', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -704,7 +704,7 @@ rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_and_the_console(number):
+def test_node_logs_and_ends_on_a_signal(number):
     process = subprocess.Popen(
         [sys.executable, '-c', PROGRAM], stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
@@ -729,7 +729,7 @@ def test_signals_and_the_console(number):
         '[INFO] [T] [sleeper]: spinning', '[FATAL] [T] [sleeper]: over']
 
 
-def test_log_level_from_the_command_line():
+def test_log_level_is_set_on_the_command_line():
     program = PROGRAM.replace('rclpy.spin(node)', 'raise KeyboardInterrupt').replace(
         'while rclpy.ok()', 'while False')
     done = subprocess.run(
@@ -775,13 +775,13 @@ library, _dds._lib = _dds._lib, Slow()
 
 @pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
                     reason="it is the embedded default's own ending")
-def test_a_second_interrupt_at_the_end_is_no_error():
+def test_interrupt_at_exit_is_no_error():
     done = subprocess.run([sys.executable, '-c', INTERRUPTED_AT_ITS_END], capture_output=True,
                           text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, '')
 
 
-def test_importing_rclpy_is_quick():
+def test_rclpy_is_imported_within_a_second():
     code = 'import time; t = time.perf_counter(); import rclpy; print(time.perf_counter() - t)'
     times = [float(subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                                   check=True, timeout=30).stdout) for _ in range(5)]

@@ -45,7 +45,7 @@ def namespaces():
 @pytest.mark.skipif(not namespaces(), reason='no right to make a network of its own')
 @pytest.mark.parametrize('scope', ['SUBNET', 'LOCALHOST', 'LOCALHOST 127.0.0.2'])
 @pytest.mark.parametrize('network', NETWORKS)
-def test_discovery_without_configuration(network, scope):
+def test_nodes_discover_each_other_without_configuration(network, scope):
     scope, _, peers = scope.partition(' ')
     environment = {name: value for name, value in os.environ.items()
                    if name not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
@@ -74,7 +74,7 @@ kill $! 2>/dev/null; wait
 
 
 @pytest.mark.skipif(not namespaces(), reason='no right to make a network of its own')
-def test_a_computer_is_heard_that_has_this_one_among_its_peers(tmp_path):
+def test_static_peer_on_one_computer_is_enough(tmp_path):
     environment = {name: value for name, value in os.environ.items()
                    if name not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID', 'ROS_STATIC_PEERS')}
     environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

@@ -85,7 +85,7 @@ def world():
 
 # --- parameters ---------------------------------------------------------------------------------
 
-def test_declaring_and_reading(world):
+def test_parameters_are_declared_and_read(world):
     node = world.node('one')
     assert node.declare_parameter('speed', 1.5).value == 1.5
     assert node.get_parameter('speed').type_ == Parameter.Type.DOUBLE
@@ -113,7 +113,7 @@ def test_declaring_and_reading(world):
     assert not node.has_parameter('speed')
 
 
-def test_setting(world):
+def test_parameter_is_set_or_refused_with_a_reason(world):
     node, told = world.node('one'), []
     node.declare_parameter('count', 2, ParameterDescriptor(
         integer_range=[IntegerRange(from_value=0, to_value=10, step=2)]))
@@ -145,7 +145,7 @@ def test_setting(world):
         node.declare_parameter('new', 1)
 
 
-def test_all_or_none(world):
+def test_parameters_are_set_atomically(world):
     node = world.node('one', allow_undeclared_parameters=True)
     node.declare_parameter('fixed', 1, ParameterDescriptor(read_only=True))
     done = node.set_parameters_atomically(
@@ -157,7 +157,7 @@ def test_all_or_none(world):
     assert node.set_parameters([Parameter('a')])[0].successful and not node.has_parameter('a')
 
 
-def test_values_from_the_command_line_and_files(tmp_path):
+def test_parameters_come_from_command_line_and_files(tmp_path):
     file = tmp_path / 'values.yaml'
     file.write_text(
         '/**:\n  ros__parameters:\n    all: 1\n    shared: everyone\n'
@@ -185,7 +185,7 @@ def test_values_from_the_command_line_and_files(tmp_path):
     context.shutdown()
 
 
-def test_parameters_of_another_node(world):
+def test_client_sets_parameters_of_another_node(world):
     server, client_node, events = world.node('server'), world.node('client', 1), []
     server.declare_parameter('gain', 2.0)
     client_node.create_subscription(ParameterEvent, '/parameter_events', events.append, 10)
@@ -213,13 +213,13 @@ def test_parameters_of_another_node(world):
 @pytest.mark.parametrize('text, value', [
     ('1', 1), ('1.5', 1.5), ('true', True), ('abc', 'abc'), ('[1, 2]', [1, 2]),
     ('[a, b]', ['a', 'b']), ('', ''), ('[1, a]', '[1, a]')])
-def test_values_as_one_types_them(text, value):
+def test_typed_text_becomes_a_parameter_value(text, value):
     assert parameter_value_to_python(get_parameter_value(text)) == value
 
 
 # --- the graph ----------------------------------------------------------------------------------
 
-def test_nodes_topics_and_services_show(world):
+def test_graph_shows_nodes_topics_and_services(world):
     here, there = world.node('here', namespace='/a'), world.node('there', 1)
     here.create_publisher(String, 'chatter', QoSProfile(
         depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -259,7 +259,7 @@ def test_nodes_topics_and_services_show(world):
                 and there.count_publishers('/a/chatter') == 0)
 
 
-def test_rosout(world):
+def test_log_messages_are_published_on_rosout(world):
     talker, reader, got = world.node('talker'), world.node('reader', 1), []
     reader.create_subscription(Log, '/rosout', got.append, QoSProfile(
         depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -270,7 +270,7 @@ def test_rosout(world):
     assert found['careful'].level == Log.WARN and found['careful'].name == 'talker'
     assert found['moving'].name == 'talker.arm' and found['careful'].stamp.sec > 0
     assert found['careful'].file.endswith('test_rclpy_graph.py')
-    assert found['careful'].function == 'test_rosout'
+    assert found['careful'].function == 'test_log_messages_are_published_on_rosout'
 
 
 # --- lifecycle ----------------------------------------------------------------------------------
@@ -293,7 +293,7 @@ class Managed(LifecycleNode):
         return self.answers.get('error', TransitionCallbackReturn.SUCCESS)
 
 
-def test_transitions_from_outside(world):
+def test_service_calls_change_the_lifecycle_state(world):
     node, caller, events, got = world.node('managed', kind=Managed), world.node('c', 1), [], []
     publisher = node.create_lifecycle_publisher(String, 'out', 10)
     caller.create_subscription(String, 'out', got.append, 10)
@@ -330,7 +330,7 @@ def test_transitions_from_outside(world):
     world.until(lambda: events and events[-1].goal_state.label == 'finalized')
 
 
-def test_transitions_that_fail(world):
+def test_failing_transition_is_reported(world):
     node = world.node('managed', kind=Managed)
     node.answers['configure'] = TransitionCallbackReturn.FAILURE
     assert node.trigger_configure() == TransitionCallbackReturn.FAILURE

@@ -76,7 +76,7 @@ def ros2(*arguments, **kwargs):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_packages(package):
+def test_pkg_verbs_find_packages_and_executables(package):
     status, out, err = ros2('pkg', 'list')
     assert status == 0 and 'pkg' in out.split() and out.split() == sorted(out.split())
     assert ros2('pkg', 'prefix', 'pkg') == (0, f'{package}\n', '')
@@ -89,7 +89,7 @@ def test_packages(package):
     assert ros2('pkg', 'executables', 'nope') == (1, '', "Package 'nope' not found\n")
 
 
-def test_run(package):
+def test_run_passes_arguments_and_exit_status(package):
     assert ros2('run', 'pkg', 'status', 'a', '--b') == (
         7, 'a --b\n[ros2run]: Process exited with failure 7\n', '')
     status, out, _ = ros2('run', 'pkg', 'killed')
@@ -100,7 +100,7 @@ def test_run(package):
     assert ros2('run', 'nope', 'x') == (1, '', "Package 'nope' not found\n")
 
 
-def test_help_names_the_commands(package):
+def test_help_lists_the_commands(package):
     status, out, _ = ros2('--help')
     assert status == 0 and out.startswith('usage: ros2 [-h]')
     for line in ('launch', 'run', 'pkg'):
@@ -117,7 +117,7 @@ def test_help_names_the_commands(package):
 @pytest.mark.parametrize('words', [
     ('bag', 'record', '-a'), ('action', 'list', '-t'), ('topic', 'delay', '/x'),
     ('service', 'type', '/x')])
-def test_missing_dependency_is_named(words):
+def test_missing_command_names_ros2(words):
     status, out, err = ros2(*words)
     name = words[0] if words[0] in ('bag', 'action') else ' '.join(words[:2])
     assert (status, out) == (1, '') and err.startswith(
@@ -151,7 +151,7 @@ def test_launch_description_is_printed(package):
     assert "ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
 
 
-def test_a_launch_file_is_launched(package):
+def test_launch_file_runs_with_arguments(package):
     status, out, err = ros2('launch', 'pkg', 'say.launch.xml', 'word:=one', 'word:=two')
     assert (status, err) == (0, '') and '[INFO] [launch.user]: says two' in out.splitlines()
     path = package / 'share' / 'pkg' / 'launch' / 'say.launch.xml'
@@ -168,7 +168,7 @@ def test_a_launch_file_is_launched(package):
     (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "
                                     "'<name>:=<value>'"),
 ])
-def test_errors_are_one_line_and_status_1(package, arguments, error):
+def test_launch_error_is_one_line_and_status_1(package, arguments, error):
     status, out, err = ros2('launch', *arguments)
     assert (status, len(err.splitlines())) == (1, 1) and err.startswith(error)
 
@@ -197,7 +197,7 @@ def wait_until_ready(process, count):
     return lines
 
 
-def test_two_nodes_until_interrupted(package):
+def test_interrupt_ends_both_nodes_of_a_launch(package):
     process = start('pkg', 'a.launch.py', 'word:=false')
     try:
         lines = wait_until_ready(process, 2)
@@ -213,7 +213,7 @@ def test_two_nodes_until_interrupted(package):
     assert 'All log files can be found below' in lines[0]
 
 
-def test_a_prefix_for_executables(package):
+def test_launch_prefix_precedes_each_executable(package):
     status, out, _ = ros2(
         'launch', '--launch-prefix', 'echo prefixed', '-a', 'pkg', 'a.launch.py', 'word:=0')
     assert status == 0
@@ -295,7 +295,7 @@ def test_commands_come_from_entry_points(package, tmp_path):
     assert status == 1 and "No module named 'fogtest_that_is_not_there'" in err
 
 
-def test_versions_of_extension_points():
+def test_incompatible_extension_point_is_refused():
     satisfies_version('0.1', '^0.1')
     satisfies_version('1.4', '^1.2')
     for version, caret_range in (('0.1', '^0.2'), ('0.2', '^0.1'), ('2.0', '^1.2')):

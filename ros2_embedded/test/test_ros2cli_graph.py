@@ -70,7 +70,7 @@ def ros2(*command, status=0, timeout=40, until=None, by=signal.SIGINT):
     return said + out + errors
 
 
-def test_topics(worker):
+def test_topic_list_and_info_show_topics(worker):
     listed = ros2('topic', 'list', '-t').splitlines()
     assert '/cell/chatter [std_msgs/msg/String]' in listed and '/rosout [' in str(listed)
     info = ros2('topic', 'info', '/cell/chatter')
@@ -81,7 +81,7 @@ def test_topics(worker):
     assert "Unknown topic '/none'" in ros2('topic', 'info', '/none', status=1)
 
 
-def test_echo(worker):
+def test_topic_echo_prints_messages(worker):
     assert ros2('topic', 'echo', '--once', '/cell/chatter') == 'data: hello\n---\n'
     assert ros2('topic', 'echo', '--once', '--field', 'data', '/cell/chatter') == 'hello\n---\n'
     assert ros2('topic', 'echo', '--once', '/cell/chatter', 'std_msgs/msg/String') == \
@@ -93,7 +93,7 @@ def test_echo(worker):
     assert 'message type is invalid' in ros2('topic', 'echo', '/x', 'no/such', status=1)
 
 
-def test_pub(worker):
+def test_topic_pub_publishes_and_ends(worker):
     done = ros2('topic', 'pub', '--once', '/cell/orders', 'std_msgs/msg/String', '{data: go}')
     assert "publishing #1: std_msgs.msg.String(data='go')" in done
     assert worker.stdout.readline() == 'go\n'
@@ -108,7 +108,7 @@ def test_pub(worker):
 
 
 @pytest.mark.parametrize('options', [(), ('-r', '5'), ('-w', '0')])
-def test_pub_repeats_until_interrupted(worker, options):
+def test_topic_pub_repeats_until_interrupted(worker, options):
     ros2('topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}',
          until='publishing #3', status=signal.SIGINT)
     assert [worker.stdout.readline() for _ in range(2)] == ['again\n'] * 2
@@ -117,21 +117,21 @@ def test_pub_repeats_until_interrupted(worker, options):
 @pytest.mark.parametrize('command', [
     ('topic', 'pub', '--once', '/nobody', 'std_msgs/msg/String'),
     ('service', 'call', '/nobody', 'example_interfaces/srv/AddTwoInts')])
-def test_sigterm_ends_a_command_that_waits(command):
+def test_sigterm_ends_a_waiting_command(command):
     said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=10)
     assert 'publishing' not in said and 'response' not in said
     if importlib.util.find_spec('rosidl_embedded'):
         assert len(said.splitlines()) == 1
 
 
-def test_rates(worker):
+def test_topic_hz_and_bw_measure(worker):
     rate = ros2('topic', 'hz', '/cell/chatter', until='window: ', status=None)
     assert 15 < float(rate.split('average rate: ')[1].split()[0]) < 25
     width = ros2('topic', 'bw', '/cell/chatter', until='Message size mean: ', status=None)
     assert 'Subscribed to [/cell/chatter]' in width
 
 
-def test_nodes(worker):
+def test_node_list_and_info_show_nodes(worker):
     assert '/cell/worker' in ros2('node', 'list').splitlines()
     info = ros2('node', 'info', '/cell/worker').splitlines()
     assert info[0] == '/cell/worker'
@@ -144,7 +144,7 @@ def test_nodes(worker):
     assert "Unable to find node '/none'" in ros2('node', 'info', '/none', status=1)
 
 
-def test_services(worker):
+def test_service_list_and_call_work(worker):
     assert '/cell/add [example_interfaces/srv/AddTwoInts]' in \
         ros2('service', 'list', '-t').splitlines()
     called = ros2('service', 'call', '/cell/add', 'example_interfaces/srv/AddTwoInts',
@@ -155,7 +155,7 @@ def test_services(worker):
     assert 'service type is invalid' in ros2('service', 'call', '/x', 'no/such', status=1)
 
 
-def test_parameters(worker):
+def test_param_verbs_list_get_and_set(worker):
     listed = ros2('param', 'list', '/cell/worker').splitlines()
     assert {'  arm.joints', '  speed', '  use_sim_time'} <= {*listed} and sorted(listed) == listed
     assert '/cell/worker:' in ros2('param', 'list').splitlines()

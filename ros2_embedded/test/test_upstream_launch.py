@@ -101,7 +101,7 @@ def ros2():
 
 
 @pytest.mark.parametrize('file', FILES)
-def test_launch_files(prefix, tmp_path, file):
+def test_launch_file_of_ros2_starts_its_programs(prefix, tmp_path, file):
     container = 'component_container' in named(EXECUTABLE, file)
     status, out = launched(prefix, tmp_path, ros2(), 'launch', str(SOURCES / file),
                            until='I am ' if container else None)
@@ -121,7 +121,7 @@ def example(tmp_path, name):
     return str(path)
 
 
-def test_talker_and_listener(prefix, tmp_path):
+def test_example_starts_talker_and_listener(prefix, tmp_path):
     status, out = launched(
         prefix, tmp_path, sys.executable, example(tmp_path, 'pub_sub_launch.py'))
     assert status == 0 and 'Starting introspection of launch description' in out
@@ -129,7 +129,7 @@ def test_talker_and_listener(prefix, tmp_path):
         assert f'/{name} --ros-args -r chatter:=my_chatter' in out
 
 
-def test_lifecycle_talker_and_listener(prefix, tmp_path):
+def test_example_activates_the_lifecycle_talker(prefix, tmp_path):
     write(prefix / 'lib/lifecycle/lifecycle_talker', NODE.format(
         python=sys.executable, folder=str(SOURCES / 'demos/lifecycle_py'),
         module='lifecycle_py.talker'))

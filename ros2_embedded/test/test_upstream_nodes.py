@@ -142,7 +142,7 @@ def names(cases):
 
 
 @pytest.mark.parametrize('others, one, expected', ENDING, ids=names(ENDING))
-def test_what_ends_does_so(others, one, expected):
+def test_demo_prints_its_result_and_ends(others, one, expected):
     with ExitStack() as stack:
         for other in others:
             stack.enter_context(running(*other))
@@ -152,7 +152,7 @@ def test_what_ends_does_so(others, one, expected):
 
 
 @pytest.mark.parametrize('others, one, expected', SPINNING, ids=names(SPINNING))
-def test_what_spins_says_what_it_should(others, one, expected):
+def test_demo_prints_its_result_while_spinning(others, one, expected):
     with ExitStack() as stack:
         for other in others:
             stack.enter_context(running(*other))
@@ -160,7 +160,7 @@ def test_what_spins_says_what_it_should(others, one, expected):
             shows(process, *expected)
 
 
-def test_a_talker_is_interrupted():
+def test_demo_talker_ends_on_interrupt():
     with running(*demo('topics.talker')) as process, running(*demo('topics.listener')) as other:
         shows(other, 'I heard')  # it isn't about to publish: that would fail, as on ROS 2
         process.send_signal(signal.SIGINT)
@@ -172,7 +172,7 @@ def test_parameters_of_a_demo_are_set():
         shows(setter, '[9.0, 4.0]')
 
 
-def test_a_demo_sets_lists_loads_and_deletes_parameters(tmp_path, monkeypatch):
+def test_demo_sets_lists_loads_and_deletes_parameters(tmp_path, monkeypatch):
     share = tmp_path / 'share/demo_nodes_py'
     share.mkdir(parents=True)
     shutil.copy(SOURCES / DEMOS / 'demo_nodes_py/parameters/params.yaml', share)

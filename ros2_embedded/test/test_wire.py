@@ -138,7 +138,7 @@ def side(peer):
     made.context.try_shutdown()
 
 
-def test_messages_go_there_and_back(side):
+def test_ros2_node_returns_a_message(side):
     got = []
     publisher = side.node.create_publisher(String, '/real/there', 10)
     side.node.create_subscription(String, '/real/back', got.append, 10)
@@ -148,7 +148,7 @@ def test_messages_go_there_and_back(side):
     assert got[0].data == 'grüße'
 
 
-def test_large_messages_go_there_and_back(side):
+def test_ros2_node_returns_a_large_message(side):
     got, image = [], Image(height=720, width=1280, encoding='bgr8', step=3840)
     image.data = bytes(range(256)) * 10800
     publisher = side.node.create_publisher(Image, '/real/image_there', 10)
@@ -160,7 +160,7 @@ def test_large_messages_go_there_and_back(side):
     assert got[0] == image
 
 
-def test_latched_messages_come_late(side):
+def test_latched_message_of_ros2_is_received_late(side):
     got = []
     side.node.create_subscription(String, '/real/latched', got.append, QoSProfile(
         depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -168,7 +168,7 @@ def test_latched_messages_come_late(side):
     assert got[0].data == 'from ROS 2'
 
 
-def test_its_services_answer(side):
+def test_service_of_ros2_answers(side):
     client = side.node.create_client(AddTwoInts, '/real/add')
     assert client.wait_for_service(timeout_sec=LIMIT)
     futures = [client.call_async(AddTwoInts.Request(a=number, b=2)) for number in range(8)]
@@ -176,7 +176,7 @@ def test_its_services_answer(side):
     assert [future.result().sum for future in futures] == list(range(2, 10))
 
 
-def test_its_parameters_can_be_set(side):
+def test_parameter_of_a_ros2_node_is_set(side):
     client = AsyncParameterClient(side.node, '/real/peer')
     assert client.wait_for_services(timeout_sec=LIMIT)
     from rclpy.parameter import Parameter
@@ -185,7 +185,7 @@ def test_its_parameters_can_be_set(side):
     assert future.result().results[0].successful
 
 
-def test_it_shows_in_our_graph(side):
+def test_ros2_node_is_in_our_graph(side):
     side.until(lambda: ('peer', '/real') in side.node.get_node_names_and_namespaces())
     side.until(lambda: ('/real/add', ['example_interfaces/srv/AddTwoInts'])
                in side.node.get_service_names_and_types_by_node('peer', '/real'))
@@ -196,7 +196,7 @@ def test_it_shows_in_our_graph(side):
     assert len({str(one.topic_type_hash) for one in ours}) == 1
 
 
-def test_we_show_in_its_graph_and_answer_its_commands(side):
+def test_commands_of_ros2_see_our_node(side):
     side.node.declare_parameter('speed', 1.5)
     side.node.create_publisher(String, 'chatter', 3)
 
@@ -230,7 +230,7 @@ def test_we_show_in_its_graph_and_answer_its_commands(side):
         thread.join(LIMIT)
 
 
-def test_it_shows_in_our_commands(peer):
+def test_our_commands_see_a_ros2_node(peer):
     command = str(Path(sys.executable).with_name('ros2'))
     for words, expected in ((('node', 'list'), '/real/peer'), (('topic', 'list'), '/real/there'),
                             (('service', 'list'), '/real/add'),
@@ -243,7 +243,7 @@ def test_it_shows_in_our_commands(peer):
 
 
 @pytest.mark.parametrize('peers', ['', '127.0.0.2'])
-def test_both_find_each_other_on_this_computer_alone(monkeypatch, peers):
+def test_nodes_discover_each_other_on_one_computer(monkeypatch, peers):
     """The older one to be there is ours, then ROS 2's: each has to answer a newcomer."""
     domain = int(os.environ['ROS_DOMAIN_ID']) + 100
     monkeypatch.delenv('CYCLONEDDS_URI')
@@ -268,7 +268,7 @@ def test_both_find_each_other_on_this_computer_alone(monkeypatch, peers):
         context.try_shutdown()
 
 
-def test_nobody_warned_of_anything(side, capfd):
+def test_neither_side_logs_a_warning(side, capfd):
     publisher = side.node.create_publisher(String, '/real/there', 10)
     side.node.create_subscription(String, '/real/back', lambda _: None, 10)
     side.until(lambda: publisher.get_subscription_count() == 1)
@@ -322,7 +322,7 @@ for name in sys.argv[1:]:
 '''
 
 
-def test_all_interfaces_are_written_as_ros_2_writes_them():
+def test_every_interface_is_serialized_as_by_ros2():
     from rosidl_embedded.definition import table, TABLES
     names = [f'{package}/{name}' for package in sorted(one.stem for one in TABLES.glob('*.txt'))
              for name in table(package)]
@@ -335,7 +335,7 @@ def test_all_interfaces_are_written_as_ros_2_writes_them():
     assert [line for line in theirs if line not in known] == []
 
 
-def test_type_hashes_are_those_that_ros_2_generated():
+def test_type_hashes_equal_those_of_ros2():
     import json
 
     from rosidl_embedded.definition import table, TABLES
