@@ -47,7 +47,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Keep together, where several processes share the tests, what shares something costly.
 
     That is the cluster of the pods and the simulated EC2; of all else, the fixtures of a module.
-    The two take longest, so they come first.
+    The two take longest, so they come first, and tests without a machine come last: no process
+    begins with something long when the others are done.
     """
     def group(item: pytest.Item) -> str:
         folder = item.path.parent.name
@@ -55,7 +56,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     for item in items:
         item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: group(item) not in ('kubernetes', 'aws'))
+    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws'),
+                                 'integration' not in item.path.parts))
 
 
 @pytest.fixture(autouse=True)
@@ -138,23 +140,28 @@ def moto_server() -> Iterator[str]:
 
 
 @pytest.fixture
-def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poll clouds without the pauses that real ones need."""
+    from fogros2 import waiting
+
+    def wait_until(probe: Any, **options: Any) -> Any:
+        return waiting.wait_until(probe, **{**options, 'first': 0.0, 'interval': 0.02})
+
+    for module in [found for name, found in sys.modules.items()
+                   if name.startswith('fogros2.provider.') and hasattr(found, 'wait_until')]:
+        monkeypatch.setattr(module, 'wait_until', wait_until)
+
+
+@pytest.fixture
+def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
     from moto.ec2.models import ec2_backends
     from moto.ec2.models.amis import AmiBackend
     from moto.ssm.models import Parameter, ssm_backends
 
-    from fogros2 import waiting
     from fogros2.provider.aws import images
 
-    def hasty(probe: Any, **options: Any) -> Any:
-        return waiting.wait_until(probe, **{**options, 'first': 0.0, 'interval': 0.02})
-
-    # the pauses are for EC2: Moto ends an instance at once
-    for module in [found for name, found in sys.modules.items()
-                   if name.startswith('fogros2.provider.') and hasattr(found, 'wait_until')]:
-        monkeypatch.setattr(module, 'wait_until', hasty)
     # a thousand of other people's images, loaded anew for each test and region
     monkeypatch.setenv('MOTO_EC2_LOAD_DEFAULT_AMIS', 'false')
     urllib.request.urlopen(urllib.request.Request(
@@ -183,9 +190,10 @@ def moto_aws(moto_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
         return image
 
     monkeypatch.setattr(AmiBackend, 'create_image', create_with_snapshots)
-    # Moto has no price list
-    monkeypatch.setattr('fogros2.provider.vm.market.Market.price_of',
-                        lambda *args, **kwargs: Decimal('0.0416'))
+    # Moto has no price list, and boto3 would ask it again and again
+    monkeypatch.setattr('fogros2.provider.aws.prices.Ec2Prices.prices', lambda *args: {
+        name: Decimal(price) for name, price in (
+            ('t3.large', '0.0832'), ('t3.medium', '0.0416'), ('t3.xlarge', '0.1664'))})
     for region in MOTO_REGIONS:
         for arch in images.UBUNTU:
             for path in (images.UBUNTU[arch], images.DEEP_LEARNING[arch]):

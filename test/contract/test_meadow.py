@@ -15,7 +15,7 @@ from rigs.meadow.server import Meadow, serve, TOKEN
 
 
 @pytest.fixture
-def meadow(monkeypatch, tmp_path):
+def meadow(hasty, monkeypatch, tmp_path):
     """Serve an empty Meadow on the loopback."""
     state = Meadow()
     server = serve(state)

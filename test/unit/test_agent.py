@@ -44,7 +44,8 @@ def test_event_is_found_beyond_a_block(tmp_path, size):
     for extra in range(40):
         log.append([event('x' * (size + extra)), event('short')])
     for seq in range(1, 81):
-        assert read(log, seq)[0]['seq'] == seq
+        data, _ = log.read(log.find(seq))
+        assert json.loads(data.splitlines()[0])['seq'] == seq
 
 
 def test_lost_event_is_searched_from_the_oldest(tmp_path):

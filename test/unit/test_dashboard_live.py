@@ -43,7 +43,8 @@ def provider(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def live() -> Iterator[Live]:
+def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
+    monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
     made = Live()
     made.start()
     yield made
@@ -126,7 +127,7 @@ def test_deletion_is_refused_forced_and_reported(live: Live) -> None:
 
 
 def test_orphan_is_shown_and_another_robots_machine_is_not(
-    live: Live,
+    request: pytest.FixtureRequest,
 ) -> None:
     machine('orphan')
     Store().delete('orphan')
@@ -134,17 +135,19 @@ def test_orphan_is_shown_and_another_robots_machine_is_not(
     Store().delete('others')
     Memory.machines['id-others'] = dataclasses.replace(
         Memory.machines['id-others'], tags={TAG_NAME: 'others', TAG_ROBOT: 'another'})
+    live = request.getfixturevalue('live')
     assert '(orphan)' in when(live, 'orphan', lambda one: True)['state']
     assert [one['name'] for one in live.state()['machines']] == ['orphan']
 
 
-def test_machines_of_one_name_are_separate(live: Live) -> None:
+def test_machines_of_one_name_are_separate(request: pytest.FixtureRequest) -> None:
     """As in two regions, of launches that this robot has forgotten; then a launch has a third."""
     for number in '12':
         machine('a')
         Memory.machines[f'id-{number}'] = dataclasses.replace(
             Memory.machines.pop('id-a'), id=f'id-{number}', region=f'region-{number}')
     Store().delete('a')
+    live = request.getfixturevalue('live')
 
     def shown() -> dict[str, str]:
         return {one['key']: one['id'] for one in live.state()['machines'] if not one['ended']}
@@ -173,12 +176,13 @@ def test_dead_launch_and_damaged_record_are_shown(live: Live) -> None:
 
 def test_nothing_is_polled_while_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
-    monkeypatch.setattr('ros2fog_cli.api.live.PRESENT', 0.5)
+    monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
+    monkeypatch.setattr('ros2fog_cli.api.live.PRESENT', 0.2)
     monkeypatch.setattr(Store, 'machines', lambda store: asked.append(time.monotonic()) or [])
     live = Live()
     live.start()
     try:
-        wait_until(lambda: asked and time.monotonic() - asked[-1] > 1.0, timeout=10.0,
+        wait_until(lambda: asked and time.monotonic() - asked[-1] > 0.5, timeout=10.0,
                    what='quiet')
         before = len(asked)
         live.state(-1, 0.0)

@@ -19,7 +19,7 @@ from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch, robot_vpn
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
-from fogros2.deploy.steps import connecting, dds, installing
+from fogros2.deploy.steps import connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.creating import Creation
@@ -55,7 +55,7 @@ from fogros2.shell import host_key
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.plugins import instead
-from fogros2.waiting import Timeouts, wait_until
+from fogros2.waiting import Periodic, Timeouts, wait_until
 
 SPEC = MachineSpec('planner', 'fake')
 
@@ -513,6 +513,8 @@ def test_failing_watch_is_reported_and_becomes_a_fault(
         raise KeyError('Reservations')
 
     monkeypatch.setattr(provider, 'describe', describe)
+    monkeypatch.setattr(watching, 'Periodic',
+                        lambda name, interval, work: Periodic(name, 0.01, work))
     watch = Watch(context, mine, gone=fail, found=fail)
     wait_until(lambda: bool(heard), timeout=10, what='a word of it')
     assert "KeyError: 'Reservations'" in heard[0].reason and heard[0].machine == 'planner'
