@@ -478,14 +478,17 @@ def test_clock_sleeps_in_steady_and_simulated_time(context):
     threading.Timer(0.05, simulated.set_ros_time_override, [until]).start()
     assert simulated.sleep_until(until, context)
 
+    awake = threading.Event()
+
     def switch() -> None:
-        deadline = time.monotonic() + 30
-        while not simulated._jumps and time.monotonic() < deadline:  # until somebody sleeps
-            time.sleep(0.001)
-        simulated._set_ros_time_is_active(False)
+        for active in 300 * (False, True):  # the first may come before anybody sleeps
+            if awake.wait(0.05):
+                return
+            simulated._set_ros_time_is_active(active)
 
     threading.Thread(target=switch).start()
     assert not simulated.sleep_for(Duration(seconds=60), context)
+    awake.set()
 
 
 def test_simulated_clock_drives_time_and_timers(world):
