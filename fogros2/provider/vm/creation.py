@@ -208,7 +208,7 @@ class Creation:
     def _places(self, region: str, order: Order, types: list[str]) -> Iterator[Place]:
         """Yield the places: all zones of the first type, then of the next."""
         zones: list[str] = []
-        more = self._cloud.places(region, order)
+        more = iter(self._cloud.places(region, order))
         for kind in types:
             yield from [Place(region, kind, zone) for zone in zones]
             for zone in more:  # only while the first type is tried
