@@ -8,6 +8,11 @@ from pathlib import Path
 import subprocess
 import sys
 
+import pytest
+
+from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec
+
 TEMPLATE = Path(__file__).resolve().parents[2] / 'doc' / 'provider_template'
 
 
@@ -24,3 +29,13 @@ def test_launch_files_can_name_the_template_s_machine(monkeypatch):
     monkeypatch.syspath_prepend(str(TEMPLATE))
     from fogros2_shelf.machines import ShelfInstance
     assert ShelfInstance(folder='/srv/shelf', name='planner').provider == 'shelf'
+
+
+def test_cloud_template_checks_its_options(monkeypatch):
+    monkeypatch.syspath_prepend(str(TEMPLATE))
+    monkeypatch.setenv('MEADOW_TOKEN', 'token')
+    from fogros2_meadow import MeadowProvider
+    options = {'region': 'north', 'machine_types': ('large',)}
+    MeadowProvider().check(MachineSpec('planner', 'meadow', options))
+    with pytest.raises(ConfigurationError, match='no spot machines'):
+        MeadowProvider().check(MachineSpec('planner', 'meadow', {**options, 'spot': True}))
