@@ -275,7 +275,7 @@ def test_a_machine_that_dials_a_robot_that_moves_dials_it_there(
         wait_until(lambda: any(
             isinstance(event, StepDone) and f'dials {later}:' in event.detail
             and event.step.startswith('VPN, from') for event in events),
-            timeout=25, what='the machine to dial again')
+            timeout=60, what='the machine to dial again')
         begin = time.monotonic()
         wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=10,
                    what='the heartbeat')

@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from fogros2.runtime import uncompressed
+from fogros2.waiting import wait_until
 
 rclpy = pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is here')
 
@@ -22,8 +23,9 @@ def test_image_topic_between_two_hosts_is_found() -> None:
     camera.create_publisher(Image, '/camera/image_raw', 1)
     slam.create_subscription(Image, '/camera/image_raw', lambda _: None, 1)
     try:
-        found = uncompressed.crossing_images(
-            {'planner': ['slam']}, os.environ, threading.Event())
+        # on a busy computer, one inspection may end before it has discovered both nodes
+        found = wait_until(lambda: uncompressed.crossing_images(
+            {'planner': ['slam']}, os.environ, threading.Event()), timeout=60, what='the topic')
         assert found == ['/camera/image_raw']
         assert uncompressed.crossing_images({}, os.environ, threading.Event()) == []
     finally:
