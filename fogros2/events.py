@@ -142,7 +142,11 @@ class Gap(TypedDict):
 
 
 class MachineLost(TypedDict):
-    """The machine ended, stopped or was evicted, as its provider reports; the last event."""
+    """
+    The machine ended, stopped or was evicted, as its provider reports; the last event.
+
+    Or it is lost: neither it nor its provider answers.
+    """
 
     event: Literal['lost']
     reason: str

@@ -81,7 +81,16 @@ class Warned:
     remedy: str
 
 
-Event = Union[StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured, Warned]
+@dataclasses.dataclass(frozen=True)
+class Silence:
+    """A machine has not answered for ``seconds``; 0: it answers again."""
+
+    machine: str
+    seconds: float
+
+
+Event = Union[
+    StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured, Warned, Silence]
 Reporter = Callable[[Event], None]
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 import json
 import threading
 from typing import Any, Optional
@@ -14,7 +15,7 @@ from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
 from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import Watch
-from fogros2.errors import AgentError
+from fogros2.errors import AgentError, FogError
 from fogros2.events import Event
 from fogros2.model import host_port, Machine, NodeSpec, to_json
 
@@ -47,8 +48,8 @@ class RunningMachine(Step):
         self._callbacks: list[EventCallback] = []
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
-        if context.capabilities.owned:
-            job.undo.callback(Watch(context, job, gone=self._gone, found=found).close)
+        job.undo.callback(Watch(
+            context, job, gone=self._gone, found=found, lost=self._is_lost).close)
 
     def warm(self) -> None:
         """Start the machine's launch process ahead of its nodes; once."""
@@ -133,12 +134,24 @@ class RunningMachine(Step):
 
     def _gone(self, reason: str) -> None:
         """Report, once, that the provider has ended the machine; close the connection."""
+        self._report_end(reason)
+        self.agent.close()
+
+    def _is_lost(self, reason: str) -> None:
+        """Report, once, that the machine is lost; stop its nodes there if it comes back."""
+        self._report_end(reason)
+        self.heartbeat.close()
+        with contextlib.suppress(FogError):
+            # they may run on the robot by then
+            self.agent.request('stop', nodes=None, timeout=self.spec.robot_timeout)
+        self.agent.close()
+
+    def _report_end(self, reason: str) -> None:
         with self._lock:
             self._lost = reason
             callbacks = list(self._callbacks)
         for callback in callbacks:
             callback({'event': 'lost', 'reason': reason})
-        self.agent.close()
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""

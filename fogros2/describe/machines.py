@@ -66,7 +66,8 @@ class CloudInstance:
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
     :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
         system has the same package, the system's version is used.
-    :param on_interrupt: what to do when the provider reclaims the machine while its nodes run.
+    :param on_interrupt: what to do when the provider reclaims the machine while its nodes run, or
+        when neither the machine nor its provider has answered for 37 s.
         'shutdown' ends the launch with a nonzero exit status. 'robot' restarts the nodes on the
         robot, where their programs must be installed. They keep names and parameters, and lose
         their memory: lifecycle states and loaded components.

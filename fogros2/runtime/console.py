@@ -15,6 +15,7 @@ from fogros2.report import (
     Event,
     OutputLine,
     Progress,
+    Silence,
     StepDone,
     StepFailed,
     StepStarted,
@@ -74,6 +75,11 @@ class Console:
                     f'{what}\nsynchronise both clocks: sudo apt-get install chrony')
             elif isinstance(event, Warned):
                 self._logger.warning(f'{event.text}\n{event.remedy}')
+            elif isinstance(event, Silence) and event.seconds:
+                self._logger.warning(f'{event.machine}: no answer for {event.seconds:.0f} s '
+                                     '(VPN); nodes keep running')
+            elif isinstance(event, Silence):
+                self._logger.info(f'{event.machine}: answers again')
             self._draw()
 
     def table(self) -> None:

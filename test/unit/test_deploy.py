@@ -19,6 +19,7 @@ from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch, robot_vpn
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
+from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps import connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
@@ -514,13 +515,92 @@ def test_failing_watch_is_reported_and_becomes_a_fault(
 
     monkeypatch.setattr(provider, 'describe', describe)
     monkeypatch.setattr(watching, 'Periodic',
-                        lambda name, interval, work: Periodic(name, 0.01, work))
+                        lambda name, interval, work, **stop: Periodic(
+                            name, 0.01, work, **stop))
     watch = Watch(context, mine, gone=fail, found=fail)
-    wait_until(lambda: bool(heard), timeout=10, what='a word of it')
-    assert "KeyError: 'Reservations'" in heard[0].reason and heard[0].machine == 'planner'
+    failed = wait_until(
+        lambda: [event for event in heard if isinstance(event, StepFailed)] or None,
+        timeout=10, what='a word of it')
+    assert "KeyError: 'Reservations'" in failed[0].reason and failed[0].machine == 'planner'
     with pytest.raises(KeyError):
         watch.close()
     watch.close()
+
+
+class Cut:
+    """The agent and the heartbeats of a machine; the link is cut at a time."""
+
+    def __init__(self):
+        self.cut_at = None
+        self.asked = []
+        self.closed = False
+
+    @property
+    def age(self):
+        return 0.0 if self.cut_at is None else time.monotonic() - self.cut_at
+
+    silent_for = age
+
+    def request(self, command, **arguments):
+        self.asked.append(command)
+
+    def subscribe(self, callback, since):
+        pass
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def cut(request, launch, provider, monkeypatch):
+    """Return a running machine's link, what the launch reports, and what a session gets."""
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(
+        owned=getattr(request, 'param', True)))
+    reported, events = [], []
+    provider._machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
+    context, mine = begun(launch, report=reported.append)
+    mine.machine = mine.shell = None
+    mine.interface = SimpleNamespace(address='198.18.7.2')
+    mine.agent = mine.heartbeat = link = Cut()
+    mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
+    running = RunningMachine(context, mine, None, None)
+    running.subscribe(events.append)
+    yield link, reported, events
+    running.close()
+
+
+def test_silence_is_reported_within_5_s_and_its_end(cut, provider):
+    link, reported, events = cut
+    link.cut_at = time.monotonic()
+    wait_until(lambda: bool(reported), timeout=10, what='a report')
+    link.cut_at = None
+    wait_until(lambda: len(reported) > 1, timeout=5, what='the end')
+    assert [(event.machine, round(event.seconds)) for event in reported] == [
+        ('planner', 5), ('planner', 0)]
+    assert events == []
+
+
+@pytest.mark.parametrize('cut', [True, False], indirect=True)
+def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
+    """Its nodes stop there should it be back: they may run on the robot by then."""
+    link, _, events = cut
+    provider.failures.update(describe=ProviderError('no network'))
+    monkeypatch.setattr(watching, 'POLL_INTERVAL', 60.0)
+    monkeypatch.setattr(watching, 'LOSS', 5.5)
+    link.cut_at = time.monotonic()
+    wait_until(lambda: link.closed, timeout=10, what='the verdict')
+    assert [event['event'] for event in events] == ['lost']
+    assert 'it is lost: no answer for ' in events[0]['reason'] and link.asked == ['stop']
+
+
+def test_machine_that_its_provider_knows_is_not_lost(cut, provider, monkeypatch):
+    link, _, events = cut
+    monkeypatch.setattr(watching, 'LOSS', 5.5)
+    monkeypatch.setattr(watching, 'POLL_INTERVAL', 0.2)
+    link.cut_at = time.monotonic()
+    wait_until(lambda: provider.calls.count('describe') > 5 and link.age > 6.5, timeout=20,
+               what='answers of the provider')
+    assert events == []
 
 
 def test_a_port_of_the_robot_that_is_taken_says_what_to_do(launch, monkeypatch):

@@ -14,6 +14,7 @@ from fogros2.report import (
     ClockMeasured,
     OutputLine,
     Progress,
+    Silence,
     StepDone,
     StepFailed,
     StepStarted,
@@ -108,6 +109,14 @@ def test_progress_on_a_terminal_only():
         assert ('2.0 kB' in stream.getvalue()) == drawn
         console.close()
         assert stream.getvalue() == '' or stream.getvalue().endswith('\r\x1b[K')
+
+
+def test_silence_and_its_end_are_a_line_each(lines):
+    console = Console(io.StringIO())
+    console(Silence('planner', 4.7))
+    console(Silence('planner', 0.0))
+    assert lines == [('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
+                     ('INFO', 'planner: answers again')]
 
 
 def test_warning_has_its_remedy_on_a_line_of_its_own(lines):

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import functools
+import threading
+import time
 from typing import Optional
 
 from fogros2.agent_client import Heartbeat
@@ -12,11 +15,15 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.model import Machine, MachineState
-from fogros2.report import ClockMeasured, Reporter, StepFailed
+from fogros2.report import ClockMeasured, Reporter, Silence, StepFailed
 from fogros2.waiting import Periodic
 
-#: Seconds without a heartbeat before the provider is asked, and the poll interval after that.
-SILENCE, POLL_INTERVAL = 5.0, 5.0
+#: Seconds without an answer to a heartbeat after which a machine is silent: two are missing.
+SILENCE = 4.6
+#: Poll interval in seconds of the provider of a silent machine.
+POLL_INTERVAL = 5.0
+#: Seconds without an answer of machine and provider after which a machine is lost.
+LOSS = 37.0
 
 _ENDED = {
     MachineState.DELETED: 'it was deleted', MachineState.STOPPING: 'it is being ended',
@@ -53,26 +60,36 @@ class ClockComparison:
 
 class Watch(Step):
     """
-    Ask the provider about a machine without heartbeat, until the machine is known to be gone.
+    Report a machine that does not answer, and ask its provider whether the machine is gone.
 
-    A machine that exists but is out of reach is not reported. An unknown exception is a defect of
-    FogROS2 or of a plugin: it ends the watch and is reported at once, and ``close`` raises it, so
-    that the nodes continue until then.
+    A machine that exists but is out of reach is not gone. It is lost if neither it nor its
+    provider answers for ``LOSS`` seconds; a computer that FogROS2 does not own has no provider.
+    An unknown exception is a defect of FogROS2 or of a plugin: it ends the watch and is reported
+    at once, and ``close`` raises it, so that the nodes continue until then.
 
     :param gone: called with the reason, once, from the watch's thread.
     :param found: called with the provider's report of a machine that runs.
+    :param lost: called instead of ``gone`` for a lost machine, which may still run.
     """
 
     def __init__(
         self, context: Context, job: MachineJob, *,
         gone: Callable[[str], None], found: Callable[[Machine], None],
+        lost: Callable[[str], None] = lambda reason: None,
     ) -> None:
         super().__init__(context, job)
         self._gone = gone
         self._found = found
-        self._closed = False
+        self._lost = lost
+        self._silent = False
+        self._closed = threading.Event()
+        self._ending = threading.Lock()
         self._fault: Optional[BaseException] = None
-        self._polls = Periodic('fog-watch', 1.0, self._poll)
+        self._word_at = time.monotonic()
+        # two threads: the provider's answer may take minutes
+        self._periodic('fog-watch', 0.2, self._look)
+        if context.capabilities.owned:
+            self._periodic('fog-ask', 1.0, self._ask)
 
     def close(self) -> None:
         """
@@ -80,43 +97,62 @@ class Watch(Step):
 
         :raises BaseException: the exception that ended the watch, once.
         """
-        self._closed = True
-        self._polls.close()
+        self._closed.set()
         fault, self._fault = self._fault, None
         if fault is not None:
             raise fault
 
-    def _poll(self) -> Optional[float]:
-        try:
-            return self._look()
-        except BaseException as error:  # noqa: BLE001 - raised again by ``close``
-            self._polls.close()
-            self._fault = error
-            self._context.report(StepFailed(
-                self._job.name, 'watch', 0.0, 'nobody looks any more whether the machine still '
-                f'exists: {type(error).__name__}: {error}', fatal=False))
-            return None
+    def _periodic(self, name: str, interval: float, work: Callable[[], Optional[float]]) -> None:
+        def guarded() -> Optional[float]:
+            try:
+                return work()
+            except BaseException as error:  # noqa: BLE001 - raised again by ``close``
+                self._closed.set()
+                self._fault = error
+                self._context.report(StepFailed(
+                    self._job.name, 'watch', 0.0, 'nobody looks any more whether the machine '
+                    f'still exists: {type(error).__name__}: {error}', fatal=False))
+                return None
 
-    def _look(self) -> Optional[float]:
-        job, age = self._job, self._job.heartbeat.age
+        Periodic(name, interval, guarded, stop=self._closed)
+
+    def _look(self) -> None:
+        age = self._job.heartbeat.age or 0.0
+        if (age > SILENCE) != self._silent:
+            self._silent = not self._silent
+            self._context.report(Silence(self._job.name, age if self._silent else 0.0))
+        if min(age, time.monotonic() - self._word_at) > LOSS:
+            self._end(self._lost, f'it is lost: no answer for {age:.0f} s, and no word of its '
+                      'provider')
+
+    def _ask(self) -> Optional[float]:
+        age = self._job.heartbeat.age
         if age is None or age <= SILENCE:
             return None
-        reason, deleted = self._ask()
-        # while the agent sends, the machine exists, whatever the provider reports
-        if reason and job.agent.silent_for > SILENCE and not self._closed:
-            job.gone, job.deleted = True, deleted
-            self._polls.close()
-            self._gone(reason)
-        return POLL_INTERVAL
-
-    def _ask(self) -> tuple[str, bool]:
-        """Return why the machine ended ('' if it runs or is unknown), and if it is deleted."""
+        deleted = False
         try:
             machine = self._context.provider.describe(self._job.machine_id)
         except MachineNotFound as error:
-            return str(error.args[0]), True
+            reason, deleted = str(error.args[0]), True
         except FogError:
-            return '', False  # perhaps the robot has no network: retried
-        if machine.state is MachineState.RUNNING and not self._closed:
-            self._found(machine)
-        return _ENDED.get(machine.state, ''), machine.state is MachineState.DELETED
+            return POLL_INTERVAL  # perhaps the robot has no network: retried
+        else:
+            self._word_at = time.monotonic()
+            reason, deleted = _ENDED.get(machine.state, ''), machine.state is MachineState.DELETED
+            if machine.state is MachineState.RUNNING and not self._closed.is_set():
+                self._found(machine)
+        if reason:
+            self._end(functools.partial(self._is_gone, deleted), reason)
+        return POLL_INTERVAL
+
+    def _is_gone(self, deleted: bool, reason: str) -> None:
+        self._job.gone, self._job.deleted = True, deleted
+        self._gone(reason)
+
+    def _end(self, tell: Callable[[str], None], reason: str) -> None:
+        with self._ending:
+            # while the agent sends, the machine exists, whatever the provider reports
+            if self._closed.is_set() or self._job.agent.silent_for <= SILENCE:
+                return
+            self._closed.set()
+        tell(reason)
