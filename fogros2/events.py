@@ -166,11 +166,19 @@ class Empty(TypedDict):
     """The answer to a request that has no result."""
 
 
-class Configured(TypedDict):
-    """The machine's name, and the number of the next event."""
-
+class _Configured(TypedDict):
     machine: str
     next: int
+
+
+class Configured(_Configured, total=False):
+    """
+    The machine's name, and the number of the next event.
+
+    ``signed``: heartbeats need an HMAC; an agent of the first version omits it.
+    """
+
+    signed: bool
 
 
 class Launched(TypedDict):

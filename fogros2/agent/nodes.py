@@ -63,6 +63,8 @@ class Nodes:
         self.states: dict[str, NodeStatus] = {}
         #: Seconds that each node may take to end.
         self.graces: dict[str, float] = {}
+        #: The nodes that start again when they end.
+        self.respawn: set[str] = set()
         self.stopping = False
         #: Whether processes that the launch process left get little time to end.
         self.quickly = False
@@ -182,6 +184,7 @@ class Nodes:
             graces[spec['id']] = grace
         launch = self.start_launch()
         self.graces.update(graces)
+        self.respawn.update(spec['id'] for spec in specs if spec.get('respawn'))
         for spec in specs:
             self.states[spec['id']] = {
                 'id': spec['id'], 'name': spec['name'], 'state': 'starting', 'pid': None,
@@ -284,7 +287,9 @@ class Nodes:
             for node in left:
                 node['state'], node['pid'], node['returncode'] = 'exited', None, -number
                 events.append({'event': 'exited', 'node': node['id'], 'name': node['name'],
-                               'returncode': -number, 'respawns': False})
+                               'returncode': -number,
+                               # by the robot, after ``launch_exited``
+                               'respawns': not expected and node['id'] in self.respawn})
             if not expected:
                 say(f'the launch process ended with status {status}')
                 events.append({'event': 'launch_exited', 'returncode': status,
@@ -294,6 +299,17 @@ class Nodes:
             self._swept(number)
 
         self.processes.sweep(self.mark, swept, quickly=self.quickly)
+
+    def sweep_former(self) -> None:
+        """End the nodes of an agent that died here; report that their launch process ended."""
+        def swept(number: int) -> None:
+            event: LaunchExited = {
+                'event': 'launch_exited', 'returncode': -int(signal.SIGKILL), 'said': ''}
+            self.write([dump(event)[1:]])
+            self._swept(number)
+
+        self.stopping = True
+        self.processes.sweep(self.mark, swept, quickly=False)
 
     def _swept(self, number: int) -> None:
         """Note that no process of the nodes is left, and remove what they received."""

@@ -28,27 +28,36 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
                with ``exit`` true the agent then exits. Does nothing if another launch has taken
                the machine over from ``launch``.
 
-Heartbeats are UDP datagrams from the robot's VPN address, a JSON object with ``launch``. The agent
-sends each back with ``clock`` added: the machine's time in seconds since the epoch.
+Heartbeats are UDP datagrams from the robot's VPN address: ``BEAT`` and its HMAC-SHA256 by the key
+in ``heartbeat``, which a launch makes anew. The agent drops a datagram that has another HMAC, or a
+number that is not above the last one's. It answers the others with ``ANSWER``.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hmac
 import json
 import socket
+import struct
 import sys
 import time
 
 TYPE_CHECKING = False  # importing typing takes a megabyte of memory
 if TYPE_CHECKING:
-    from typing import Any
+    from typing import Any, Optional
 
     Json = dict[str, Any]
 
 MAX_LINE = 16 << 20
 #: Bytes of one generation of the journal; two are kept.
 LOG_BYTES = 64 << 20
+#: Largest datagram that is looked at, in bytes.
+DATAGRAM = 256
+#: A heartbeat: its number, and the robot's monotonic time in seconds.
+BEAT = struct.Struct('!Qd')
+#: The answer: both of these, and the machine's time in seconds since the epoch.
+ANSWER = struct.Struct('!Qdd')
 
 #: Keys of the configuration: accepted types and default value.
 CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
@@ -99,6 +108,17 @@ def words(argv: Any) -> list[str]:
     return argv
 
 
+def sign(key: str, data: bytes) -> bytes:
+    """Return data followed by its HMAC; the key is hexadecimal."""
+    return data + hmac.digest(bytes.fromhex(key), data, 'sha256')
+
+
+def verify(key: str, form: struct.Struct, datagram: bytes) -> Optional[tuple[Any, ...]]:
+    """Return the fields of a signed datagram; None if it has another HMAC or another form."""
+    data = datagram[:form.size]
+    return form.unpack(data) if hmac.compare_digest(sign(key, data), datagram) else None
+
+
 def checked(new: Json) -> Json:
     """
     Check the types and values of a configuration; drop unknown keys.
@@ -123,8 +143,9 @@ def checked(new: Json) -> Json:
         try:
             socket.inet_aton(heartbeat['bind'])
             socket.inet_aton(heartbeat['peer'])
-            if not 0 < heartbeat['port'] < 65536:
-                raise ValueError('port')
+            if not 0 < heartbeat['port'] < 65536 or len(bytes.fromhex(heartbeat['key'])) < 16:
+                raise ValueError('port or key')
         except (KeyError, OSError, TypeError, ValueError) as error:
-            raise Refused("'heartbeat' needs bind and peer, addresses, and a port") from error
+            raise Refused(
+                "'heartbeat' needs bind and peer, addresses, a port and a key") from error
     return known

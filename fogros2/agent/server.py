@@ -2,7 +2,7 @@
 """
 The agent's clients, their requests, and its command line.
 
-    agent.py serve --config FILE [--detach]    run the agent
+    agent.py serve --config FILE [--detach]    run the agent; detached, start it again if it dies
     agent.py connect --directory DIR           relay stdin and stdout to a running agent
 """
 
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 CLIENTS = 64
 #: Seconds between attempts to end the machine.
 RETRY_END = 30.0
+#: Shortest and longest pause in seconds before an agent that died starts again.
+FIRST_RESTART, LAST_RESTART = 0.1, 30.0
 #: Settings that a restarted agent takes over from its predecessor.
 RESUMED = (
     'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
@@ -133,7 +135,8 @@ class Agent:
         self.checks = Checks(self.processes, self.emit)
         self.nodes = Nodes(self.processes, self.directory, self.config, self.write)
         self.watchdog = Watchdog(self.config, self.loop.clock())
-        self.heartbeats = Heartbeats(self.loop, self.config, self.watchdog)
+        self.heartbeats = Heartbeats(
+            self.loop, self.config, self.watchdog, self.save_deadlines)
         self.clients: list[Client] = []
         self.ending = self.done = False
         #: Whether a launch has taken the machine over from the launch that created it.
@@ -224,19 +227,33 @@ class Agent:
             if not self.config['launch'] and self.config['on_exit'] == 'keep':
                 self.watchdog.disarm()  # a kept machine expects no launch
                 self.released = True
+            with contextlib.suppress(OSError, OverflowError, TypeError, ValueError), \
+                    open(self.path('watchdog.json')) as stream:
+                self.nodes.mark, *state = json.load(stream)
+                if self.config['launch']:
+                    self.watchdog.resume(state, self.loop.clock())
 
     def save(self) -> None:
         """Write the pid for people, and the configuration for a restarted agent."""
         try:
             os.ftruncate(self.lock, 0)
             os.pwrite(self.lock, f'{os.getpid()}\n'.encode(), 0)
-            aside = self.path('config.json.new')
-            fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
-            with os.fdopen(fd, 'w') as stream:
-                json.dump(self.config, stream)
-            os.replace(aside, self.path('config.json'))
+            self._write('config.json', self.config)
         except OSError as error:
             say(f"the configuration can't be kept: {error}")
+        self.save_deadlines()
+
+    def save_deadlines(self) -> None:
+        """Write the watchdog's state, and the mark of the nodes, for a restarted agent."""
+        with contextlib.suppress(OSError):
+            self._write('watchdog.json', [self.nodes.mark, *self.watchdog.state])
+
+    def _write(self, name: str, data: Any) -> None:
+        aside = self.path(f'{name}.new')
+        fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(fd, 'w') as stream:
+            json.dump(data, stream)
+        os.replace(aside, self.path(name))
 
     # -- running ------------------------------------------------------------------------------
 
@@ -259,8 +276,8 @@ class Agent:
             say(str(error))
         self.nodes.trim_log()
         if self.journal.next > 1:
-            # the nodes ended with the agent that died here, and nothing has reported it
-            self.emit({'event': 'launch_exited', 'returncode': -int(signal.SIGKILL), 'said': ''})
+            # the nodes end with the agent that died here, and nothing has reported it
+            self.nodes.sweep_former()
         while not self.done:
             until = self.loop.clock() + 60.0
             if not self.ending:
@@ -378,6 +395,8 @@ class Agent:
             self.nodes.states.clear()
             new.setdefault('heartbeat', None)
         self.released = self.released and not new.get('launch')
+        if new.get('heartbeat', self.config['heartbeat']) != self.config['heartbeat']:
+            self.watchdog.number = 0  # of another key
         self.config.update(new)
         if taken_over:
             self.watchdog.disarm()
@@ -385,7 +404,7 @@ class Agent:
         self._restart_watchdog()
         self.save()
         self.heartbeats.open()
-        return {'machine': self.config['machine'], 'next': self.journal.next}
+        return {'machine': self.config['machine'], 'next': self.journal.next, 'signed': True}
 
     def _restart_watchdog(self) -> None:
         self.watchdog.configured(self.loop.clock(), heartbeat=bool(self.config['heartbeat']))
@@ -569,10 +588,36 @@ def detach() -> int:
         os._exit(0 if b'"ready":true' in line else 1)
     os.close(reader)
     os.setsid()
-    null = os.open(os.devnull, os.O_RDWR)
-    for fd in (0, 1, 2):
-        os.dup2(null, fd)
+    silence(0, 1, 2)
     return writer
+
+
+def silence(*descriptors: int) -> None:
+    """Connect descriptors to /dev/null."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for fd in descriptors:
+        os.dup2(null, fd)
+    os.close(null)
+
+
+def supervise(directory: str, answer: int) -> None:
+    """
+    Return in a child process that is to be the agent; start another child when one dies.
+
+    This process exits when an agent ends in order, or when its directory was removed.
+
+    :param answer: descriptor of the line about the start; only the first child writes it.
+    """
+    pause = FIRST_RESTART
+    while child := os.fork():
+        silence(answer)
+        begin = time.monotonic()
+        status = os.waitpid(child, 0)[1]
+        ran = time.monotonic() - begin
+        pause = FIRST_RESTART if ran > LAST_RESTART else min(2 * pause, LAST_RESTART)
+        time.sleep(pause if status else 0)
+        if status == 0 or not os.path.isdir(directory):
+            os._exit(0)
 
 
 def read(path: str) -> Json:
@@ -595,13 +640,16 @@ def serve(config_path: str, *, daemon: bool) -> int:
     """Run the agent with a configuration file; return the exit status."""
     answer = detach() if daemon else -1
     try:
-        agent = Agent(read(config_path))
+        config = read(config_path)
+        if daemon:
+            supervise(config['directory'], answer)
+        agent = Agent(config)
         agent.open()
     except Refused as error:
         if daemon:
             os.write(answer, dump(error.answer))
-        else:
-            say(str(error))
+            return 0  # nothing to start again
+        say(str(error))
         return 1
     if daemon:
         log = os.open(agent.path('agent.log'),

@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 import selectors
 import socket
 import time
 
 from fogros2.agent.loop import Loop
-from fogros2.agent.protocol import dump, Refused
+from fogros2.agent.protocol import ANSWER, BEAT, DATAGRAM, Refused, sign, verify
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Optional
+    from typing import Any, Optional
 
     from fogros2.agent.protocol import Json
 
@@ -33,6 +33,26 @@ class Watchdog:
         self.lifetime_from = now
         self.boot_from: Optional[float] = now
         self.beat_at: Optional[float] = None
+        #: The number of the last heartbeat.
+        self.number = 0
+
+    @property
+    def state(self) -> list[Any]:
+        """What a restarted agent continues with, see ``resume``."""
+        return [self.number, self.lifetime_from, self.boot_from, self.beat_at]
+
+    def resume(self, state: Any, now: float) -> None:
+        """
+        Continue the deadlines of an agent that died.
+
+        :raises TypeError, ValueError, OverflowError: ``state`` is damaged.
+        """
+        number, lifetime, boot, beat = state
+        # a time after now is of a clock before a reboot
+        self.lifetime_from = min(now, lifetime)
+        self.boot_from = None if boot is None else min(now, boot)
+        self.beat_at = None if beat is None else min(now, beat)
+        self.number = int(number)
 
     def configured(self, now: float, *, heartbeat: bool) -> None:
         """Restart the lifetime and the heartbeat's deadline: a launch has configured the agent."""
@@ -42,8 +62,9 @@ class Watchdog:
         elif self.boot_from is not None:
             self.boot_from = now
 
-    def beat(self, now: float) -> None:
-        """Note a heartbeat; ignored after ``disarm``."""
+    def beat(self, number: int, now: float) -> None:
+        """Note a heartbeat; its time is ignored after ``disarm``."""
+        self.number = number
         if self.beat_at is not None:
             self.beat_at = now
 
@@ -72,12 +93,19 @@ class Watchdog:
 
 
 class Heartbeats:
-    """Receive heartbeats for a watchdog, and answer them."""
+    """
+    Receive heartbeats for a watchdog, and answer them.
 
-    def __init__(self, loop: Loop, config: Json, watchdog: Watchdog) -> None:
+    :param save: stores the watchdog's state on disk.
+    """
+
+    def __init__(
+        self, loop: Loop, config: Json, watchdog: Watchdog, save: Callable[[], None],
+    ) -> None:
         self.loop = loop
         self.config = config
         self.watchdog = watchdog
+        self.save = save
         self.socket: Optional[socket.socket] = None
 
     def open(self) -> None:
@@ -107,13 +135,13 @@ class Heartbeats:
     def _receive(self, mask: int) -> None:
         assert self.socket is not None
         try:
-            data, peer = self.socket.recvfrom(2048)
-            if peer[0] != self.config['heartbeat']['peer']:
+            datagram, peer = self.socket.recvfrom(DATAGRAM)
+            where = self.config['heartbeat']
+            beat = verify(where['key'], BEAT, datagram) if peer[0] == where['peer'] else None
+            if beat is None or beat[0] <= self.watchdog.number:
                 return
-            beat = json.loads(data)
-            if beat['launch'] != self.config['launch']:
-                return
-            self.watchdog.beat(self.loop.clock())
-            self.socket.sendto(dump({**beat, 'clock': time.time()}), peer)
-        except (OSError, KeyError, TypeError, ValueError, RecursionError):
-            return  # the VPN is down, or the datagram is invalid
+            self.watchdog.beat(beat[0], self.loop.clock())
+            self.save()
+            self.socket.sendto(sign(where['key'], ANSWER.pack(*beat, time.time())), peer)
+        except OSError:
+            return  # the VPN is down

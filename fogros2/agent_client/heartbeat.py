@@ -8,9 +8,10 @@ import json
 import socket
 import threading
 import time
-from typing import Optional
+from typing import Any, Optional
 
 from fogros2 import events
+from fogros2.agent.protocol import ANSWER, BEAT, DATAGRAM, sign, verify
 from fogros2.clock import ClockOffset, OffsetFilter
 from fogros2.model import to_json
 
@@ -29,14 +30,17 @@ class Heartbeat:
     :param address: the machine's VPN address.
     :param port: the agent's port on the machine.
     :param launch_id: the launch for which the agent was configured.
+    :param key: signs the heartbeats, hexadecimal; '' for an agent that knows no signed ones.
     :param interval: seconds between heartbeats.
     """
 
     def __init__(
-        self, address: str, port: int, launch_id: str, interval: float = HEARTBEAT_INTERVAL,
+        self, address: str, port: int, launch_id: str, key: str = '',
+        interval: float = HEARTBEAT_INTERVAL,
     ) -> None:
         self._target = (address, port)
         self._launch_id = launch_id
+        self._key = key
         self._interval = interval
         self._stopped = threading.Event()
         self._answered_at: Optional[float] = None
@@ -77,7 +81,9 @@ class Heartbeat:
                 self._listen(link, time.monotonic() + self._interval)
 
     def _send(self, link: socket.socket, number: int) -> None:
-        data = to_json({'launch': self._launch_id, 'n': number, 't': time.monotonic()}).encode()
+        now = time.monotonic()
+        data = sign(self._key, BEAT.pack(number, now)) if self._key else to_json(
+            {'launch': self._launch_id, 'n': number, 't': now}).encode()
         with contextlib.suppress(OSError):  # no route while the VPN is down
             link.sendto(data, self._target)
 
@@ -88,7 +94,7 @@ class Heartbeat:
                 return
             link.settimeout(min(left, 0.25))
             try:
-                data, peer = link.recvfrom(2048)
+                data, peer = link.recvfrom(DATAGRAM)
             except TimeoutError:
                 continue
             except OSError:
@@ -97,7 +103,7 @@ class Heartbeat:
                 continue
             now = time.monotonic()
             try:
-                answer = events.heartbeat(json.loads(data))
+                answer = events.heartbeat(self._parsed(data))
             except (ValueError, RecursionError):
                 continue  # an invalid message, perhaps of a stranger
             if peer != self._target or answer['launch'] != self._launch_id:
@@ -106,3 +112,9 @@ class Heartbeat:
             self._round_trip, self._answered_at = round_trip, now
             if 'clock' in answer and 0 <= round_trip < LONGEST:
                 self._offset = self._offsets.add(round_trip, time.time(), answer['clock'])
+
+    def _parsed(self, data: bytes) -> Any:
+        if not self._key:
+            return json.loads(data)
+        fields = verify(self._key, ANSWER, data)
+        return fields and {'launch': self._launch_id, 't': fields[1], 'clock': fields[2]}

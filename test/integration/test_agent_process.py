@@ -33,6 +33,8 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 ME = pwd.getpwuid(os.getuid()).pw_name
 #: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.
 ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
+#: Signs the heartbeats.
+KEY = '5a' * 32
 LAUNCH = [sys.executable, str(Path(fogros2.__file__).with_name('cloud_launch.py'))]
 
 
@@ -711,8 +713,8 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
     client.request('start', nodes=[rig.node('n', SLEEP)])
     node = rig.wait('started', node='n')['pid']
     client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', interval=0.1)
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', KEY, interval=0.1)
     begin = time.monotonic()
     wait_until(lambda: time.monotonic() - begin > 1.5, timeout=5, what='longer than the timeout')
     assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 0.1
@@ -731,8 +733,8 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
 
 def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
     rig.serve(program=slow_agent, heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', interval=0.1)
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', KEY, interval=0.1)
     try:
         wait_until(lambda: heartbeat.clock_offset is not None, timeout=10, what='the offset')
         offset = heartbeat.clock_offset
@@ -741,11 +743,11 @@ def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
         heartbeat.close()
 
 
-@pytest.mark.parametrize('wrong', ['launch', 'peer', 'nonsense'])
+@pytest.mark.parametrize('wrong', ['key', 'peer', 'nonsense'])
 def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
     rig.serve(robot_timeout=0.8, end_command=ends(rig), heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port,
-        'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1'})
+        'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1', 'key': KEY})
     client = rig.client()
     client.request('configure')
     with contextlib.ExitStack() as stack:
@@ -756,7 +758,7 @@ def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
                 link.sendto(data, ('127.0.0.1', free_udp_port))
         else:
             heartbeat = stack.enter_context(contextlib.closing(Heartbeat(
-                '127.0.0.1', free_udp_port, 'other' if wrong == 'launch' else 'abc123',
+                '127.0.0.1', free_udp_port, 'abc123', 'ff' * 32 if wrong == 'key' else KEY,
                 interval=0.05)))
         assert rig.wait('watchdog')['reason'] == 'robot gone'
         assert heartbeat is None or heartbeat.round_trip is None
@@ -768,7 +770,7 @@ def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, free_udp_port)
     client.request('start', nodes=[rig.node('n', SLEEP)])
     rig.wait('started', node='n')
     client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
     assert rig.wait('watchdog', reason='robot gone')['action'] == 'stop the nodes'
     rig.wait('exited', node='n')
     assert not (rig.folder / 'ended').exists()
@@ -959,7 +961,7 @@ def test_machine_with_heartbeats_is_not_taken_over(rig, free_udp_port):
     rig.serve()
     client = rig.client()
     client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
     client.request('start', nodes=[rig.node('n', SLEEP)])
     rig.wait('output', node='n')
     with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
@@ -979,7 +981,8 @@ def test_busy_heartbeat_port_is_refused(rig):
         other.bind(('127.0.0.1', 0))
         with pytest.raises(AgentError, match='no heartbeats at 127.0.0.1:'):
             client.request('configure', heartbeat={
-                'bind': '127.0.0.1', 'port': other.getsockname()[1], 'peer': '127.0.0.1'})
+                'bind': '127.0.0.1', 'port': other.getsockname()[1], 'peer': '127.0.0.1',
+                'key': KEY})
 
 
 def test_health_check_repairs_and_takes_down(rig):
@@ -1072,7 +1075,7 @@ def test_restarted_agent_keeps_watchdog_and_journal(rig, free_udp_port):
     first = rig.serve(robot_timeout=3.0, end_command=ends(rig))
     client = rig.client()
     client.request('configure', launch='def456', force='abc123', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1'})
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
     client.request('start', nodes=[rig.node('n', SLEEP)])
     node = rig.wait('started', node='n')['pid']
     first.kill()
@@ -1101,7 +1104,7 @@ def first_agent(tmp_path: Path) -> Path:
     return path
 
 
-def test_agent_of_the_first_commit_serves_a_new_robot(rig, first_agent):
+def test_agent_of_the_first_commit_serves_a_new_robot(rig, first_agent, free_udp_port):
     rig.program = first_agent
     agent = rig.serve(on_exit='keep')
     client = rig.client()
@@ -1115,6 +1118,10 @@ def test_agent_of_the_first_commit_serves_a_new_robot(rig, first_agent):
     assert rig.text('n') == 'yes\n'
     status = client.status()
     assert (status['launch'], status['nodes'][0]['state']) == ('next', 'exited')
+    assert 'signed' not in client.request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
+    with contextlib.closing(Heartbeat('127.0.0.1', free_udp_port, 'next')) as heartbeat:
+        wait_until(lambda: heartbeat.round_trip is not None, timeout=10, what='an answer')
     client.request('release', exit=True)
     assert rig.ended(agent) == 0 and not rig.directory.exists()
 

@@ -14,6 +14,8 @@ from fogros2.agent.loop import boot_clock
 from fogros2.agent.protocol import checked, CONFIG, dump, Refused
 from fogros2.agent.watchdog import Watchdog
 
+HEARTBEAT = {'bind': '10.0.0.1', 'peer': '10.0.0.2', 'port': 7, 'key': 'ab' * 16}
+
 
 def event(text: str) -> bytes:
     return dump({'event': 'output', 'text': text})[1:]
@@ -155,7 +157,7 @@ def test_robot_timeout_begins_with_the_heartbeat_configuration():
     dog.configured(50.0, heartbeat=True)
     assert dog.due(59.9) is None
     assert dog.due(60.0) == 'robot gone'
-    dog.beat(59.0)
+    dog.beat(1, 59.0)
     assert dog.due(68.9) is None
     assert dog.due(69.0) == 'robot gone'
     assert dog.due(500.0) == 'robot gone'
@@ -165,9 +167,9 @@ def test_lifetime_ends_machine_despite_heartbeats():
     dog = Watchdog(config(), 0.0)
     dog.configured(0.0, heartbeat=True)
     for second in range(0, 1000, 5):
-        dog.beat(float(second))
+        dog.beat(second, float(second))
         assert dog.due(float(second)) is None
-    dog.beat(1000.0)
+    dog.beat(1001, 1000.0)
     assert dog.due(1000.0) == 'lifetime'
     dog.configured(1000.0, heartbeat=True)
     assert dog.due(1000.0) is None
@@ -180,7 +182,7 @@ def test_late_heartbeat_does_not_rearm_the_watchdog():
     dog = Watchdog(config(), 0.0)
     dog.configured(0.0, heartbeat=True)
     dog.disarm()
-    dog.beat(1.0)
+    dog.beat(1, 1.0)
     assert dog.beat_at is None
     assert dog.deadlines() == [(1000.0, 'lifetime')]
 
@@ -192,6 +194,29 @@ def test_configuring_without_heartbeat_keeps_the_deadline():
     assert dog.due(10.0) == 'robot gone'
 
 
+def test_restarted_agent_continues_the_deadlines():
+    dog, again = Watchdog(config(), 5.0), Watchdog(config(), 60.0)
+    dog.configured(50.0, heartbeat=True)
+    dog.beat(7, 52.0)
+    again.resume(json.loads(json.dumps(dog.state)), 60.0)
+    assert again.deadlines() == dog.deadlines() == [(62.0, 'robot gone'), (1050.0, 'lifetime')]
+    assert again.number == 7
+
+
+def test_deadline_of_a_clock_before_a_reboot_counts_as_now():
+    dog = Watchdog(config(), 3.0)
+    dog.resume([7, 90000.0, None, 90000.0], 3.0)
+    assert dog.deadlines() == [(13.0, 'robot gone'), (1003.0, 'lifetime')]
+
+
+@pytest.mark.parametrize('state', [
+    7, [], [1, 2.0, 3.0], [1, None, None, None], ['x', 1.0, None, None], [1, 'x', None, None],
+    [float('inf'), 1.0, None, None]])
+def test_damaged_state_of_a_watchdog_is_refused(state):
+    with pytest.raises((OverflowError, TypeError, ValueError)):
+        Watchdog(config(), 3.0).resume(state, 3.0)
+
+
 def test_clock_counts_suspended_time():
     assert abs(boot_clock() - float(open('/proc/uptime').read().split()[0])) < 5.0
 
@@ -200,9 +225,9 @@ def test_clock_counts_suspended_time():
     {'lifetime': 0}, {'lifetime': float('nan')}, {'lifetime': float('inf')}, {'lifetime': True},
     {'lifetime': '8'}, {'on_exit': 'burn'}, {'end_command': 'shutdown'}, {'end_command': [3]},
     {'environment': {'A': 3}}, {'environment': {'': 'x'}}, {'environment': {'A': 'x\0'}},
-    {'heartbeat': {'bind': '10.0.0.1', 'peer': '10.0.0.2', 'port': 0}},
-    {'heartbeat': {'bind': '10.0.0.1', 'peer': '10.0.0.2', 'port': '7'}},
-    {'heartbeat': {'bind': 'name', 'peer': '10.0.0.2', 'port': 7}},
+    {'heartbeat': {**HEARTBEAT, 'port': 0}}, {'heartbeat': {**HEARTBEAT, 'port': '7'}},
+    {'heartbeat': {**HEARTBEAT, 'bind': 'name'}}, {'heartbeat': {**HEARTBEAT, 'key': 'ab' * 15}},
+    {'heartbeat': {**HEARTBEAT, 'key': None}}, {'heartbeat': {**HEARTBEAT, 'key': 'secret'}},
     {'heartbeat': [1]}, {'machine': 7}, {'log_bytes': -1},
 ])
 def test_invalid_settings_are_refused(settings):
@@ -211,5 +236,5 @@ def test_invalid_settings_are_refused(settings):
 
 
 def test_settings_of_a_newer_robot_are_ignored():
-    assert checked({'new': 1, 'id': 3, 'machine': 'x', 'heartbeat': None}) == {
-        'machine': 'x', 'heartbeat': None}
+    assert checked({'new': 1, 'id': 3, 'machine': 'x', 'heartbeat': HEARTBEAT}) == {
+        'machine': 'x', 'heartbeat': HEARTBEAT}

@@ -398,6 +398,7 @@ def test_the_guard_is_armed_before_anything_else_runs():
     script, = (words[2] for words in told['bootcmd'])
     assert '"end_command": ["shutdown", "-h", "now"]' in script
     assert '"user": "ubuntu"' in script
+    assert '--property=Restart=always' in script
     assert 'apt' not in script
     assert told['ssh_keys']['ed25519_public'].split() == one_time(TOKEN).public.split()
     assert 'bootcmd' not in config()
@@ -454,6 +455,10 @@ def test_booting_instance_starts_its_agent(booted):
     assert status['ok'] and status['machine'] == 'planner', status
     assert oct((top / 'opt/fogros2/agent.json').stat().st_mode)[-3:] == '600'
     assert program.read_text() == joined()
+    # a signal ends the agent in order; without another one, nothing would end the instance
+    os.kill(status['pid'], signal.SIGTERM)
+    wait_until(lambda: not Path(f"/proc/{status['pid']}").exists(), timeout=20, what='its end')
+    wait_until(server.exists, timeout=20.0, what='another agent')
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):

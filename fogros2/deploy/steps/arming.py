@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import contextlib
+import secrets
 from typing import Any, Optional
 
 from fogros2 import model, plan
@@ -180,11 +181,12 @@ class Arming(Step):
         :raises VpnError: no heartbeat was answered through the VPN.
         """
         context, job, address = self._context, self._job, self._job.interface.address
+        key = secrets.token_hex(32)
         try:
-            job.agent.request(
+            configured = job.agent.request(
                 'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,
                 heartbeat={'bind': address, 'port': plan.HEARTBEAT_PORT,
-                           'peer': context.vpn.interface.address},
+                           'peer': context.vpn.interface.address, 'key': key},
                 environment={
                     'FOGROS2_VPN_ADDRESS': address,
                     **plan.extended({**ros.environment, **dds}, job.spec.environment)},
@@ -196,7 +198,8 @@ class Arming(Step):
                     f"end what listens there: ss -lunp 'sport = :{plan.HEARTBEAT_PORT}'"
                 ) from error
             raise
-        job.heartbeat = Heartbeat(address, plan.HEARTBEAT_PORT, context.launch)
+        job.heartbeat = Heartbeat(address, plan.HEARTBEAT_PORT, context.launch,
+                                  key if configured.get('signed') else '')
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(

@@ -69,13 +69,13 @@ echo "{host_key_mark}$(cat $key.pub)"
 {agent}
 """
 
+# However the agent ends, it starts again: nobody else would end the machine.
 _AGENT = """\
+# deadlines of an agent before this boot
+rm -f /{agent_directory}/watchdog.json
 while :; do
     python3 -IS /{folder}/agent.py serve --config /{folder}/agent.json &
     wait $!
-    code=$?
-    [ $code -eq 0 ] && break
-    # without an agent, nobody would end the machine
     sleep 1 & wait $!
 done
 """
@@ -153,7 +153,7 @@ def add(
         'host_key_mark': HOST_KEY_MARK, 'agent_directory': AGENT_DIRECTORY,
         'root': 'prohibit-password' if user == 'root' else 'no',
     }
-    start_agent = _AGENT.format(**names) + _IDLE if agent_config else _IDLE
+    start_agent = _AGENT.format(**names) if agent_config else _IDLE
     if nested:
         archive.file(_NESTED_CONFIG, _NESTED_SETTINGS.format(
             limits=', '.join(f'"{word}"' for word in container_engine.limits()[1::2])).encode())

@@ -36,13 +36,13 @@ UNGUARDED = 120
 # Starts at the beginning of the boot; the login user is created a little later.
 _WATCHDOG = """\
 #!/bin/sh
-# Keeps the agent running; a machine whose agent does not start ends.
+# Keeps the agent running, however it ends; a machine whose agent does not start ends.
 exec >>{log} 2>&1 </dev/null
 left={unguarded}
 while [ $left -gt 0 ]; do
     if id -u {user} >/dev/null 2>&1; then
         begin=$(date +%s)
-        python3 -IS {program} serve --config {folder}/agent.json && exit 0
+        python3 -IS {program} serve --config {folder}/agent.json
         # an agent that ran for a while starts again
         [ $(($(date +%s) - begin)) -lt 10 ] || left={unguarded}
     fi
@@ -80,7 +80,7 @@ cat >{folder}/watchdog.sh <<'{mark}'
 [ -n "$owned" ] || sed -i 's/"launch": "[^"]*"/"launch": ""/' {folder}/agent.json
 # a unit of its own: it must not end with this step of the boot
 systemd-run --no-block --unit=fogros2-agent --property=DefaultDependencies=no \\
-    --property=Restart=on-failure /bin/sh {folder}/watchdog.sh >/dev/null 2>&1 \\
+    --property=Restart=always /bin/sh {folder}/watchdog.sh >/dev/null 2>&1 \\
     || setsid /bin/sh {folder}/watchdog.sh &
 """
 
