@@ -113,7 +113,7 @@ def node(image: str, launch: str, folder: Path, *command: str, **variables: str,
                   for word in made.arguments], folder, **variables)
 
 
-def test_what_it_says_and_how_it_ends_is_told(image, launch, tmp_path):
+def test_output_and_exit_status_of_a_container_are_passed_on(image, launch, tmp_path):
     follower = started(limited(image, 'sh', '-c', 'echo hello; exit 3'), launch, tmp_path)
     said = follower.communicate(timeout=60)[0]
     assert (said.splitlines(), follower.returncode) == (['hello'], 3)
@@ -152,7 +152,7 @@ def test_image_for_another_processor_is_named(foreign: str, image: str) -> None:
     assert 'processors, and the machine has' in containers.reason(caught.value.result.stderr)
 
 
-def test_it_stops_with_the_process_that_follows_it(image, launch, tmp_path):
+def test_container_stops_with_its_follower(image, launch, tmp_path):
     follower = started(limited(
         image, 'sh', '-c', "trap 'echo bye; exit 0' TERM; echo up; while :; do "
         'busybox sleep 0.1; done'), launch, tmp_path)
@@ -164,7 +164,7 @@ def test_it_stops_with_the_process_that_follows_it(image, launch, tmp_path):
     assert there(launch) == []
 
 
-def test_what_nobody_follows_any_more_is_removed(image, launch, tmp_path):
+def test_container_of_a_killed_follower_is_removed(image, launch, tmp_path):
     follower = started(limited(image, 'busybox', 'sleep', '1000'), launch, tmp_path)
     os.kill(follower.pid, signal.SIGKILL)
     follower.wait(60)
@@ -179,7 +179,7 @@ def test_missing_image_is_reported(engine, launch):
         at_machine(containers.fetch('oci-archive:/no/such'))
 
 
-def test_one_that_fails_is_started_again_as_often_as_it_may(image, launch, tmp_path):
+def test_failed_container_restarts_as_often_as_allowed(image, launch, tmp_path):
     follower = started(
         limited(image, 'sh', '-c', 'echo up; exit 3', restart='on-failure:1'), launch, tmp_path)
     said = follower.communicate(timeout=60)[0].splitlines()
@@ -188,7 +188,7 @@ def test_one_that_fails_is_started_again_as_often_as_it_may(image, launch, tmp_p
     assert there(launch) == []
 
 
-def test_one_that_was_told_to_end_is_not_started_again(image, launch, tmp_path):
+def test_interrupted_container_is_not_restarted(image, launch, tmp_path):
     follower = started(limited(
         image, 'sh', '-c', "trap 'exit 7' TERM; echo up; while :; do busybox sleep 0.1; done",
         restart='always'), launch, tmp_path)
@@ -199,7 +199,7 @@ def test_one_that_was_told_to_end_is_not_started_again(image, launch, tmp_path):
     assert there(launch) == []
 
 
-def test_one_that_somebody_else_removes_is_not_waited_for(image, launch, tmp_path):
+def test_removed_container_is_not_restarted(image, launch, tmp_path):
     follower = started(limited(
         image, 'sh', '-c', 'echo up; exec busybox sleep 1000', restart='always'), launch, tmp_path)
     assert follower.stdout.readline() == 'up\n'
@@ -257,7 +257,7 @@ def test_node_in_an_image_has_variables_files_and_user(image, launch, tmp_path):
     (signal.SIGTERM, "trap '' TERM; echo up; while :; do busybox sleep 0.1; done",
      -signal.SIGKILL),
 ])
-def test_a_node_in_an_image_takes_signals_as_any_node(
+def test_node_in_an_image_receives_signals(
         image, launch, tmp_path, asked, command, returncode):
     process = node(image, launch, tmp_path, 'sh', '-c', command)
     assert process.stdout.readline() == 'up\n'
@@ -267,7 +267,7 @@ def test_a_node_in_an_image_takes_signals_as_any_node(
     assert there(launch) == []
 
 
-def test_a_node_in_an_image_that_is_killed_there_ended_so(image, launch, tmp_path):
+def test_node_killed_in_its_image_reports_sigkill(image, launch, tmp_path):
     process = node(image, launch, tmp_path, 'sh', '-c', 'kill -KILL $$')
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL
@@ -275,7 +275,7 @@ def test_a_node_in_an_image_that_is_killed_there_ended_so(image, launch, tmp_pat
 
 
 @pytest.mark.parametrize('moment', ['variables-*', 'container-there'])
-def test_one_that_is_told_to_end_before_it_began_ends(image, launch, tmp_path, moment):
+def test_node_interrupted_before_its_start_ends(image, launch, tmp_path, moment):
     process = node(image, launch, tmp_path, 'sh', '-c', 'exec busybox sleep 1000')
     wait_until(lambda: there(launch) if moment == 'container-there'
                else list(tmp_path.glob(moment)), timeout=20, longest=0.01, what=moment)
@@ -388,7 +388,7 @@ def volumes() -> set[str]:
 
 @pytest.mark.usefixtures('nothing_left')
 @pytest.mark.skipif(which('ros2') is None, reason='needs ros2 on PATH')
-def test_a_container_machine_runs_containers_and_nodes_in_images(
+def test_container_machine_runs_containers_and_images(
         images, crun, with_python, cloud_network, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     name = f'boxes-{secrets.token_hex(3)}'
@@ -418,7 +418,7 @@ def test_a_container_machine_runs_containers_and_nodes_in_images(
     assert volumes() <= before
 
 
-def test_a_machine_that_was_stopped_runs_containers_again(images, crun, cloud_network):
+def test_restarted_machine_runs_containers_again(images, crun, cloud_network):
     name = f'boxes-{secrets.token_hex(3)}'
     machines = ContainerProvider()
     machine = machines.create(

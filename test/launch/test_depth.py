@@ -76,7 +76,7 @@ def robot_process():
 
 @pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
 @pytest.mark.parametrize('depth', DEPTHS)
-def test_cloud_node(run, fake, planner, depth, description):
+def test_cloud_node_is_found_at_any_depth(run, fake, planner, depth, description):
     fake.on_start = ends
     entity = DEPTHS[depth](cloud_node, planner)
     assert run(description([entity, robot_process()])) == 0
@@ -87,7 +87,7 @@ def test_cloud_node(run, fake, planner, depth, description):
 
 @pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
 @pytest.mark.parametrize('depth', DEPTHS)
-def test_cloud_group(run, fake, planner, depth, description, capfd):
+def test_cloud_group_finds_nodes_at_any_depth(run, fake, planner, depth, description, capfd):
     fake.on_start = ends
     entity = DEPTHS[depth](node, planner)
     assert run(description([CloudGroup(planner, [entity]), robot_process()])) == 0
@@ -113,7 +113,7 @@ def test_on_exit_of_a_group_process_stays_on_the_machine(run, fake, planner):
     assert [name.split('-')[0] for _, name in fake.noted('start')] == ['first', 'talker']
 
 
-def test_a_timer_of_the_robot_is_not_drawn_into_a_group(run, fake, planner, capfd):
+def test_timer_beside_a_group_stays_on_the_robot(run, fake, planner, capfd):
     """The timers of a launch share an event handler, which any of them may have registered."""
     fake.on_start = ends
     assert run(LaunchDescription([
@@ -181,13 +181,13 @@ def include(*entities):
     return events.IncludeLaunchDescription(LaunchDescription(entities))
 
 
-def test_an_include_that_is_emitted(run, fake, planner):
+def test_emitted_include_runs_its_cloud_node(run, fake, planner):
     fake.on_start = ends
     assert run(LaunchDescription([EmitEvent(event=include(cloud_node(planner)))])) == 0
     assert len(fake.noted('start')) == 1
 
 
-def test_an_include_emitted_from_a_group(run, fake, planner, capfd):
+def test_include_emitted_from_a_group_runs_on_its_machine(run, fake, planner, capfd):
     fake.on_start = ends
     assert run(LaunchDescription([CloudGroup(planner, [
         EmitEvent(event=include(node())),

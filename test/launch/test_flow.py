@@ -92,12 +92,12 @@ def test_robot_nodes_alone_do_not_wait(run, fake):
     assert [note[0] for note in fake.notes] == ['robot starts', 'robot ends']
 
 
-def test_an_unknown_order_of_robot_nodes():
+def test_unknown_value_of_robot_nodes_is_refused():
     with pytest.raises(ConfigurationError, match='robot_nodes'):
         FogROSLaunchDescription(robot_nodes='soon')
 
 
-def test_order_of_what_the_robot_executes_is_kept(run, fake, planner, capfd):
+def test_waiting_process_keeps_its_configuration(run, fake, planner, capfd):
     """A held process has the configuration of its place, not of the moment it starts."""
     from launch.actions import SetLaunchConfiguration
     from launch.substitutions import LaunchConfiguration
@@ -139,27 +139,27 @@ def test_a_later_node_joins_a_running_machine(run, fake, planner):
     assert len(fake.noted('up')) == 1 and len(fake.noted('start')) == 2
 
 
-def test_a_machine_can_be_named(run, fake, planner):
+def test_node_refers_to_its_machine_by_name(run, fake, planner):
     fake.on_start = ends
     assert run(FogROSLaunchDescription([talker('planner'), talker(planner)])) == 0
     assert fake.noted('up') == [('planner',)]
 
 
-def test_an_unknown_name(run, fake, planner, capfd):
+def test_unknown_machine_name_is_refused(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner), talker('planer')])) == 1
     assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
         capfd.readouterr().out)
     assert not fake.noted('up')
 
 
-def test_one_name_for_two_machines(run, fake, planner, capfd):
+def test_two_machines_of_one_name_are_refused(run, fake, planner, capfd):
     twin = ContainerInstance(name='planner', ros_workspace='', memory='1g')
     assert run(LaunchDescription([talker(planner), talker(twin)])) == 1
     assert "two machines of this launch are called 'planner'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 
-def test_what_a_machine_says_of_itself(run, fake, planner):
+def test_description_shows_that_its_machine_exists(run, fake, planner):
     told = []
 
     def look(machine, node):
@@ -174,7 +174,7 @@ def test_what_a_machine_says_of_itself(run, fake, planner):
     assert planner.info()['public_ip'] == '192.0.2.7'
 
 
-def test_equal_machines_are_one(run, fake, planner):
+def test_equal_machines_are_created_once(run, fake, planner):
     """A launch file included twice makes its machine twice."""
     fake.on_start = ends
     twin = ContainerInstance(name='planner', ros_workspace='')
@@ -207,7 +207,7 @@ def test_robot_nodes_have_the_dds_environment(run, fake, planner, capfd, descrip
     assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
 
 
-def test_the_dds_environment_outlives_the_group_that_brought_it(run, fake, planner, capfd):
+def test_dds_environment_outlives_its_group(run, fake, planner, capfd):
     fake.on_start = ends
     process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
     assert run(LaunchDescription([
@@ -223,7 +223,7 @@ def test_a_launch_without_cloud_keeps_its_dds_environment(run, fake, monkeypatch
 
 
 @pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
-def test_the_deployment_sees_what_the_launch_file_set(run, fake, planner, description):
+def test_deployment_uses_the_environment_of_the_launch(run, fake, planner, description):
     fake.on_start = ends
     assert run(description([SetEnvironmentVariable('ROS_DOMAIN_ID', '7'), talker(planner)])) == 0
     assert fake.environment['ROS_DOMAIN_ID'] == '7'
@@ -241,7 +241,7 @@ def test_a_cloud_node_of_a_timer_prepares_the_robot_nodes(run, fake, planner, ca
     assert order(fake, 'start', 'down') == ['start', 'down']
 
 
-def test_a_node_that_runs_already_is_warned_about(run, fake, planner, capfd):
+def test_robot_node_started_before_the_dds_is_warned_about(run, fake, planner, capfd):
     fake.on_start = ends
     process = ExecuteProcess(cmd=['sleep', '60'], name='early')
     cloud = talker(planner, on_exit=[Shutdown()])
@@ -251,7 +251,7 @@ def test_a_node_that_runs_already_is_warned_about(run, fake, planner, capfd):
     assert f'{process.name} runs already' in capfd.readouterr().out
 
 
-def test_the_launch_files_environment_travels(run, fake, planner, monkeypatch):
+def test_environment_of_the_launch_file_is_sent(run, fake, planner, monkeypatch):
     fake.on_start = ends
     monkeypatch.setenv('FROM_THE_SHELL', 'stays')
     monkeypatch.setenv('SAME', 'as here')
@@ -292,7 +292,7 @@ def test_output_is_prefixed_by_machine_and_process(run, fake, planner, capfd):
 @pytest.mark.parametrize('text', [
     'qt.qpa.xcb: could not connect to display\n', '(view): Gtk-WARNING: cannot open display: \n',
     'Could not load the Qt platform plugin "xcb" in "" even though it was found.\n'])
-def test_a_node_that_opens_a_window_gets_one_hint(run, fake, planner, capfd, text):
+def test_node_that_opens_a_window_gets_one_hint(run, fake, planner, capfd, text):
     def fails(machine, node):
         for _ in range(2):
             machine.say('output', node, stream='stderr', text=text)
@@ -304,7 +304,7 @@ def test_a_node_that_opens_a_window_gets_one_hint(run, fake, planner, capfd, tex
     assert (said.out + said.err).count('a machine has no screen: run the node on the robot') == 1
 
 
-def test_output_for_the_log_alone(run, fake, planner, capfd):
+def test_output_goes_to_the_log_alone(run, fake, planner, capfd):
     def speaks(machine, node):
         machine.say('output', node, stream='stdout', text='for the log\n')
         machine.say('output', node, stream='stderr', text='for the screen too\n')
@@ -316,7 +316,7 @@ def test_output_for_the_log_alone(run, fake, planner, capfd):
     assert 'for the log' not in output and 'for the screen too' in output
 
 
-def test_cached_output(run, fake, planner):
+def test_cached_output_of_a_remote_node_is_kept(run, fake, planner):
     def speaks(machine, node):
         machine.say('output', node, stream='stdout', text='remember me\n')
         ends(machine, node)
@@ -327,7 +327,7 @@ def test_cached_output(run, fake, planner):
     assert node.get_stdout() == 'remember me\n'
 
 
-def test_exit_status(run, fake, planner, capfd):
+def test_remote_exit_status_is_reported(run, fake, planner, capfd):
     """A node that dies is reported; the launch's own status is as with local nodes."""
     fake.on_start = lambda machine, node: machine.say(
         'exited', node, returncode=3, respawns=False)
@@ -339,14 +339,14 @@ def test_exit_status(run, fake, planner, capfd):
         capfd.readouterr().out)
 
 
-def test_on_exit_shutdown(run, fake, planner):
+def test_on_exit_of_a_remote_node_shuts_down(run, fake, planner):
     fake.on_start = ends
     assert run(LaunchDescription([
         *robot(fake, 'sleep', '60'), talker(planner, on_exit=[Shutdown()])])) == 0
     assert order(fake, 'robot ends', 'down') == ['robot ends', 'down']
 
 
-def test_respawn_is_the_machines_and_is_seen_here(run, fake, planner):
+def test_machine_respawns_and_the_launch_sees_it(run, fake, planner):
     starts, exits = [], []
 
     def dies_twice(machine, node):
@@ -396,7 +396,7 @@ def test_shutdown_process_ends_one_node(run, fake, planner):
     assert 'first' in name and first.return_code == -2
 
 
-def test_input_is_refused(run, fake, planner, capfd):
+def test_input_of_a_remote_process_is_refused(run, fake, planner, capfd):
     node = talker(planner)
     assert run(LaunchDescription([
         node,
@@ -423,7 +423,7 @@ def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
     assert "process can't be started: no such program" in capfd.readouterr().out
 
 
-def test_the_agents_launch_may_end(run, fake, planner, capfd):
+def test_end_of_the_launch_on_the_machine_ends_its_nodes(run, fake, planner, capfd):
     fake.on_start = lambda machine, node: machine.say(
         'launch_exited', returncode=-9, said='no such library')
     node = talker(planner)
@@ -441,7 +441,7 @@ def test_the_agents_launch_may_end(run, fake, planner, capfd):
     ({'event': 'connection', 'state': 'lost'},
      '[WARNING] [fogros2]: planner: the connection is lost; its nodes run on'),
 ])
-def test_what_the_agent_says_of_its_machine(run, fake, planner, capfd, event, line):
+def test_events_of_the_agent_are_logged(run, fake, planner, capfd, event, line):
     def says(machine, node):
         machine.say(event['event'], **{k: v for k, v in event.items() if k != 'event'})
         ends(machine, node)
@@ -451,7 +451,7 @@ def test_what_the_agent_says_of_its_machine(run, fake, planner, capfd, event, li
     assert line in capfd.readouterr().out
 
 
-def test_a_machine_that_vanished(run, fake, planner, capfd):
+def test_absent_agent_ends_its_nodes(run, fake, planner, capfd):
     fake.on_start = lambda machine, node: machine.say(
         'connection', state='absent', error='nobody answers')
     node = talker(planner)
@@ -460,7 +460,7 @@ def test_a_machine_that_vanished(run, fake, planner, capfd):
     assert 'planner: the agent is gone: nobody answers' in capfd.readouterr().out
 
 
-def test_shutdown_between_two_lives_of_a_node(run, fake, planner):
+def test_shutdown_stops_a_node_that_waits_for_respawn(run, fake, planner):
     fake.on_start = lambda machine, node: machine.say(
         'exited', node, returncode=1, respawns=True)
     node = talker(planner, respawn=True, respawn_delay=60.0)
@@ -524,7 +524,7 @@ def test_a_program_may_be_in_the_image_alone(run, fake):
     assert fake.machines['planner'].nodes['program'].package == 'theirs'
 
 
-def test_an_agent_that_refuses_to_start_nodes(run, fake, planner, monkeypatch, capfd):
+def test_failing_node_start_ends_the_launch(run, fake, planner, monkeypatch, capfd):
     def start(self, nodes):
         raise AgentError('the agent is gone')
 
@@ -542,20 +542,20 @@ def test_an_agent_that_refuses_to_start_nodes(run, fake, planner, monkeypatch, c
     assert 'the agent is gone' in capfd.readouterr().out
 
 
-def test_an_undo_that_fails_gives_status_1(run, fake, planner, capfd):
+def test_failing_undo_gives_status_1(run, fake, planner, capfd):
     fake.on_start = ends
     fake.down_errors = [VpnError('the interface would not go', 'ip link delete fog1')]
     assert run(LaunchDescription([talker(planner)])) == 1
     assert 'the interface would not go (ip link delete fog1)' in capfd.readouterr().out
 
 
-def test_an_unknown_image_transport(run, fake, planner, capfd):
+def test_unknown_image_transport_is_refused(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner, stream_topics=[('/camera', 'h256')])])) == 1
     assert "no image transport is called 'h256'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 
-def test_an_error_of_ours_is_not_hidden(run, fake, planner, capfd):
+def test_unknown_error_is_shown(run, fake, planner, capfd):
     fake.errors['planner'] = ZeroDivisionError('a bug')
     assert run(LaunchDescription([talker(planner)])) == 1
     assert 'a bug' in capfd.readouterr().out
@@ -565,7 +565,7 @@ def test_an_error_of_ours_is_not_hidden(run, fake, planner, capfd):
 # -- down ----------------------------------------------------------------------------------------
 
 
-def test_down_comes_last(run, fake, planner):
+def test_rollback_comes_after_all_nodes_have_ended(run, fake, planner):
     """Cloud nodes are stopped, the robot's nodes exit, then the VPN goes."""
     node = talker(planner)
     assert run(FogROSLaunchDescription([
@@ -579,7 +579,7 @@ def test_down_comes_last(run, fake, planner):
     assert len(fake.noted('down')) == 1
 
 
-def test_stops_of_several_nodes_travel_together(run, fake, planner):
+def test_one_request_stops_several_nodes(run, fake, planner):
     nodes = [talker(planner) for _ in range(5)]
     assert run(LaunchDescription([
         *nodes,
@@ -590,7 +590,7 @@ def test_stops_of_several_nodes_travel_together(run, fake, planner):
     assert len(fake.noted('start')) == 5
 
 
-def test_shutdown_while_a_machine_comes_up(run, fake, planner):
+def test_shutdown_cancels_a_machine_that_comes_up(run, fake, planner):
     fake.waits['planner'] = threading.Event()
     assert run(FogROSLaunchDescription([
         talker(planner), *robot(fake, 'sleep', '60'),
@@ -607,7 +607,7 @@ def shutdown_event():
     return Shutdown(reason='a test')
 
 
-def test_a_machine_that_does_not_answer_is_given_up(run, fake, planner, monkeypatch, capfd):
+def test_launch_ends_though_the_machine_is_silent(run, fake, planner, monkeypatch, capfd):
     monkeypatch.setattr(remote_run, 'GRACE', 0.0)
     node = talker(planner, sigterm_timeout='0.05', sigkill_timeout='0.05')
 
@@ -622,7 +622,7 @@ def test_a_machine_that_does_not_answer_is_given_up(run, fake, planner, monkeypa
     assert fake.noted('down')
 
 
-def test_a_lifecycle_node_in_a_group(run, fake, planner):
+def test_group_runs_a_lifecycle_node(run, fake, planner):
     from launch_ros.actions import LifecycleNode
 
     from fogros2 import CloudGroup
@@ -634,7 +634,7 @@ def test_a_lifecycle_node_in_a_group(run, fake, planner):
     assert len(fake.noted('start')) == 1
 
 
-def test_a_component_container_in_a_group(run, fake, planner, capfd):
+def test_group_runs_a_component_container(run, fake, planner, capfd):
     from launch_ros.actions import ComposableNodeContainer
 
     from fogros2 import CloudGroup

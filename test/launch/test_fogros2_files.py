@@ -60,7 +60,7 @@ def logs(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('kind', MACHINES)
-def test_a_launch_file_of_its_form_is_read(tmp_path, kind):
+def test_launch_file_of_fogros2_is_read(tmp_path, kind):
     machine, error = MACHINES[kind]
     path = tmp_path / 'own.launch.py'
     path.write_text(f'{HEAD}    machine = {machine}\n{TAIL}')
@@ -69,7 +69,7 @@ def test_a_launch_file_of_its_form_is_read(tmp_path, kind):
 
 
 @pytest.mark.parametrize('option', ['-it', '-d'])
-def test_containers_are_added_as_its_examples_do(tmp_path, option):
+def test_docker_container_of_fogros2_is_read(tmp_path, option):
     path = tmp_path / 'docker.launch.py'
     path.write_text(
         f"{HEAD}    machine = fogros2.AWSCloudInstance('ami-0123')\n"
@@ -78,7 +78,7 @@ def test_containers_are_added_as_its_examples_do(tmp_path, option):
     check(ros2('launch', str(path), '-s'), '')
 
 
-def test_its_choice_of_region_and_type_asks_nobody(tmp_path):
+def test_choice_of_region_and_type_makes_no_request(tmp_path):
     path = tmp_path / 'auto.launch.py'
     path.write_text(f"""{HEAD}
     from fogros2 import ec2_instance_type_selection as types, region_ami_selection as places

@@ -273,7 +273,7 @@ def test_what_is_wrong_is_refused_with_a_word_on_what_is_right(text, expected):
         assert word in said, said
 
 
-def test_what_turns_out_wrong_when_executed_says_where(run, fake):
+def test_late_mistake_ends_before_any_machine(run, fake):
     description = xml('<arg name="size" default="large"/>'
                       '<fog_machine name="p" provider="aws" disk_size="$(var size)"/>')
     assert run(description) == 1
@@ -354,7 +354,7 @@ def test_nodes_groups_and_streams_run_on_the_machine(
     assert 'image:=/fogros2/planner/back' in there['back_other_encoder'].arguments
 
 
-def test_what_holds_for_the_whole_launch(run, fake):
+def test_fogros_launch_has_settings_of_the_whole_launch(run, fake):
     coordinators = []
     description = xml("""
       <arg name="when" default="immediately"/>
@@ -394,7 +394,7 @@ def test_of_two_machines_of_one_name_the_condition_chooses(run, fake):
     assert fake.machines['planner'].spec.options == {'memory': '2g'}
 
 
-def test_a_machine_that_nobody_described_is_refused(run, fake):
+def test_undescribed_machine_is_refused(run, fake):
     description = xml('<fog_machine name="planner" provider="container"/>'
                       '<cloud_node machine="planer" pkg="demo" exec="talker"/>')
     assert run(description) == 1

@@ -22,7 +22,7 @@ def planner():
     return ContainerInstance(name='planner', ros_workspace='')
 
 
-def test_what_is_in_an_image_is_not_looked_for_here(run, fake, planner):
+def test_executable_of_an_image_is_not_checked_on_the_robot(run, fake, planner):
     fake.on_start = ends
     assert run(FogROSLaunchDescription([
         DeclareLaunchArgument('image', default_value='ros:jazzy'),
@@ -43,7 +43,7 @@ def test_what_is_in_an_image_is_not_looked_for_here(run, fake, planner):
 @pytest.mark.parametrize(('given', 'options'), [
     ('', ()), ('--gpus=all', ('--gpus=all',)), ('-v, /a b:/c:ro', ('-v', '/a b:/c:ro')),
     ("['-e', 'A=1,2']", ('-e', 'A=1,2'))])
-def test_options_may_come_as_one_argument(run, fake, planner, given, options):
+def test_image_options_may_be_one_argument(run, fake, planner, given, options):
     fake.on_start = ends
     assert run(LaunchDescription([
         DeclareLaunchArgument('options', default_value=given),
@@ -56,7 +56,7 @@ def test_options_may_come_as_one_argument(run, fake, planner, given, options):
 @pytest.mark.parametrize(('provider', 'given', 'mounts'), [
     ('container', '', []), ('container', '/usr, /etc:/other', ['/usr', '/etc:/other']),
     ('aws', '', None)])
-def test_a_machine_s_folders_may_come_as_one_argument(provider, given, mounts):
+def test_mounts_of_a_machine_may_be_one_argument(provider, given, mounts):
     context = LaunchContext()
     context.launch_configurations.update(provider=provider, mounts=given)
     action = FogMachine(LaunchConfiguration('provider'), {

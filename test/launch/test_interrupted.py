@@ -150,7 +150,7 @@ def test_nodes_continue_on_the_robot(run, fake, package, planner, talker, watch,
     assert said.index(REASON) < said.index('ERROR'), 'the end of the one here, by SIGINT'
 
 
-def test_the_launch_ends_unless_told_otherwise(run, fake, talker, watch, capfd):
+def test_interrupted_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
     machine = ContainerInstance(name='planner', ros_workspace='')
     watch.at_start = {1: says(fake, 'notice', reason=REASON)}
     assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
@@ -163,7 +163,7 @@ def test_the_launch_ends_unless_told_otherwise(run, fake, talker, watch, capfd):
     assert 'says-' in errors[1] and len(errors) == 2, 'the node was ended, by SIGINT'
 
 
-def test_a_machine_that_is_gone_ends_the_launch(run, fake, talker, watch, capfd):
+def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
     machine = ContainerInstance(name='planner', ros_workspace='')
     watch.at_start = {1: says(fake, 'lost', reason='it was deleted')}
     assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
@@ -174,7 +174,7 @@ def test_a_machine_that_is_gone_ends_the_launch(run, fake, talker, watch, capfd)
     assert len(errors) == 1
 
 
-def test_nodes_of_a_machine_that_is_gone_go_on(run, fake, package, planner, talker, watch):
+def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, planner, talker, watch):
     watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
     assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
     assert watch.starts[1][1] == str(package / 'lib/demo/says')
@@ -183,7 +183,7 @@ def test_nodes_of_a_machine_that_is_gone_go_on(run, fake, package, planner, talk
     assert [code for _, code in watch.exits] == [-2], 'that of the one here, at the end'
 
 
-def test_notice_then_gone_before_the_nodes_ended(run, fake, planner, talker, watch):
+def test_machine_lost_after_its_notice_holds_nothing_up(run, fake, planner, talker, watch):
     """The machine vanishes while its nodes are being ended: they don't wait for it."""
     def on_start(machine, node):
         machine.exits_on_stop = False
@@ -200,7 +200,7 @@ def test_notice_then_gone_before_the_nodes_ended(run, fake, planner, talker, wat
     assert len(watch.starts) == 2 and watch.interrupted == [('planner', REASON, False)]
 
 
-def test_a_machine_that_does_not_end_its_nodes(run, fake, planner, talker, watch, monkeypatch):
+def test_silent_machine_does_not_hold_up_its_nodes(run, fake, planner, talker, watch, monkeypatch):
     from fogros2.runtime import remote_run
     monkeypatch.setattr(remote_run, 'GRACE', 0.0)
 
@@ -214,7 +214,7 @@ def test_a_machine_that_does_not_end_its_nodes(run, fake, planner, talker, watch
     assert len(watch.starts) == 2
 
 
-def test_requests_that_fail_meanwhile(run, fake, planner, talker, watch):
+def test_nodes_continue_though_stop_requests_fail(run, fake, planner, talker, watch):
     def on_start(machine, node):
         def stop(ids):
             raise AgentError('the agent is gone')
@@ -226,7 +226,7 @@ def test_requests_that_fail_meanwhile(run, fake, planner, talker, watch):
     assert len(watch.starts) == 2
 
 
-def test_respawn_goes_on_here(run, fake, package, planner, watch):
+def test_robot_respawns_nodes_of_a_lost_machine(run, fake, package, planner, watch):
     program = package / 'lib/demo/fails'
     program.write_text('#!/bin/sh\nexit 3\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
@@ -238,7 +238,7 @@ def test_respawn_goes_on_here(run, fake, package, planner, watch):
     assert [code for _, code in watch.exits] == [3, 3, 3]
 
 
-def test_one_that_waits_to_be_respawned_there(run, fake, planner, talker, watch):
+def test_node_awaiting_its_respawn_runs_on_the_robot_only(run, fake, planner, talker, watch):
     """The machine must not start it again while it runs here."""
     def on_start(machine, node):
         machine.exits_on_stop = False
@@ -252,7 +252,7 @@ def test_one_that_waits_to_be_respawned_there(run, fake, planner, talker, watch)
     assert fake.machines['planner'].stops == [[spec.id]] and len(watch.starts) == 2
 
 
-def test_signals_and_shutdown_reach_the_process_here(run, fake, planner, talker, watch):
+def test_shutdown_event_reaches_a_moved_process(run, fake, planner, talker, watch):
     node = talker(machine=planner)
     watch.at_start = {
         1: says(fake, 'lost', reason='evicted'),
@@ -263,7 +263,7 @@ def test_signals_and_shutdown_reach_the_process_here(run, fake, planner, talker,
     assert fake.machines['planner'].signals == []
 
 
-def test_what_comes_later_runs_here_at_once(run, fake, package, planner, talker, watch):
+def test_later_node_of_a_lost_machine_runs_here(run, fake, package, planner, talker, watch):
     late = talker(machine=planner, exec_name='late')
     watch.at_start = {
         1: says(fake, 'lost', reason='evicted'),
@@ -273,7 +273,7 @@ def test_what_comes_later_runs_here_at_once(run, fake, package, planner, talker,
     assert len(fake.machines['planner'].all) == 1
 
 
-def test_groups_and_everything_in_them(run, fake, planner, watch, package):
+def test_groups_continue_with_names_and_plain_programs(run, fake, planner, watch, package):
     """A group's names, and programs that are no nodes."""
     program = package / 'lib/demo/says'
     program.write_text(HERE)
@@ -316,7 +316,7 @@ def last_words(machine, node, event):
 
 
 @pytest.mark.parametrize('event', ['ending', 'watchdog'])
-def test_nodes_that_end_because_their_machine_does(run, fake, planner, talker, watch, event):
+def test_nodes_ended_by_their_machine_continue(run, fake, planner, talker, watch, event):
     """Seconds before it is known that the machine is gone."""
     def on_start(machine, node):
         last_words(machine, node, event)

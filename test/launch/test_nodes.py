@@ -89,7 +89,7 @@ def stops(action):
 
 @pytest.mark.parametrize('cls', KINDS)
 @pytest.mark.parametrize('none', [{}, {'machine': None}])
-def test_a_node_without_machine_is_launch_ros_s(run, fake, cls, none):
+def test_node_without_machine_is_a_launch_ros_node(run, fake, cls, none):
     plain = node(cls, **none)
     assert isinstance(plain, getattr(launch_ros.actions, cls.__name__))
     assert not has_machine(plain)
@@ -101,12 +101,12 @@ def test_a_node_without_machine_is_launch_ros_s(run, fake, cls, none):
 
 @pytest.mark.parametrize('option', [
     {'image': 'ros:jazzy'}, {'stream_topics': [('/camera', 'h264')]}])
-def test_options_of_a_machine_need_one(option):
+def test_machine_option_without_machine_is_refused(option):
     with pytest.raises(ConfigurationError, match=f'{next(iter(option))}= of a node is for a mach'):
         node(**option)
 
 
-def test_a_node_without_machine_goes_with_its_group(run, fake, planner):
+def test_node_runs_on_the_machine_of_its_group(run, fake, planner):
     fake.on_start = ends
     assert run(LaunchDescription([CloudGroup(planner, [node()])])) == 0
     assert started(fake) == [('planner', 'talker')]
@@ -115,7 +115,7 @@ def test_a_node_without_machine_goes_with_its_group(run, fake, planner):
 # -- with one ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('cls', KINDS)
-def test_a_node_with_machine_runs_there(run, fake, planner, cls):
+def test_node_runs_on_its_machine(run, fake, planner, cls):
     fake.on_start = ends
     away = node(cls, machine=planner)
     assert isinstance(away, cls)
@@ -141,7 +141,7 @@ def test_a_machine_is_named_by_text_or_substitution(run, fake, planner, name):
     assert started(fake) == [('planner', 'named'), ('planner', 'talker')]
 
 
-def test_a_false_condition_makes_no_machine(run, fake, planner):
+def test_false_condition_creates_no_machine(run, fake, planner):
     assert run(LaunchDescription([node(machine=planner, condition=IfCondition('0'))])) == 0
     assert fake.notes == []
 
@@ -154,7 +154,7 @@ def test_a_node_keeps_its_machine_inside_a_group(run, fake, planner):
 
 
 @pytest.mark.parametrize('cls', KINDS)
-def test_a_machine_overridden_by_the_robot_is_none(run, fake, planner, cls):
+def test_machine_overridden_by_the_robot_is_not_created(run, fake, planner, cls):
     here = node(cls, machine=planner)
     assert run(LaunchDescription([OverrideMachines(
         Overrides(['planner=robot']), [here, stops(here)])])) == 0
@@ -258,7 +258,7 @@ launch:
     assert started(fake) == [('planner', 'one')]
 
 
-def test_a_node_in_xml_takes_what_a_cloud_node_takes(run, fake, streams):
+def test_xml_node_takes_the_settings_of_a_cloud_node(run, fake, streams):
     fake.on_start = ends
     assert run(fogros_launch('''
       <node machine="planner" pkg="demo" exec="talker" exec_name="one" image="ros:jazzy"
@@ -364,7 +364,7 @@ def test_machine_is_for_fogros_launch_alone(registry, tmp_path):
 
 @pytest.mark.parametrize('wrong', [
     '<node machine="planner" pkg="demo"/>', '<nod machine="planner"/>', '<fog_machine/>'])
-def test_a_file_that_cannot_be_read_changes_nothing(registry, wrong):
+def test_unreadable_launch_file_changes_nothing(registry, wrong):
     with pytest.raises(Exception, match='.'):
         fogros_launch(wrong)
     fails(TALKER.format('one'))

@@ -119,7 +119,7 @@ def program(package, tmp_path):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_while_it_runs(program, number):
+def test_signal_rolls_a_running_launch_back(program, number):
     launch = program()
     launch.wait_for('[robot-')
     launch.send(number)
@@ -130,7 +130,7 @@ def test_while_it_runs(program, number):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_while_a_machine_comes_up(program, number):
+def test_signal_rolls_back_while_a_machine_comes_up(program, number):
     launch = program(never_up=True)
     launch.wait_for('note: up')
     launch.send(number)
@@ -140,7 +140,7 @@ def test_while_a_machine_comes_up(program, number):
 
 @pytest.mark.parametrize('second', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('first', [signal.SIGINT, signal.SIGTERM])
-def test_a_second_one_does_not_cut_the_rollback_short(program, first, second):
+def test_second_signal_does_not_interrupt_the_rollback(program, first, second):
     launch = program(slow_down=True)
     launch.wait_for('[robot-')
     launch.send(first)

@@ -130,7 +130,7 @@ def ends_when_all_started(fake, count):
     fake.note = note
 
 
-def test_both_directions(run, fake, planner):
+def test_streams_run_in_both_directions(run, fake, planner):
     """The launch ends with its own processes: those that carry its streams don't keep it."""
     ends_when_all_started(fake, 5)
     assert run(watched(fake, LaunchDescription, talker(
@@ -146,7 +146,7 @@ def test_both_directions(run, fake, planner):
     assert 'image:=/fogros2/planner/seen' in encoder.arguments
 
 
-def test_what_the_user_remapped(run, fake, planner):
+def test_remapped_topic_is_streamed(run, fake, planner):
     ends_when_all_started(fake, 3)
     assert run(watched(fake, LaunchDescription, GroupAction([
         PushROSNamespace('arm'), SetRemap('image', 'camera'),
@@ -176,7 +176,7 @@ def test_one_encoder_for_several_nodes_and_machines(run, fake, planner, mapper):
     assert rules(fake, 'mapper')[0] == '/camera:=/fogros2/mapper/camera'
 
 
-def test_streams_of_the_whole_launch(run, fake, planner, mapper):
+def test_launch_streams_apply_to_every_machine(run, fake, planner, mapper):
     ends_when_all_started(fake, 5)
     assert run(watched(
         fake, FogROSLaunchDescription,
@@ -186,7 +186,7 @@ def test_streams_of_the_whole_launch(run, fake, planner, mapper):
     assert here(fake) == ['camera_h264_encoder']
 
 
-def test_streams_of_a_group(run, fake, planner):
+def test_group_streams_apply_to_all_its_nodes(run, fake, planner):
     """Its nodes all know the topic's new name; the robot's side of the stream stays there."""
     ends_when_all_started(fake, 4)
     assert run(watched(fake, FogROSLaunchDescription, CloudGroup(planner, [
@@ -199,7 +199,7 @@ def test_streams_of_a_group(run, fake, planner):
     assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_too')
 
 
-def test_a_node_without_streams_before_one_with_them(run, fake, planner):
+def test_earlier_node_takes_the_stream_of_a_later_one(run, fake, planner):
     """It would find the robot's topic otherwise, and take it over the VPN as it is."""
     ends_when_all_started(fake, 4)
     assert run(watched(
@@ -210,7 +210,7 @@ def test_a_node_without_streams_before_one_with_them(run, fake, planner):
             assert '/camera:=/fogros2/planner/camera' in node.arguments
 
 
-def test_a_stream_that_comes_too_late_for_a_node(run, fake, planner, caplog):
+def test_node_that_runs_before_its_stream_is_named(run, fake, planner, caplog):
     first = talker(planner, name='first')
     late = talker(planner, stream_topics=[('/camera', 'h264')])
     runs_on = CloudNode(machine=planner, package='demo', executable='talker', exec_name='early')
@@ -230,7 +230,7 @@ def test_a_stream_that_comes_too_late_for_a_node(run, fake, planner, caplog):
                      caplog.text)
 
 
-def test_the_robot_s_side_waits_for_the_machine(run, fake, planner):
+def test_encoder_of_the_robot_waits_for_the_machine(run, fake, planner):
     ends_when_all_started(fake, 3)
     fake.waits['planner'] = go = threading.Event()
     threading.Timer(0.3, go.set).start()
@@ -240,7 +240,7 @@ def test_the_robot_s_side_waits_for_the_machine(run, fake, planner):
     assert order[0] == 'is up'
 
 
-def test_a_machine_that_fails_starts_nothing_here(run, fake, planner):
+def test_failed_machine_starts_no_encoder(run, fake, planner):
     from fogros2.errors import ProviderError
     fake.errors['planner'] = ProviderError('no room')
     assert run(watched(fake, LaunchDescription, talker(
@@ -249,7 +249,7 @@ def test_a_machine_that_fails_starts_nothing_here(run, fake, planner):
 
 
 @pytest.mark.parametrize('late', [False, True])
-def test_an_unknown_transport_is_refused_before_anything(run, fake, planner, late, capfd):
+def test_unknown_transport_is_refused_first(run, fake, planner, late, capfd):
     wrong = talker(planner, stream_topics=[('/camera', 'h265')])
     assert run(FogROSLaunchDescription([
         talker(planner), TimerAction(period=60.0, actions=[wrong]) if late else wrong])) == 1
@@ -262,14 +262,14 @@ def test_an_unknown_transport_is_refused_before_anything(run, fake, planner, lat
 @pytest.mark.parametrize('make', [
     lambda machine, streams: CloudGroup(machine, [talker(machine)], stream_topics=streams),
     lambda machine, streams: FogROSLaunchDescription([talker(machine)], stream_topics=streams)])
-def test_an_unknown_transport_elsewhere(run, fake, planner, make, capfd):
+def test_unknown_transport_of_group_or_launch_is_refused(run, fake, planner, make, capfd):
     made = make(planner, [('/camera', 'h265')])
     assert run(made if isinstance(made, LaunchDescription) else LaunchDescription([made])) == 1
     assert 'there are: h264, raw' in capfd.readouterr().out
     assert not fake.noted('up')
 
 
-def test_contradictions_are_refused_before_anything(run, fake, planner, mapper, capfd):
+def test_contradicting_streams_are_refused_first(run, fake, planner, mapper, capfd):
     assert run(LaunchDescription([
         talker(planner, stream_topics=[BACK]),
         talker(mapper, stream_topics=[('/seen', 'h264')])])) == 1
@@ -289,7 +289,7 @@ def test_one_topic_comes_back_from_several_machines(run, fake, planner, mapper):
 
 @pytest.mark.parametrize('first', ['source', 'target'])
 @pytest.mark.parametrize('kind', [LaunchDescription, FogROSLaunchDescription])
-def test_from_machine_to_machine(run, fake, planner, mapper, first, kind):
+def test_stream_runs_from_machine_to_machine(run, fake, planner, mapper, first, kind):
     """Both nodes know the topic's new name, whichever of them the launch file has first."""
     ends_when_all_started(fake, 4)
     nodes = [talker(mapper), talker(planner, stream_topics=[StreamTopic('/map', source=mapper)])]
@@ -303,7 +303,7 @@ def test_from_machine_to_machine(run, fake, planner, mapper, first, kind):
     assert rules(fake, 'planner') == ['/map:=/fogros2/planner/map']
 
 
-def test_a_source_that_is_no_machine_of_the_launch(run, fake, planner, capfd):
+def test_unknown_source_of_a_stream_is_refused(run, fake, planner, capfd):
     assert run(LaunchDescription([
         talker(planner, stream_topics=[StreamTopic('/map', source='mapper')])])) == 1
     assert "this launch has no machine named 'mapper'" in capfd.readouterr().out
@@ -322,7 +322,7 @@ def test_missing_program_for_streams_is_reported_first(
 
 @pytest.mark.parametrize('whole', [
     {}, {'stream_topics': [(LaunchConfiguration('topic'), 'h264')]}], ids=['node', 'launch'])
-def test_values_that_are_known_late(run, fake, planner, whole):
+def test_stream_takes_substitutions(run, fake, planner, whole):
     streams = [] if whole else [(LaunchConfiguration('topic'), 'h264')]
     ends_when_all_started(fake, 3)
     assert run(watched(
@@ -331,7 +331,7 @@ def test_values_that_are_known_late(run, fake, planner, whole):
     assert here(fake) == ['front_h264_encoder']
 
 
-def test_a_program_that_takes_no_ros_arguments_is_named(run, fake, planner, caplog):
+def test_program_without_ros_arguments_is_named(run, fake, planner, caplog):
     """It may be a node that would take the raw images over the VPN; or ``sleep``."""
     ends_when_all_started(fake, 4)
     assert run(watched(fake, FogROSLaunchDescription, CloudGroup(planner, [
@@ -396,7 +396,7 @@ def test_composable_nodes_get_their_streams(run, fake, planner, caplog, box, str
     assert not [record for record in caplog.records if 'components were' in record.getMessage()]
 
 
-def test_a_group_that_only_loads_components_starts_their_streams(run, fake, planner, box, caplog):
+def test_group_of_components_starts_their_streams(run, fake, planner, box, caplog):
     """Into a container that another group has; its streams are known when they are loaded."""
     ends_when_all_started(fake, 3)
     load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
@@ -426,7 +426,7 @@ def test_components_on_the_robot_have_streams_from_machines(run, fake, mapper):
 
 
 @pytest.mark.parametrize('condition', ['true', 'false'])
-def test_components_that_came_before_a_stream_are_named(
+def test_components_loaded_before_a_stream_are_named(
         run, fake, planner, caplog, box, condition):
     ends_when_all_started(fake, 4)
     assert run(watched(

@@ -104,7 +104,7 @@ plans: dict[tuple[str, bool], Plan] = {}
 @pytest.mark.parametrize('given', [False, True])
 @pytest.mark.parametrize('kind', ['py', 'xml', 'yaml'])
 @pytest.mark.parametrize('name', sorted(EXAMPLES))
-def test_the_three_are_one_plan(plan, name, kind, given):
+def test_python_xml_and_yaml_describe_the_same_plan(plan, name, kind, given):
     found = plan(FOLDER / f'{name}.launch.{kind}', EXAMPLES[name] if given else {})
     assert found.machines and found.nodes
     assert [ends for _, _, ends in found.robot] == [True]
@@ -119,7 +119,7 @@ def test_the_three_are_one_plan(plan, name, kind, given):
 
 @pytest.mark.parametrize('kind', ['xml', 'yaml'])
 @pytest.mark.parametrize('name', sorted(EXAMPLES))
-def test_their_arguments_are_python_s_in_words_and_values(name, kind):
+def test_xml_and_yaml_declare_the_arguments_of_python(name, kind):
     def arguments(kind):
         source = AnyLaunchDescriptionSource(str(FOLDER / f'{name}.launch.{kind}'))
         from launch import LaunchContext
