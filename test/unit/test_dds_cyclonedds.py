@@ -46,7 +46,7 @@ def test_an_interface_may_be_given_by_its_address() -> None:
         'presence_required': 'true'}
 
 
-def test_without_multicast_peers_and_the_host_itself_are_asked() -> None:
+def test_peers_and_localhost_are_asked_without_multicast() -> None:
     root = rendered(VPN, LOOPBACK, peers=('198.18.7.2', '198.18.7.3', '198.18.7.2'))
     hosts = [peer['address'].partition(':')[0] for peer in attributes(root, 'Peer')]
     assert [hosts.count(f'{a}') for a in ('127.0.0.1', '198.18.7.2', '198.18.7.3')] == [
@@ -70,18 +70,18 @@ def test_the_robot_prefers_itself_then_its_lan_then_the_vpn() -> None:
 
 @pytest.mark.parametrize('user', [
     {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, {'ROS_LOCALHOST_ONLY': '1'}])
-def test_who_keeps_ros_to_the_robot_has_no_lan(user: dict[str, str]) -> None:
+def test_localhost_range_uses_no_lan(user: dict[str, str]) -> None:
     interfaces = CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user)
     assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
 
 
-def test_a_robot_without_a_lan_still_takes_in_what_runs_beside() -> None:
+def test_robot_without_a_lan_uses_the_loopback() -> None:
     interfaces = CYCLONE.robot_interfaces('foga1b2c3', None, {})
     assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
     assert texts(rendered(*interfaces), 'DontRoute') == []
 
 
-def test_a_machine_prefers_the_vpn_and_reaches_nothing_beyond() -> None:
+def test_machine_uses_vpn_and_loopback_only() -> None:
     root = rendered(*CYCLONE.machine_interfaces('foga1b2c3m0'))
     assert [interface['name'] for interface in attributes(root, 'NetworkInterface')] == [
         'foga1b2c3m0', 'lo']
@@ -90,7 +90,7 @@ def test_a_machine_prefers_the_vpn_and_reaches_nothing_beyond() -> None:
 
 
 @pytest.mark.parametrize('domain, port', [(0, 7410), (5, 8660)])
-def test_machines_ask_each_other_in_the_domain(domain: int, port: int) -> None:
+def test_peer_ports_are_those_of_the_domain(domain: int, port: int) -> None:
     interfaces = CYCLONE.machine_interfaces('foga1b2c3m0')
     root = ElementTree.fromstring(CycloneDds(domain).render(interfaces, ['198.18.7.3']))
     assert [peer['address'] for peer in attributes(root, 'Peer')] == [
@@ -104,7 +104,7 @@ def test_a_domain_without_ports_is_refused() -> None:
 
 
 @pytest.mark.parametrize('variable', ['CYCLONEDDS_URI', 'ROS_STATIC_PEERS'])
-def test_peers_of_the_user_are_asked_from_the_lan(variable: str) -> None:
+def test_static_peers_put_the_lan_first(variable: str) -> None:
     user = {variable: '<CycloneDDS><Discovery><Peers><Peer address="192.168.0.7"/></Peers>'
                       '</Discovery></CycloneDDS>'}
     root = rendered(*CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user))
@@ -112,13 +112,7 @@ def test_peers_of_the_user_are_asked_from_the_lan(variable: str) -> None:
         'eth0', 'lo', 'foga1b2c3']
 
 
-def test_a_user_who_keeps_to_this_computer_gets_no_lan() -> None:
-    interfaces = CYCLONE.robot_interfaces(
-        'foga1b2c3', 'eth0', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
-    assert [interface.name for interface in interfaces] == ['lo', 'foga1b2c3']
-
-
-def test_interfaces_of_the_user_stand_in_for_the_lan(tmp_path: Path) -> None:
+def test_user_s_interfaces_replace_the_lan(tmp_path: Path) -> None:
     path = tmp_path / 'dds.xml'
     names = ('<NetworkInterface name="lo" multicast="true"/>'
              '<NetworkInterface name="wlan0"/>')
@@ -184,7 +178,7 @@ def test_the_receive_buffer_asks_for_no_minimum() -> None:
         {'max': '4194304 B'}]
 
 
-def test_what_is_lost_comes_again_soon() -> None:
+def test_lost_messages_are_repeated_within_milliseconds() -> None:
     """Both sides: the reader that misses something, the writer that asks whether it does."""
     root = rendered(VPN, LOOPBACK)
     assert texts(root, 'NackDelay') == ['5 ms']

@@ -204,7 +204,7 @@ def test_unknown_zone_does_not_prevent_the_pod():
     assert list(affinity) == ['preferredDuringSchedulingIgnoredDuringExecution']
 
 
-def test_nothing_asked_for_is_nothing_demanded():
+def test_manifest_has_no_limits_by_default():
     _, pod = made()
     container, = pod['containers']
     assert 'resources' not in container
@@ -246,7 +246,7 @@ def test_names_fit_where_a_cluster_has_less_room():
     assert len(names.job_name('a' * 80)) + len('-abcde') <= 63
 
 
-def test_an_id_carries_its_place():
+def test_machine_id_is_read_back_from_text():
     where = MachineId('robots', 'fogros2-talker', '1b-2c', 'arn:aws:eks:x:1:cluster/y@z')
     assert MachineId.parse(str(where)) == where
     for wrong in ('no-such-machine', 'a/b/c@d', 'podman:0123456789ab:token'):
@@ -260,7 +260,7 @@ def test_an_id_carries_its_place():
     ({'namespace': 'Robots'}, 'Robots'), ({'user': 'A B'}, 'A B'),
     ({'node_selector': ['pool']}, 'node_selector'), ({'env': {'a-b': 'c'}}, 'a-b'),
     ({'robot_host': 'a b'}, 'a b')])
-def test_options_that_make_no_sense_are_named(options, word):
+def test_invalid_option_is_named(options, word):
     error = raised(ConfigurationError, lambda: Options.parse(options))
     assert word in str(error)
 
@@ -306,7 +306,7 @@ def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
     ({}, ApiError('you may not', status=403), ''),
     ({'node_selector': {'pool': 'gpu'}}, ['amd64'], 'x86_64'),
 ])
-def test_architecture_is_that_of_all_nodes_that_fit(monkeypatch, options, nodes, architecture):
+def test_architecture_is_that_of_the_matching_nodes(monkeypatch, options, nodes, architecture):
     class Cluster:
         def request(self, method, path, *, labelSelector, **words):
             assert (method, path) == ('GET', '/api/v1/nodes')
@@ -378,7 +378,7 @@ def condition(kind: str, **values: str) -> dict[str, Any]:
     return {'type': kind, 'status': 'True', **values}
 
 
-def test_where_a_machine_is_in_its_life():
+def test_state_of_a_machine_follows_job_and_pod():
     assert pods.state_of(job_of(), None) is MachineState.PENDING
     assert pods.state_of(job_of(), pod_of('Pending', state={'waiting': {}})) \
         is MachineState.PENDING
@@ -410,7 +410,7 @@ def test_web_application_neither_holds_up_nor_keeps_a_machine():
     assert 'exit status 3' in pods.end_of(job_of(), over)
 
 
-def test_the_first_pod_is_the_machine():
+def test_oldest_pod_of_the_job_is_the_machine():
     later = pod_of(name='b', created='2026-01-01T00:10:00Z')
     first = pod_of(name='a')
     other = pod_of(name='c', created='2025-01-01T00:00:00Z')
@@ -421,7 +421,7 @@ def test_the_first_pod_is_the_machine():
     assert pods.pod_of(job_of(), [other]) is None
 
 
-def test_why_a_machine_has_ended():
+def test_reason_of_the_end_is_found():
     over = job_of(conditions=[condition('Failed', reason='DeadlineExceeded')])
     assert pods.end_of(over, None) == 'its lifetime is over'
     assert 'Evicted: low on memory' in pods.end_of(
@@ -449,7 +449,7 @@ def test_unavailable_image_is_reported(reason, message, final, word):
     assert word in trouble.hint
 
 
-def test_a_pull_that_is_tried_again_keeps_its_reason():
+def test_repeated_image_pull_keeps_its_first_reason():
     """The kubelet says why once, and from then on that it waits for the next try."""
     why = Trouble('ErrImagePull: dial tcp 1.2.3.4:443: i/o timeout')
     waiting = Trouble('ImagePullBackOff: Back-off pulling image "x"')
@@ -457,7 +457,7 @@ def test_a_pull_that_is_tried_again_keeps_its_reason():
     assert not why.less_than(waiting) and not waiting.less_than(Trouble('FailedScheduling: x'))
 
 
-def test_a_container_that_is_being_made_is_no_trouble():
+def test_container_in_creation_is_no_trouble():
     assert pods.trouble_of(pod_of(
         'Pending', state={'waiting': {'reason': 'ContainerCreating'}})) is None
 
@@ -478,7 +478,7 @@ def test_pod_that_fits_on_no_node_is_reported(message, word):
     assert word in trouble.hint
 
 
-def test_events_tell_what_a_pod_does_not():
+def test_trouble_is_found_in_events():
     def event(reason: str, message: str) -> dict[str, Any]:
         return {'reason': reason, 'message': message, 'metadata': {'namespace': 'robots'}}
 
@@ -499,11 +499,11 @@ def test_events_tell_what_a_pod_does_not():
     ('https://192.168.1.2:6443', ['metallb.io'], 'MetalLB'),
     ('https://192.168.1.2:6443', ['apps', 'helm.cattle.io', 'notgke.io'], ''),
     ('https://eks.amazonaws.com.example', [], '')])
-def test_who_makes_load_balancers(server, groups, maker):
+def test_provider_of_load_balancers_is_recognised(server, groups, maker):
     assert exposure.load_balancers(server, groups) == maker
 
 
-def test_a_load_balancer_of_a_cloud_s_is_waited_for_longer():
+def test_load_balancer_of_a_cloud_has_more_time():
     assert exposure.timeout('EKS') == exposure.timeout('') == 180.0
     assert exposure.timeout('k3s') == exposure.timeout('MetalLB') == 60.0
 
@@ -528,11 +528,11 @@ def test_an_outer_address_of_a_node_comes_first():
     Exposure('node_port', '198.51.100.4', 31234, 'the node answers'),
     Exposure('pod_dials_robot', '', 0, 'no load balancer came in 180 s; port 1 answers nothing'),
     Exposure('pod_ip', '10.1.2.3')])
-def test_a_way_can_be_written_down(way):
+def test_exposure_is_read_back_from_text(way):
     assert Exposure.parse(str(way)) == way
 
 
-def test_what_was_written_down_by_somebody_else_is_no_way():
+def test_invalid_text_of_an_exposure_is_ignored():
     assert Exposure.parse('') is None
     assert Exposure.parse('node_port 1.2.3.4 x') is None
 
@@ -551,14 +551,14 @@ def echo(tmp_path):
     assert child.wait(5.0) == 0
 
 
-def test_the_place_that_answers_is_found(echo):
+def test_first_address_that_answers_is_found(echo):
     places = [('127.0.0.1', 9), ('no-such-host.invalid', echo), ('127.0.0.1', echo)]
     assert exposure.first_to_answer(places, 'word', timeout=10.0) == ('127.0.0.1', echo)
     # another launch's question isn't answered
     assert exposure.first_to_answer(places, 'other', timeout=0.3) is None
 
 
-def test_looking_for_a_way_ends_with_the_launch():
+def test_cancel_ends_the_search_for_an_exposure():
     from fogros2.errors import Cancelled
     cancel = threading.Event()
     cancel.set()
@@ -566,7 +566,7 @@ def test_looking_for_a_way_ends_with_the_launch():
         [('127.0.0.1', 9)], 'word', timeout=10.0, cancel=cancel))
 
 
-def test_the_pod_s_program_is_one_that_sh_reads():
+def test_program_of_a_pod_is_valid_shell():
     subprocess.run(['sh', '-n', '-c', boot.SCRIPT], check=True)
     command = boot.arguments('fog', 600.0, 51830, 'word', 180.0)
     assert command[:2] == ['/bin/sh', '-c']

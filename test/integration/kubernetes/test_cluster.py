@@ -159,7 +159,7 @@ def test_killed_test_leaves_nothing_of_its_cluster(started):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='kills a process of root')
-def test_a_node_that_was_killed_as_well_is_tidied_up_by_the_next(kubernetes, binaries):
+def test_next_cluster_removes_a_killed_node(kubernetes, binaries):
     network_of = free_network()
     host, there = network_of.hosts()
     name = uuid.uuid4().hex[:6]
@@ -187,6 +187,6 @@ def test_a_node_that_was_killed_as_well_is_tidied_up_by_the_next(kubernetes, bin
     assert kubernetes.kubeconfig.exists(), 'the one that runs is spared'
 
 
-def test_the_kubelet_sets_nothing_for_the_whole_computer(kubernetes):
+def test_kubelet_changes_no_setting_of_the_computer(kubernetes):
     for name in node.KERNEL_SETTINGS:
         assert kubernetes.run('findmnt', '-n', f'/proc/sys/{name}').returncode == 0, name

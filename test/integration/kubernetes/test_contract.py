@@ -85,14 +85,14 @@ def test_nodes_do_not_run_as_root(pod):
         assert shell.run(Command(('id', '-un')), timeout=30.0).stdout == 'fog\n'
 
 
-def test_a_pod_has_no_token_of_the_cluster_s(pod):
+def test_pod_has_no_token_of_the_cluster(pod):
     with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
         found = shell.run(Command(('ls', '/var/run/secrets/kubernetes.io'), sudo=True),
                           timeout=30.0, check=False)
         assert found.returncode != 0
 
 
-def test_a_launch_asks_the_cluster_seldom(place):
+def test_launch_makes_few_requests_to_the_cluster(place):
     """Everything a provider and a shell ask for a machine: the figure that is promised."""
     api = kubernetes_client.connect()
     before = api.calls
@@ -107,7 +107,7 @@ def test_a_launch_asks_the_cluster_seldom(place):
     assert api.calls - before <= 15
 
 
-def test_a_pod_that_nobody_guards_ends_itself(place, monkeypatch):
+def test_pod_without_agent_ends_itself(place, monkeypatch):
     monkeypatch.setattr('fogros2.provider.kubernetes.manifests.BOOT', 2.0)
     provider = KubernetesProvider()
     spec = MachineSpec('unguarded', provider.name, {'container_image': BARE}, robot_timeout=2.0)
@@ -119,7 +119,7 @@ def test_a_pod_that_nobody_guards_ends_itself(place, monkeypatch):
         provider.destroy(machine_id)
 
 
-def test_an_agent_s_word_ends_the_pod(place):
+def test_end_command_ends_the_pod(place):
     provider, machine_id, machine = run('ended')
     try:
         with contextlib.closing(KubernetesShell(machine.shell, name='ended')) as shell:
@@ -133,7 +133,7 @@ def test_an_agent_s_word_ends_the_pod(place):
         provider.destroy(machine_id)
 
 
-def test_the_way_is_the_one_that_was_asked_for(place):
+def test_requested_exposure_is_used(place):
     def asked(expose):
         provider, machine_id, machine = run(f"by-{expose.replace('_', '-')}", expose=expose)
         provider.destroy(machine_id)
@@ -179,7 +179,7 @@ def test_a_load_balancer_is_waited_for(place, client):
     assert machine.vpn_port >= 49152 or machine.vpn_port == 51820
 
 
-def test_a_way_that_lets_nothing_through_is_told(place, monkeypatch):
+def test_blocked_exposure_is_reported(place, monkeypatch):
     """With a node's port that nobody answers at: what a firewall in between does."""
     monkeypatch.setattr('fogros2.provider.kubernetes.exposure.NODE_PORT', 1.0)
     monkeypatch.setattr('fogros2.provider.kubernetes.exposure.node_port', lambda service: 9)
@@ -228,7 +228,7 @@ def test_foreign_service_is_not_taken_for_the_machines(
     assert client.ask('GET', path)['spec']['ports'][0]['port'] == 9
 
 
-def test_the_service_of_a_job_that_is_gone_is_waited_for(place, client, in_the_way):
+def test_service_of_a_deleted_job_is_waited_for(place, client, in_the_way):
     """The cluster takes it away with its Job, but some time later."""
     path = in_the_way('heir', ownerReferences=[{
         'apiVersion': 'batch/v1', 'kind': 'Job', 'name': 'fogros2-heir', 'uid': 'of-another'}],
@@ -249,7 +249,7 @@ def test_the_service_of_a_job_that_is_gone_is_waited_for(place, client, in_the_w
     assert 'UDP by node_port' in machine.note
 
 
-def test_the_end_of_a_machine_is_no_other_s(place, client):
+def test_deletion_keeps_pods_of_other_jobs(place, client):
     """Its pods are known by their Job: a new one may have the name by then."""
     base = f'/api/v1/namespaces/{place.name}/pods'
     other = client.create(

@@ -117,7 +117,7 @@ def builder(engine, kubernetes, tmp_path_factory):
         yield create
 
 
-def test_an_image_is_built_and_pushed_and_a_pod_runs_it(builder, namespace):
+def test_pod_runs_an_image_that_was_built_and_pushed(builder, namespace):
     made = builder('--registry', f'{builder.registry.name}/robots')
     assert made.returncode == 0, made
     reference = made.stdout.splitlines()[0].removeprefix('pushed ')
@@ -141,13 +141,13 @@ def test_an_image_is_built_and_pushed_and_a_pod_runs_it(builder, namespace):
 
 
 @pytest.mark.skipif(shutil.which('buildah') is None, reason='needs buildah')
-def test_buildah_does_the_same(builder):
+def test_buildah_builds_and_pushes_an_image(builder):
     made = builder('--registry', f'{builder.registry.name}/buildah', '--engine', 'buildah')
     assert made.returncode == 0, made
     assert made.stdout.startswith(f'pushed {builder.registry.name}/buildah/fogros2:'), made
 
 
-def test_the_image_holds_what_was_asked_for(builder):
+def test_image_has_the_requested_packages(builder):
     made = builder('--registry', 'localhost/fogt', '--no-push')
     assert made.returncode == 0 and made.stdout.startswith('built localhost/fogt/fogros2:'), made
     asked = [line for layer in (builder.folder / 'store').rglob('asked')
@@ -158,14 +158,14 @@ def test_the_image_holds_what_was_asked_for(builder):
             'wireguard-go'} <= set(installs.split())
 
 
-def test_a_registry_that_wants_a_login(builder):
+def test_registry_that_needs_a_login_is_reported(builder):
     made = builder('--registry', f'{builder.closed.name}/robots')
     assert made.returncode == 1, made
     assert f'pushing {builder.closed.name}/robots/fogros2:' in made.stderr, made
     assert f'login {builder.closed.name}' in made.stderr, made
 
 
-def test_a_registry_that_is_not_there(builder):
+def test_unreachable_registry_is_reported(builder):
     with socket.socket() as taken:
         taken.bind((builder.registry.host, 0))
         name = f'{builder.registry.host}:{taken.getsockname()[1]}'
@@ -175,21 +175,21 @@ def test_a_registry_that_is_not_there(builder):
     assert f'is {name} right, and reachable from here?' in made.stderr, made
 
 
-def test_a_registry_without_tls_that_nobody_has_allowed(builder):
+def test_registry_without_tls_is_reported(builder):
     made = builder('--registry', f'{builder.registry.name}/robots',
                    CONTAINERS_REGISTRIES_CONF='/dev/null')
     assert made.returncode == 1, made
     assert 'speaks no TLS' in made.stderr, made
 
 
-def test_an_image_to_begin_with_that_is_not_there(builder):
+def test_missing_base_image_is_reported(builder):
     missing = f'{builder.registry.name}/nothing:1'
     made = builder('--registry', f'{builder.registry.name}/robots', base=missing)
     assert made.returncode == 1, made
     assert f'is there an image {missing}? --base names another' in made.stderr, made
 
 
-def test_a_builder_that_is_not_there(builder, tmp_path):
+def test_missing_image_builder_is_reported(builder, tmp_path):
     made = builder('--registry', 'localhost/fogt', '--engine', 'docker', PATH=os.path.dirname(
         shutil.which('ros2')))
     assert made.returncode == 1, made

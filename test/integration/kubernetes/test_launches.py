@@ -140,7 +140,7 @@ def test_a_killed_robot_s_pod_ends_itself(killed):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_the_example(namespace):
+def test_example_runs_in_a_pod(namespace):
     with launching() as start:
         run = start('fogros2_examples', 'talker.kube.launch.py', 'name:=planner',
                     f'image:={READY}', 'count:=2')
@@ -165,14 +165,14 @@ def talks_by_default(path, namespace):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_fogros2s_form(namespace, tmp_path):
+def test_launch_file_in_the_form_of_fogros2_runs(namespace, tmp_path):
     path = tmp_path / 'form.launch.py'
     path.write_text(FORM)
     talks_by_default(path, namespace)
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_fogros2s_talker_kube_byte_for_byte(upstream, namespace):
+def test_unedited_talker_kube_of_fogros2_runs(upstream, namespace):
     talks_by_default(upstream / 'FogROS2/fogros2_examples/launch/talker.kube.launch.py', namespace)
 
 
@@ -266,7 +266,7 @@ def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_nodes_of_an_evicted_pod_go_on_on_the_robot(launch, namespace):
+def test_nodes_of_an_evicted_pod_continue_on_the_robot(launch, namespace):
     run = launch("talker(pod('evicted', on_interrupt='robot'))", 'listener()')
     run.wait_for('I heard: [Hello World from evicted ', timeout=PATIENCE)
     (pod,) = namespace.all('pods')
@@ -305,7 +305,7 @@ def test_restart_of_the_api_server_is_waited_for(launch, namespace, kubernetes):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_a_kept_pod_is_a_warm_start(launch, namespace):
+def test_second_launch_reuses_a_kept_pod(launch, namespace):
     entities = ("talker(pod('warm', on_exit='keep'))", 'listener()')
     pods = []
     for _ in range(2):
@@ -325,7 +325,7 @@ def test_a_kept_pod_is_a_warm_start(launch, namespace):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_ros2_fog_knows_pods(launch, namespace, kubernetes, monkeypatch, tmp_path):
+def test_fog_verbs_work_with_pods(launch, namespace, kubernetes, monkeypatch, tmp_path):
     run = launch("talker(pod('known'))", 'listener()')
     run.wait_for('I heard', timeout=PATIENCE)
     with ThreadPoolExecutor() as pool:

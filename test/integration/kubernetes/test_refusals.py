@@ -48,7 +48,7 @@ def refused(timeout: float, *machines: dict[str, object]) -> list[str]:
     return said
 
 
-def test_what_keeps_pods_from_running(namespace, monkeypatch):
+def test_reason_why_a_pod_does_not_run_is_reported(namespace, monkeypatch):
     # what time might mend is given less of it than usual
     monkeypatch.setattr('fogros2.provider.kubernetes.start.PATIENCE', 4.0)
     gpu, labels, image = refused(
