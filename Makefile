@@ -33,7 +33,7 @@ test:
 test-fast:
 	@tools/setup.sh test
 	@rm -f .cache/test-*.xml
-	@tools/run.sh embedded -- pytest -n 2 --dist loadgroup --no-loadscope-reorder \
+	@tools/run.sh embedded -- pytest -n 3 --dist loadgroup --no-loadscope-reorder \
 		--junit-xml=.cache/test-fast.xml test/unit test/contract test/launch $(ARGS)
 
 ## fresh   the commands above on newly installed systems; results go to benchmarks/results/fresh.md

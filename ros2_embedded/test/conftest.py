@@ -6,7 +6,7 @@ import os
 # before anything of ROS is imported
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
-os.environ['ROS_DOMAIN_ID'] = str(20 + os.getpid() % 80)  # one's own, for tests side by side
+os.environ['ROS_DOMAIN_ID'] = str(70 + os.getpid() % 30)  # one's own, for tests side by side
 os.environ['CYCLONEDDS_URI'] = (  # this computer's loopback and nothing else
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
     '<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto'

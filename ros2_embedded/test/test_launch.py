@@ -375,7 +375,12 @@ def test_broken_launch_file_is_reported(tmp_path, content, expected, capsys):
     ('loop.launch.yaml', 'launch: [include: {file: $(dirname)/loop.launch.yaml}]')])
 def test_circular_include_is_reported(tmp_path, capsys, name, content):
     (tmp_path / name).write_text(content)
-    assert run(IncludeLaunchDescription(str(tmp_path / name))) == 1
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(300)  # a thousand take seconds
+    try:
+        assert run(IncludeLaunchDescription(str(tmp_path / name))) == 1
+    finally:
+        sys.setrecursionlimit(limit)
     assert 'maximum recursion depth exceeded' in capsys.readouterr().out
 
 

@@ -856,7 +856,8 @@ def test_late_request_does_not_claim_a_released_machine(rig):
 def test_release_during_a_takeover_leaves_the_machine_free(rig):
     rig.serve(launch='first', on_exit='keep')
     client = rig.client()
-    client.request('start', nodes=[rig.node('n', STUBBORN)])
+    client.request('start', nodes=[
+        rig.node('n', STUBBORN, sigterm_timeout=0.2, sigkill_timeout=0.2)])
     rig.wait('output', node='n')
     refused: list[AgentError] = []
 

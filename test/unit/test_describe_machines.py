@@ -90,6 +90,8 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(zzz=1), 'there are: apt, bootstrap, containers, cpus'),
     (lambda: ContainerInstance(name='two words'), "'two words' is no name for a machine"),
     (lambda: ContainerInstance(name='$(reboot)'), 'is no name for a machine'),
+    (lambda: ContainerInstance(name='../../up'), 'is no name for a machine'),
+    (lambda: ContainerInstance(name='Ümlaut'), 'is no name for a machine'),
     (lambda: ContainerInstance(name='x' * 41), 'is no name for a machine'),
     (lambda: ContainerInstance(name=''), 'is no name for a machine'),
     (lambda: ContainerInstance(on_exit='delet'), "did you mean 'delete'?"),

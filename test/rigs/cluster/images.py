@@ -45,7 +45,8 @@ _SANDBOX_CONFIG = {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '21474
 APPLICATION = 'fogros2.test/application:1'
 _APPLICATION_CONFIG = {'Env': ['PATH=/'], 'Cmd': [
     '/busybox', 'sh', '-c', '/busybox echo "the application" >/index.html; '
-    'exec /busybox httpd -f -p 8080 -h /']}
+    # as Lichtblick's server does; the first process of a container has no default handler
+    'trap "exit 0" TERM; /busybox httpd -f -p 8080 -h / & wait']}
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
             'rsync', 'wireguard-go', 'wireguard-tools')
