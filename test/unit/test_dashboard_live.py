@@ -47,6 +47,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
     made = Live()
     made.start()
+    wait_until(lambda: 'machines' in made.state(), timeout=10.0, what='the first look')
     yield made
     made.close()
 
