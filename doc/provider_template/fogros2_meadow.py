@@ -28,7 +28,10 @@ TABLE = {'north': (60.2, 24.9, 'Helsinki', True)}
 @dataclasses.dataclass(frozen=True)
 class MeadowOptions(VmOptions):
     """
-    Options of a machine at Meadow, besides region, disk_size, spot, min_cpu, max_price, ...
+    Options of a machine at Meadow.
+
+    It inherits region, regions, by_region, disk_size, spot, arch, min_cpu, min_memory_gb,
+    cpu_type, gpu, gpu_memory_gb, max_price, tags, user and ssh_from.
 
     :param machine_type: name of a type, or 'cheapest'.
     :param machine_types: types to try after ``machine_type``.
@@ -90,7 +93,7 @@ class Meadow(VmCloud):
 
     def insert(self, place: Place, order: Order, prepared: Any, created: list[str],
                tags: Mapping[str, str]) -> str:
-        """Request a machine and return its id at once."""
+        """Request a machine with Ubuntu 24.04 and return its id at once."""
         raise NotImplementedError
 
     def delete(self, machine: VmId) -> None:
@@ -114,6 +117,7 @@ class MeadowProvider(VmProvider):
     """Machines at Meadow."""
 
     name = 'meadow'
+    #: Lacks stop, images, preemption_notice and application_port.
     capabilities = VmProvider.capabilities  # dataclasses.replace(..., stop=True) adds one
 
     def __init__(self) -> None:

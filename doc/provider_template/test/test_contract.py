@@ -6,6 +6,8 @@ import json
 from fogros2_shelf import ShelfProvider
 import pytest
 
+from fogros2.errors import ProviderError
+from fogros2.model import CreateRequest, MachineSpec
 from fogros2.testing import ProviderContract
 
 
@@ -25,3 +27,17 @@ class TestShelf(ProviderContract):
     def make(self):
         """Return a provider, and the options of its machines."""
         return ShelfProvider(str(self.folder)), {'folder': str(self.folder)}
+
+    def test_full_shelf_is_an_error(self):
+        """Ask for a third computer."""
+        provider, options = self.make()
+
+        def create(name):
+            request = CreateRequest(token=name, tags={'fogros2-name': name},
+                                    authorized_key='ssh-ed25519 AAAA', vpn_port=51820)
+            return provider.create(MachineSpec(name, 'shelf', options), request)
+
+        for name in ('first', 'second'):
+            create(name)
+        with pytest.raises(ProviderError, match='free'):
+            create('third')
