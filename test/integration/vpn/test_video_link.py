@@ -83,7 +83,7 @@ def test_large_images_take_turns_on_a_slow_link(vpn: Any) -> None:
     """One takes 0.7 s of it. With all of them sent, the link would be full and none whole."""
     vpn.relay.tell({'rate': 10e6})
     viewer = stream(vpn, codec='raw', images=2)
-    assert len(during(viewer, time.monotonic(), 6.0)) >= 3
+    assert len(during(viewer, time.monotonic(), 10.0)) >= 5
 
 
 def wire_seconds(rate: float) -> float:
@@ -98,9 +98,9 @@ def test_jpeg_fills_link_and_never_queues(vpn: Any, rate: float, delay: float) -
     """A longer link takes several images at a time; the queue would hold a second of them."""
     vpn.relay.tell({'rate': rate, 'delay': delay, 'queue': 1.0})
     viewer = stream(vpn, codec='jpeg')
-    lines = during(viewer, time.monotonic() + 1.0, 5.0)
+    lines = during(viewer, time.monotonic() + 2.0, 10.0)
     wire = wire_seconds(rate)
-    assert len(lines) >= 0.6 * 5.0 / wire
+    assert len(lines) >= 0.6 * 10.0 / wire
     numbers = [line['image'] for line in lines]
     assert numbers == sorted(set(numbers))
     latencies = sorted(line['latency'] - delay for line in lines)
