@@ -60,7 +60,7 @@ lint:
 ## bench  every benchmark; figures go to benchmarks/results
 bench:
 	@tools/setup.sh bench
-	@set -e; for script in $(filter-out benchmarks/theora.py benchmarks/applications_%,$(wildcard benchmarks/*.py)); do \
+	@set -e; for script in $(filter-out benchmarks/chaos.py benchmarks/security.py benchmarks/theora.py benchmarks/applications_%,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
 
 ## docs   the documentation, as pages for a browser
@@ -73,10 +73,13 @@ deb:
 	@tools/setup.sh lint
 	@tools/run.sh embedded -- python packaging/deb.py
 
-## soak   the long tests that 'make test' leaves out
+## soak   the long tests and figures that 'make test' and 'make bench' leave out
 soak:
-	@tools/setup.sh test
+	@tools/setup.sh bench
 	@tools/run.sh embedded -- pytest -m soak $(ARGS)
+	@tools/run.sh embedded -- python benchmarks/security.py
+	@tools/run.sh embedded -- python benchmarks/chaos.py
+	@tools/run.sh embedded -- python benchmarks/chaos.py --defaults
 
 ## setup  only what the others need: system packages and the virtual environment
 setup:

@@ -234,7 +234,7 @@ def _fragments(uri: str) -> Iterator[str]:
             name, _, rest = rest.partition(',')
             path = Path(name.removeprefix('file://'))
             try:
-                yield path.read_text()
+                yield path.read_text(errors='replace')
             except OSError as error:
                 raise DdsError(
                     f"CYCLONEDDS_URI names {path}, which can't be read: {error.strerror}",

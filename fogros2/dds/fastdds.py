@@ -175,11 +175,11 @@ def _profiles(path: str) -> tuple[Element, Element]:
         root = Element('dds', xmlns=NAMESPACE)
         return root, _child(root, 'profiles')
     try:
-        root = ElementTree.fromstring(Path(path).read_text())
+        root = ElementTree.fromstring(Path(path).read_bytes())
     except OSError as error:
         raise DdsError(f"{VARIABLE} names {path}, which can't be read: {error.strerror}",
                        f'correct or unset {VARIABLE}') from error
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise DdsError(f'{path} of {VARIABLE} is no XML: {error}',
                        f'correct it or unset {VARIABLE}') from error
     for element in root.iter():

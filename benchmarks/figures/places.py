@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places where robots have their machines: this computer's podman, EC2 in a box, a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import json
+import os
+from pathlib import Path
+import subprocess
+import time
+from typing import Any, ClassVar
+
+from rigs.cluster import Client, Cluster, cluster, READY, running_cluster
+from rigs.cluster.namespaces import making_namespaces, Namespace
+from rigs.ec2 import Ec2Box
+
+ROOT = Path(__file__).resolve().parents[2]
+REGION = 'us-east-1'
+#: Seconds without the launch after which a machine of the short time-outs ends.
+ROBOT_TIMEOUT = 5.0
+
+LAUNCH = """\
+import functools
+from fogros2 import CloudNode, {kind}, FogROSLaunchDescription
+{patch}
+
+def generate_launch_description():
+    return FogROSLaunchDescription([CloudNode(
+        machine={kind}(name='{name}'{options}), package='fogros2_examples', executable='talker',
+        name='{node}')])
+"""
+TIMEOUTS = """\
+from fogros2.deploy import launch
+launch.Timeouts = functools.partial(launch.Timeouts, boot={boot}, ssh={ssh})
+"""
+
+
+class Place:
+    """
+    Machines of one provider.
+
+    :param short: whether time-outs are seconds.
+    """
+
+    kind: ClassVar[str]
+    #: Time-outs in seconds of the boot and of SSH where they are short; see ``Timeouts``.
+    boot, ssh = 10.0, 5.0
+    options = ''
+    patch = ''
+    prefix: list[str] = []
+    environment: Mapping[str, str] = {}
+
+    def __init__(self, *, short: bool = True) -> None:
+        self.short = short
+
+    @property
+    def bound(self) -> float:
+        """Seconds that a machine may run after its launch was killed."""
+        return ROBOT_TIMEOUT + self.boot + self.ssh if self.short else 120.0 + 360.0
+
+    def launch_file(self, name: str) -> str:
+        """Return a launch file with a talker on a machine of that name."""
+        patch, options = '', self.options
+        if self.short:
+            patch = TIMEOUTS.format(boot=self.boot, ssh=self.ssh) + self.patch
+            options += f', robot_timeout={ROBOT_TIMEOUT}'
+        return LAUNCH.format(kind=self.kind, name=name, node=name.replace('-', '_'), patch=patch,
+                             options=options)
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return what there is for machines of that name, and whether it is a running machine."""
+        raise NotImplementedError
+
+    def clear(self, name: str) -> None:
+        """Delete what there is for machines of that name, after it was counted."""
+
+
+class Container(Place):
+    """Containers on this computer."""
+
+    kind = 'ContainerInstance'
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return the container."""
+        listed = subprocess.run(
+            ['podman', 'ps', '-a', '--filter', f'label=fogros2-machine={name}', '--format',
+             'json'], capture_output=True, text=True, timeout=60, check=True).stdout
+        return {f"container {each['Id'][:12]}": each['State'] == 'running'
+                for each in json.loads(listed)}
+
+    def clear(self, name: str) -> None:
+        """Delete the container."""
+        for thing in self.things(name):
+            subprocess.run(['podman', 'rm', '-f', '-t', '0', thing.split()[1]],
+                           capture_output=True, timeout=60, check=False)
+
+
+class Ec2(Place):
+    """Instances of EC2 in a box."""
+
+    kind = 'AWSCloudInstance'
+    boot, ssh = 15.0, 10.0
+
+    def __init__(self, box: Ec2Box, *, short: bool = True) -> None:
+        super().__init__(short=short)
+        self.box = box
+        self.prefix = box.on_robot([])
+        self.environment = {**box.environment(REGION), 'FOGROS2_AWS_CHECKIP': box.checkip,
+                            'FOGROS2_AWS_REGIONS': REGION}
+
+    def api(self) -> Any:
+        """Return a client of the box's EC2."""
+        import boto3
+        return boto3.client('ec2', region_name=REGION, **self.box.client_arguments)
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return instances, and groups, keys and disks by their tags."""
+        found = {f'instance {each.id}': True for each in self.box.alive()
+                 if each.tags.get('fogros2-name') == name}
+        api, tag = self.api(), [{'Name': 'tag:fogros2-name', 'Values': [name]}]
+        for kind, entries in (
+                ('GroupId', api.describe_security_groups(Filters=tag)['SecurityGroups']),
+                ('KeyName', api.describe_key_pairs(Filters=tag)['KeyPairs']),
+                ('VolumeId', api.describe_volumes(Filters=tag)['Volumes'])):
+            found.update({f'{kind} {entry[kind]}': False for entry in entries})
+        return found
+
+    def plant(self, name: str) -> None:
+        """Create the group and the key of a machine whose instance another robot now creates."""
+        api, attempt = self.api(), f'{name}-{time.time():.3f}'
+        tags = [{'Key': f'fogros2-{key}', 'Value': value} for key, value in {
+            'name': name, 'attempt': attempt, 'made': str(int(time.time())),
+            'robot': 'neighbour-0-00000000'}.items()]
+        api.create_security_group(
+            GroupName=f'fogros2-{attempt}', Description=name,
+            TagSpecifications=[{'ResourceType': 'security-group', 'Tags': tags}])
+        api.create_key_pair(KeyName=f'fogros2-{attempt}', TagSpecifications=[
+            {'ResourceType': 'key-pair', 'Tags': tags}])
+
+
+class Pod(Place):
+    """Pods of a real cluster of one node."""
+
+    kind = 'KubeInstance'
+    options = f", container_image='{READY}'"
+    patch = 'from fogros2.provider.kubernetes import manifests\nmanifests.BOOT = 20.0\n'
+    boot, ssh = 20.0, 5.0
+
+    def __init__(self, space: Namespace, *, short: bool = True) -> None:
+        super().__init__(short=short)
+        self.space = space
+        self.environment = {'KUBECONFIG': str(space.kubeconfig)}
+
+    @property
+    def bound(self) -> float:
+        """Seconds that a machine may run: without an agent, ten minutes unless it is short."""
+        return super().bound if self.short else 600.0 + 60.0
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return the objects with the machine's label."""
+        return {
+            f"{kind} {each['metadata']['name']}":
+                kind == 'pods' and each['status'].get('phase') in ('Pending', 'Running')
+            for kind in ('jobs', 'pods', 'services', 'secrets', 'configmaps')
+            for each in self.space.all(kind)
+            if name in json.dumps(each['metadata'].get('labels', {}))}
+
+
+@contextlib.contextmanager
+def place(provider: str, *, short: bool = True) -> Iterator[Place]:
+    """Open a place, for as long as the block runs."""
+    with contextlib.ExitStack() as stack:
+        if provider == 'container':
+            yield Container(short=short)
+        elif provider == 'aws':
+            yield Ec2(stack.enter_context(Ec2Box()), short=short)
+        else:
+            there = _cluster(stack)
+            make = stack.enter_context(making_namespaces(
+                there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
+            yield Pod(make(), short=short)
+
+
+def _cluster(stack: contextlib.ExitStack) -> Cluster:
+    if folder := os.environ.get('FOGROS2_CLUSTER'):
+        return running_cluster(Path(folder))
+    binaries = Path(subprocess.check_output([ROOT / 'tools' / 'kubernetes.sh'], text=True).strip())
+    return stack.enter_context(cluster(binaries.parent, binaries))
