@@ -13,7 +13,7 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 import launch.logging
 
 from fogros2.describe import values
-from fogros2.errors import FogError
+from fogros2.errors import AgentError, FogError
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import streaming, uncompressed
@@ -34,7 +34,7 @@ _NOTICES = {
     'launch_exited': (
         logging.ERROR, 'the launch on the machine ended with exit status {returncode}'),
     'gap': (logging.WARNING, '{count} events of the agent came too late for its log'),
-    'connection lost': (logging.WARNING, 'the connection is lost; its nodes run on'),
+    'connection lost': (logging.WARNING, 'the connection to its agent is lost; trying again'),
     'connection back': (logging.INFO, 'the connection is back'),
     'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
 }
@@ -44,6 +44,8 @@ _UNREPORTED = -9
 #: 'robot' then holds exits back for so many seconds, until it knows whether the machine is gone.
 _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
+#: Seconds, at least, before nodes with respawn start again because their launch process ended.
+_RESPAWN_DELAY = 1.0
 
 
 class Run(Protocol):
@@ -52,6 +54,7 @@ class Run(Protocol):
     node: NodeSpec
     started: bool
     stopping: bool
+    respawning: bool
 
     def on_event(self, event: Event) -> None:
         """Handle an event of the agent that names this process."""
@@ -340,9 +343,17 @@ class Session:
         if kind in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
             self._ending = True
             self._loop.call_later(_HOLD, self._release_exits)
-        elif kind in ('launch_exited', 'connection absent') and not self._ending:
-            self._end_unreported(
-                event['returncode'] if event['event'] == 'launch_exited' else _UNREPORTED)
+        elif event['event'] == 'launch_exited' and not self._ending:
+            respawning = self._respawning()
+            self._end_unreported(event['returncode'], respawning)
+            self._start_again(respawning)
+        elif kind == 'connection absent' and not self._ending:
+            respawning = self._respawning()
+            self._end_unreported(_UNREPORTED, [])
+            if respawning:
+                self._fail(AgentError(
+                    f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
+                    f"of '{self.spec.name}' is gone", 'launch again'))
 
     def _interrupted(self, lost: bool, reason: str) -> None:
         first = not self.interrupted
@@ -373,14 +384,35 @@ class Session:
         for run, event in held:
             run.on_event(event)
 
-    def _end_unreported(self, returncode: int) -> None:
+    def _respawning(self) -> list[Run]:
+        """Return the processes that start again when they end."""
+        return [run for run in self._runs.values() if run not in self._waiting
+                and run.started and not run.stopping and not self.interrupted
+                and run.node.respawn and run.node.respawn_max_retries != 0]
+
+    def _start_again(self, runs: list[Run]) -> None:
+        """Start processes, that the end of their launch process has ended, in another one."""
+        for run in runs:
+            # an agent starts the same id once
+            node = self._runs.pop(run.node.id).node
+            run.node = dataclasses.replace(
+                node, id=f'{node.id}+', respawn_max_retries=max(-1, node.respawn_max_retries - 1))
+            self._runs[run.node.id] = run
+        if runs:
+            self._waiting += runs
+            delay = max(_RESPAWN_DELAY, *(run.node.respawn_delay for run in runs))
+            self._loop.call_later(delay, self._request, self._start_waiting)
+
+    def _end_unreported(self, returncode: int, respawning: list[Run]) -> None:
         for run in list(self._runs.values()):
             if run in self._waiting:
                 continue
             node = run.node
+            if run in respawning and run.respawning:
+                continue  # the agent has reported the exit
             if run.started:
                 run.on_event({'event': 'exited', 'node': node.id, 'name': node.name,
-                              'returncode': returncode, 'respawns': False})
+                              'returncode': returncode, 'respawns': run in respawning})
             else:
                 run.on_event({'event': 'refused', 'node': node.id, 'name': node.name,
                               'error': 'the launch on the machine ended', 'hint': ''})

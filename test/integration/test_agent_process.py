@@ -623,13 +623,14 @@ def test_killed_launch_process_ends_its_nodes_and_restarts(rig):
         'import os, subprocess, sys, time\n'
         'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
         'print(child.pid)\n'
-        'time.sleep(600)\n'))])
+        'time.sleep(600)\n'), respawn=True)])
     node = rig.wait('started', node='n')['pid']
     wait_until(lambda: '\n' in rig.text('n'), timeout=10, what='the child')
     child = int(rig.text('n'))
     os.kill(pid, signal.SIGKILL)
     assert rig.wait('launch_exited')['returncode'] == -9
-    assert rig.wait('exited', node='n')['returncode'] == -2
+    exited = rig.wait('exited', node='n')
+    assert exited['returncode'] == -2 and exited['respawns']
     assert gone(node)() and gone(child)()
     client.request('start', nodes=[rig.node('again', 'print("here")\n')])
     assert rig.wait('exited', node='again')['returncode'] == 0
@@ -1070,6 +1071,19 @@ def test_nodes_do_not_outlive_a_killed_agent(rig):
     node = rig.wait('started', node='n')['pid']
     agent.kill()
     wait_until(gone(node), timeout=10, what='the node to end')
+
+
+def test_restarted_agent_reports_when_no_node_is_left(rig):
+    agent = rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[rig.node('n', STUBBORN)])
+    wait_until(lambda: '\n' in rig.text('n'), timeout=10, what='the node')
+    pids = [int(word) for word in rig.text('n').split()]
+    agent.kill()
+    agent.wait(10)
+    rig.serve()
+    rig.wait('launch_exited')
+    assert all(gone(pid)() for pid in pids)
 
 
 def test_restarted_agent_keeps_watchdog_and_journal(rig, free_udp_port):

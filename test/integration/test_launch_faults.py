@@ -34,7 +34,7 @@ def generate_launch_description():
     machine = ContainerInstance(name='{name}', network='{network}', robot_timeout={timeout})
     return FogROSLaunchDescription([
         CloudNode(machine=machine, package='fogros2_examples', executable='talker',
-                  output='screen'),
+                  output='screen', respawn=True),
         Node(package='fogros2_examples', executable='listener', output='screen'),
     ])
 """
@@ -166,3 +166,22 @@ def containers() -> list[str]:
 
 def fog(*words: str) -> int:
     return subprocess.run(['ros2', 'fog', *words], capture_output=True, timeout=60).returncode
+
+
+@pytest.mark.parametrize('victim', [
+    '$agent', '$(cat /proc/$agent/task/$agent/children)'], ids=['agent', 'launch process'])
+def test_nodes_respawn_when_what_runs_them_is_killed(launched, victim):
+    launch = launched()
+    for _ in range(2):
+        launch.wait_for(STEPS['running'])
+        launch.said.clear()
+        killed = subprocess.run(
+            ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
+             f'agent=$(cat /run/fogros2/agent.pid); sudo kill -9 {victim}'],
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+        assert killed.returncode == 0, killed
+        launch.wait_for('the launch on the machine ended with exit status -9')
+        launch.wait_for('process started with pid')
+        launch.wait_for('Publishing')
+    launch.child.send_signal(signal.SIGINT)
+    assert launch.ended() == 0, ''.join(launch.said)

@@ -25,7 +25,7 @@ import pytest
 
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, VpnError
-from fogros2.runtime import remote_run
+from fogros2.runtime import remote_run, session
 
 
 @pytest.fixture
@@ -433,13 +433,68 @@ def test_end_of_the_launch_on_the_machine_ends_its_nodes(run, fake, planner, cap
         capfd.readouterr().out)
 
 
+@pytest.mark.parametrize('reported', [False, True])
+def test_nodes_respawn_after_the_end_of_the_agents_launch(
+    run, fake, planner, monkeypatch, reported,
+):
+    monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
+    lives = []
+
+    def lives_twice(machine, node):
+        lives.append(node)
+        if len(lives) > 2:
+            ends(machine, node)
+            return
+        if reported:
+            machine.say('exited', node, returncode=-2, respawns=True)
+        machine.say('launch_exited', returncode=-9, said='')
+
+    fake.on_start = lives_twice
+    node = talker(planner, respawn=True, respawn_max_retries=5)
+    seen = []
+    assert run(LaunchDescription([
+        node,
+        *(RegisterEventHandler(handler(**{'target_action': node, name: [
+            OpaqueFunction(function=lambda context, name=name: seen.append(name))]}))
+          for handler, name in ((OnProcessStart, 'on_start'), (OnProcessExit, 'on_exit')))])) == 0
+    assert seen == ['on_start', 'on_exit'] * 3
+    assert len({life.id for life in lives}) == 3
+    assert [life.respawn_max_retries for life in lives] == [5, 4, 3]
+
+
+def test_nodes_respawn_at_most_as_often_as_they_may(run, fake, planner, monkeypatch):
+    monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
+    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9, said='')
+    assert run(LaunchDescription([
+        talker(planner, respawn=True, respawn_max_retries=1), talker(planner)])) == 0
+    assert len(fake.noted('start')) == 3
+
+
+def test_shutdown_before_a_node_respawns(run, fake, planner):
+    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9, said='')
+    node = talker(planner, respawn=True, respawn_delay=60.0)
+    assert run(LaunchDescription([
+        node, RegisterEventHandler(OnProcessExit(target_action=node, on_exit=[Shutdown()])),
+    ])) == 0
+    assert len(fake.noted('start')) == 1 and not fake.noted('stop')
+
+
+def test_agent_that_stays_away_fails_nodes_with_respawn(run, fake, planner, capfd):
+    fake.on_start = lambda machine, node: machine.say(
+        'connection', state='absent', error='nobody answers')
+    assert run(LaunchDescription([talker(planner, respawn=True)])) == 1
+    output = capfd.readouterr().out
+    assert "can't respawn: the agent of 'planner' is gone" in output
+    assert 'Traceback' not in output
+
+
 @pytest.mark.parametrize(('event', 'line'), [
     ({'event': 'watchdog', 'reason': 'lifetime', 'action': 'delete'},
      '[ERROR] [fogros2]: planner: the agent ends everything: lifetime'),
     ({'event': 'vpn_repaired', 'what': 'vpn', 'seconds': 1.25},
      '[WARNING] [fogros2]: planner: the VPN was down for 1.2 s and is up again'),
     ({'event': 'connection', 'state': 'lost'},
-     '[WARNING] [fogros2]: planner: the connection is lost; its nodes run on'),
+     '[WARNING] [fogros2]: planner: the connection to its agent is lost; trying again'),
 ])
 def test_events_of_the_agent_are_logged(run, fake, planner, capfd, event, line):
     def says(machine, node):
