@@ -59,7 +59,8 @@ class CloudInstance:
         With 'stop' and 'keep' a name is required, so that a later launch finds the machine.
     :param lifetime: time until the machine ends by itself, in seconds or as '8h', '1d12h'.
     :param robot_timeout: time without contact to the launch until the machine stops its nodes;
-        seconds or as above.
+        seconds or as above. A machine that the launch has not reached yet ends 6 minutes after
+        its boot (a pod: 10 minutes, or this time if it is longer).
     :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.

@@ -16,6 +16,8 @@ import pytest
 
 import fogros2
 from fogros2.describe import overrides
+from fogros2.provider.kubernetes import manifests
+from fogros2.waiting import Timeouts
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
@@ -131,6 +133,16 @@ def test_page_that_explains_is_short(page):
     name = page.relative_to(ROOT).as_posix()
     if not name.startswith('doc/reference/') and page.name not in REFERENCES:
         assert len(page.read_text().split()) <= (800 if name == 'README.md' else 1500)
+
+
+@pytest.mark.parametrize('page', [
+    'README.md', 'doc/machines.md', 'doc/security.md', 'doc/machine_life.md',
+    'doc/troubleshooting.md', 'fogros2/describe/machines.py'])
+def test_end_of_a_machine_that_was_never_reached_is_stated(page):
+    text = ' '.join((ROOT / page).read_text().split())
+    allowance = Timeouts()
+    assert f'{(allowance.boot + allowance.ssh) / 60:g} minutes after' in text
+    assert f'a pod: {manifests.BOOT / 60:g}' in text
 
 
 def test_all_benchmark_results_are_listed():
