@@ -242,8 +242,9 @@ def test_graph_shows_nodes_topics_and_services(world):
             node.get_subscriber_names_and_types_by_node('there', '/')
         assert ('/a/ask', ['std_srvs/srv/Trigger']) in \
             node.get_service_names_and_types_by_node('here', '/a')
-        assert ('/a/ask', ['std_srvs/srv/Trigger']) in \
-            node.get_client_names_and_types_by_node('there', '/')
+        # each endpoint of a client is discovered by itself
+        world.until(lambda node=node: ('/a/ask', ['std_srvs/srv/Trigger'])
+                    in node.get_client_names_and_types_by_node('there', '/'))
         with pytest.raises(NodeNameNonExistentError):
             node.get_publisher_names_and_types_by_node('nobody', '/')
     info = there.get_publishers_info_by_topic('/a/chatter')[0]
