@@ -139,7 +139,7 @@ def test_page_that_explains_is_short(page):
     'README.md', 'doc/machines.md', 'doc/security.md', 'doc/machine_life.md',
     'doc/troubleshooting.md', 'fogros2/describe/machines.py'])
 def test_end_of_a_machine_that_was_never_reached_is_stated(page):
-    text = ' '.join((ROOT / page).read_text().split())
+    text = ' '.join(re.sub(r'\]\(.*?\)', '', (ROOT / page).read_text()).split())
     allowance = Timeouts()
     assert f'{(allowance.boot + allowance.ssh) / 60:g} minutes after' in text
     assert f'a pod: {manifests.BOOT / 60:g}' in text
