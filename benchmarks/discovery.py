@@ -41,7 +41,7 @@ from fogros2.errors import DeadlineExceeded
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
-    from conftest import Child, Lab
+    from rigs.vpn_lab import Child, Lab
 
 LAB = Path(__file__).parents[1] / 'test/integration/vpn'
 COUNTS = (10, 50, 100)
@@ -182,8 +182,8 @@ class Bench:
 @contextlib.contextmanager
 def laboratory() -> Iterator[Lab]:
     """Yield a robot and a machine with the VPN between them."""
-    sys.path.insert(0, str(LAB))
-    from conftest import Lab
+    sys.path.insert(0, str(LAB.parents[1]))
+    from rigs.vpn_lab import Lab
     with tempfile.TemporaryDirectory() as folder:
         lab = Lab(Path(folder))
         try:

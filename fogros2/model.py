@@ -274,6 +274,8 @@ class VpnInterface:
     :param firewall: admit only DDS and ping, and forward nothing (on the robot).
     :param host_routes: route only the peers' addresses into the VPN, because a network of the
         host overlaps the launch's subnet.
+    :param process: id of a process, or the file with the id. The filter of DDS applies to this
+        process and its children; '' for all processes of a machine.
     """
 
     name: str
@@ -284,6 +286,7 @@ class VpnInterface:
     mtu: int = 1420
     firewall: bool = False
     host_routes: bool = False
+    process: str = ''
 
 
 @dataclasses.dataclass(frozen=True)

@@ -102,26 +102,33 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
                 "leave bootstrap='embedded' out, or unset RMW_IMPLEMENTATION")
 
 
-def robot_interface(launch_id: str, network: str, port: int, key_file: str) -> VpnInterface:
-    """Return the robot's VPN interface, which has a firewall and the first address."""
+def robot_interface(
+    launch_id: str, network: str, port: int, key_file: str, process: int,
+) -> VpnInterface:
+    """
+    Return the robot's VPN interface, which has a firewall and the first address.
+
+    :param process: id of the launch, whose nodes are its children.
+    """
     return VpnInterface(
         name=f'fog{launch_id}', address=_host(network, 1), network=network, port=port,
-        key_file=key_file, firewall=True)
+        key_file=key_file, firewall=True, process=str(process))
 
 
 def machine_interface(
-    launch_id: str, network: str, index: int, port: int, key_file: str,
+    launch_id: str, network: str, index: int, port: int, key_file: str, process: str = '',
 ) -> VpnInterface:
     """
     Return the VPN interface of the ``index``-th machine, counted from 0.
 
     Its name differs from the robot's, because a machine may be the robot itself.
 
+    :param process: file with the agent's id, where the host has other DDS than the launch's.
     :raises ConfigurationError: the subnet has no free address.
     """
     return VpnInterface(
         name=f'fog{launch_id}m{index}', address=_host(network, FIRST_MACHINE + index),
-        network=network, port=port, key_file=key_file)
+        network=network, port=port, key_file=key_file, process=process)
 
 
 def _host(network: str, number: int) -> str:

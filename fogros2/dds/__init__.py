@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+import contextlib
 import dataclasses
 import ipaddress
+import socket
 from types import MappingProxyType
 from typing import ClassVar, Optional
 
@@ -53,6 +55,10 @@ class DdsVendor(abc.ABC):
         if not 0 <= domain <= self.last_domain:
             raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
+
+    def asked(self, user: Mapping[str, str]) -> list[str]:
+        """Return the hosts that the user configured for nodes to ask, names or addresses."""
+        return static_peers(user)
 
     def ask_lan(self) -> Command:
         """Return the robot's command for ``parse_lan``; by default no output is needed."""
@@ -135,6 +141,15 @@ def check_discovery(user: Mapping[str, str]) -> None:
 def static_peers(user: Mapping[str, str]) -> list[str]:
     """Return the hosts in ROS_STATIC_PEERS, which are separated by ``;``."""
     return [host.strip() for host in user.get('ROS_STATIC_PEERS', '').split(';') if host.strip()]
+
+
+def addresses_of(hosts: Sequence[str]) -> list[str]:
+    """Return the IPv4 addresses of hosts, without those that are unknown."""
+    found: set[str] = set()
+    for host in hosts:
+        with contextlib.suppress(OSError, UnicodeError):
+            found |= {str(info[4][0]) for info in socket.getaddrinfo(host, None, socket.AF_INET)}
+    return sorted(found)
 
 
 def is_address(text: str) -> bool:

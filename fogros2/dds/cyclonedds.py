@@ -28,7 +28,7 @@ from types import MappingProxyType
 from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
-from fogros2.dds import check_discovery, DdsVendor, is_address, local_only
+from fogros2.dds import check_discovery, DdsVendor, is_address, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 
@@ -75,6 +75,12 @@ class CycloneDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_cyclonedds_cpp'
+
+    def asked(self, user: Mapping[str, str]) -> list[str]:
+        """Return the hosts of ROS_STATIC_PEERS, and those of each ``<Peer>``."""
+        text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
+        return [*static_peers(user), *re.findall(
+            r'<Peer\b[^>]*\baddress=["\']([^"\':]+)', text, re.IGNORECASE)]
 
     def ask_lan(self) -> Command:
         """Return the command whose output :meth:`parse_lan` reads."""

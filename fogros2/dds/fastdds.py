@@ -67,6 +67,12 @@ class FastDds(DdsVendor):
     #: They are the same in every domain, because the middleware itself sets the port.
     ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
 
+    def asked(self, user: Mapping[str, str]) -> list[str]:
+        """Return the hosts of ROS_STATIC_PEERS, and those of the user's profiles."""
+        root, _ = _profiles(user.get(VARIABLE, ''))
+        return [*static_peers(user), *(
+            (address.text or '').strip() for address in root.iter('address'))]
+
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:

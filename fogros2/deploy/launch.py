@@ -15,7 +15,7 @@ import threading
 from typing import Optional
 
 from fogros2 import model, plan, plugin_system, ros2_daemon
-from fogros2.dds import DdsVendor
+from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import robot_router
 from fogros2.deploy.checks import check, check_architecture, check_names
 from fogros2.deploy.choosing import Choices
@@ -224,7 +224,8 @@ class Launch:
                 write_private(
                     folder / 'process.json', model.to_json(this_process()).encode())
                 vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-                    domain=self.domain, ports=self.dds().ports)
+                    domain=self.domain, ports=self.dds().ports,
+                    asked=addresses_of(self.dds().asked(self.user_environment)))
                 self._vpn = RobotVpn(
                     choose_interface(
                         self.id, folder, self.user_environment, self.timeouts.vpn), vpn,

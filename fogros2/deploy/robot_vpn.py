@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
+import os
 from pathlib import Path
 import threading
 import time
@@ -40,7 +41,8 @@ def choose_interface(
     network = addresses.choose_subnet(
         used, launch_id=launch_id, pool=addresses.pool_from(environment))
     interface = plan.robot_interface(
-        launch_id, network, addresses.choose_port(environment), str(folder / 'vpn.key'))
+        launch_id, network, addresses.choose_port(environment), str(folder / 'vpn.key'),
+        os.getpid())
     if helped.permitted():
         return dataclasses.replace(interface, key_file=helped.key_file(interface.name))
     return interface
@@ -64,7 +66,7 @@ class RobotVpn:
         self.vpn = vpn
         #: True while no part of the interface exists on this computer.
         self.down = True
-        self._report = report
+        self.report = report
         self._undo = undo
         self._timeout = timeout
         self._cancel = cancel
@@ -92,7 +94,7 @@ class RobotVpn:
                     # a thread that still updates a machine's peers may come late; nothing would
                     # take the interface down a second time
                     raise Cancelled('the VPN interface')
-                with step(self._report, '', 'VPN interface') as detail:
+                with step(self.report, '', 'VPN interface') as detail:
                     self._undo.add('VPN interface', self._take_down)
                     self.down = False
                     public_key = self._run([self.vpn.keys(self.interface)]).strip()
@@ -107,7 +109,7 @@ class RobotVpn:
 
     def _bring_up(self) -> None:
         try:
-            self._run(self.vpn.up(self.interface, []))
+            report_unfiltered(self.report, '', self._run(self.vpn.up(self.interface, [])))
         except CommandError as error:
             if 'Address already in use' in error.result.stderr:
                 raise VpnError(
@@ -156,7 +158,7 @@ class RobotVpn:
                 return
             except FogError as error:
                 if pause == 1.0 and not self._ending.is_set():
-                    self._report(StepFailed(
+                    self.report(StepFailed(
                         member.name, 'VPN peers', 0.0,
                         f'does not know a new machine yet, trying again: {error}', fatal=False))
             self._stop.wait(pause)
@@ -188,7 +190,7 @@ class RobotVpn:
             try:
                 if process.run(self.vpn.health_check(self.interface), check=False,
                                timeout=self._timeout).returncode != 0:
-                    with step(self._report, '', 'VPN repair', fatal=False):
+                    with step(self.report, '', 'VPN repair', fatal=False):
                         self._run(self.vpn.repair(self.interface, self._peers()), cancel=False)
                 self._poll_interval = POLL_INTERVAL
             except FogError:
@@ -199,7 +201,7 @@ class RobotVpn:
         """Refresh sudo's ticket, so that the way down needs no password; warn if it has ended."""
         before, self._ticket_valid = self._ticket_valid, process.refresh_ticket()
         if before and not self._ticket_valid:
-            self._report(StepFailed(
+            self.report(StepFailed(
                 '', 'sudo ticket', 0.0,
                 'sudo wants a password again, so taking this launch down will leave its '
                 'containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; else '
@@ -213,6 +215,14 @@ class RobotVpn:
             self.down = True
 
 
+def report_unfiltered(report: Reporter, machine: str, output: str) -> None:
+    """Report that a host could not filter DDS, if the commands of its interface printed that."""
+    if output.strip():
+        report(StepFailed(
+            machine, 'DDS filter', 0.0, f'{output.strip()}: its DDS is not filtered '
+            '(doc/dds_network.md says what that means)', fatal=False))
+
+
 class VpnMember:
     """
     A machine in the VPN, whose peers are updated when other machines join.
@@ -224,7 +234,7 @@ class VpnMember:
 
     def __init__(
         self, route: plan.Route, interface: VpnInterface,
-        run: Callable[[Iterable[Command]], object],
+        run: Callable[[Iterable[Command]], str],
         health_check: Callable[[Sequence[Peer]], object],
     ) -> None:
         self.route = route
@@ -241,7 +251,8 @@ class VpnMember:
         """Bring the machine's interface up with its current peers."""
         with self._lock:
             self._peers = robot.peers_of(self)
-            self._run(robot.vpn.up(self.interface, self._peers))
+            report_unfiltered(robot.report, self.name, self._run(
+                robot.vpn.up(self.interface, self._peers)))
 
     def update(self, robot: RobotVpn) -> None:
         """Send the machine and its agent the current peers, if these have changed."""

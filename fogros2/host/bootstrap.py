@@ -45,6 +45,7 @@ EMBEDDED_BYTES, APT_BYTES = 300 << 20, 3 << 30
 #: Programs that every machine needs, with their Debian packages.
 TOOLS: Mapping[str, str] = {
     'ip': 'iproute2',
+    'nft': 'nftables',
     'rsync': 'rsync',
     'wg': 'wireguard-tools',
 }
@@ -52,7 +53,7 @@ TOOLS: Mapping[str, str] = {
 APT_PACKAGES = (
     f'ros-{DISTRO}-ros-base',
     'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
-    'wireguard-tools', 'rsync', 'iproute2',
+    'wireguard-tools', 'rsync', 'iproute2', 'nftables',
     'sudo',  # for rosdep; images of ROS lack it
 )
 #: Variables with lists of folders; of the robot's folders, a machine has only those that are sent.

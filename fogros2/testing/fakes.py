@@ -221,7 +221,9 @@ class FakeProvider(Provider):
 class FakeVpn(Vpn):
     """A VPN whose commands do nothing; their arguments are the names of the peers."""
 
-    def __init__(self, domain: int = 0, ports: Sequence[tuple[int, int]] = ()) -> None:
+    def __init__(
+        self, domain: int = 0, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
+    ) -> None:
         """Ignore the parameters, which every VPN has."""
 
     def keys(self, interface: VpnInterface) -> Command:

@@ -25,7 +25,7 @@ HELPER = '/usr/libexec/fogros2/vpn'
 #: The group whose members may use the helper.
 GROUP = 'fogros2'
 #: The helper's answer to ``check`` if its protocol is the one of this module.
-PROTOCOL = '1'
+PROTOCOL = '2'
 #: Folder of the helper's private keys, one subfolder per interface; the user cannot read them.
 KEYS = '/run/fogros2-vpn'
 
@@ -79,7 +79,7 @@ class HelpedWireGuard(WireGuard):
         return self._ask(
             'up', interface, super().up(interface, peers), peers=_peers(peers),
             network=interface.network, port=interface.port, domain=self.domain,
-            ports=[list(pair) for pair in self.ports[1:]])
+            ports=[list(pair) for pair in self.ports[1:]], asked=list(self.asked))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers."""

@@ -25,7 +25,7 @@ from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn import Vpn
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
-#: for kernels without the module, ``nft`` only for interfaces with a firewall.
+#: for kernels without the module.
 PACKAGES = {
     'wg': 'wireguard-tools', 'ip': 'iproute2', 'nft': 'nftables', 'wireguard-go': 'wireguard-go'}
 #: Interval of keepalive packets in seconds: routers keep a NAT mapping for 30 s or more.
@@ -36,6 +36,12 @@ PORTS_PER_DOMAIN = 250
 #: RTPS 2.5, 9.6.2.4: multicast group of participant announcements.
 DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
+#: Matches messages of DDS: their first bytes are 'RTPS' (RTPS 2.5, 9.4.4). The hooks of the filter
+#: see whole datagrams: the kernel reassembles before ``input``, and fragments after ``output``.
+RTPS = 'meta l4proto udp @th,64,32 0x52545053'
+#: How long a computer of the LAN stays known without a message. Stock nodes announce themselves
+#: each 30 s or more often.
+LAN_TIMEOUT = '5m'
 #: Packets that may queue for ``wireguard-go``; the kernel's default is 500. A raw VGA image has
 #: 720 packets at once, and on a busy processor several images queue.
 QUEUE = 3000
@@ -45,6 +51,12 @@ QUEUE = 3000
 _ASK = r"sed -n 's/^[^[:space:]]*[[:space:]]*\[*\([^][]*\)\]*:[0-9]*$/route get \1/p'"
 #: Shell text that turns the answers into this computer's source addresses to these hosts.
 _FROM = r"ip -force -batch - 2>/dev/null | sed -n 's/.* src \([^ ]*\).*/\1/p'"
+#: A login user's PATH may lack the folders of ``nft``.
+_PATH = 'PATH=$PATH:/usr/sbin:/sbin'
+#: Shell text that sets ``top`` to the folder of control groups, version 2.
+_GROUPS = (
+    'top=/sys/fs/cgroup; [ -e $top/cgroup.procs ] || top=$top/unified; '
+    '[ -e $top/cgroup.procs ] || { echo "version 2 is missing"; return 1; }')
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
 _ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
 
@@ -63,13 +75,17 @@ class WireGuard(Vpn):
 
     :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits.
     :param ports: further ranges of UDP ports to admit, as (first, last).
+    :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
     """
 
-    def __init__(self, domain: int = 0, ports: Sequence[tuple[int, int]] = ()) -> None:
+    def __init__(
+        self, domain: int = 0, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
+    ) -> None:
         if not 0 <= domain <= (65535 - PORT_BASE) // PORTS_PER_DOMAIN:
             raise ConfigurationError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
         self.ports = (dds_ports(domain), *ports)
+        self.asked = tuple(asked)
 
     def keys(self, interface: VpnInterface) -> Command:
         """Return the command that prints the public key; only root can read the private key."""
@@ -92,7 +108,8 @@ class WireGuard(Vpn):
         """
         steps = self._steps(interface, peers)
         yield Command.script(
-            '\n'.join(step.do for step in steps), sudo=True, what=_what('set', interface, 'up'))
+            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
+            what=_what('set', interface, 'up'))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers, and keep the sessions of remaining ones."""
@@ -136,7 +153,8 @@ class WireGuard(Vpn):
         """
         steps = self._steps(interface, peers, recall=True)
         yield Command.script(
-            '\n'.join(step.do for step in steps), sudo=True, what=_what('repair', interface))
+            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
+            what=_what('repair', interface))
 
     def status(self, interface: VpnInterface) -> Command:
         """Return a command that prints only counters: ``dump`` would print the private key."""
@@ -170,7 +188,7 @@ class WireGuard(Vpn):
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield one script that undoes ``up`` in reverse order, and continues after errors."""
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
-        lines = ['failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
+        lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
@@ -178,10 +196,11 @@ class WireGuard(Vpn):
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
     ) -> list[_Step]:
-        firewall = [_firewall(interface, self.ports)] if interface.firewall else []
+        confined = [_confine(interface, self.ports, self.asked)] if interface.process else []
         return [
-            *firewall, _link(interface), _Step(_configure(interface, peers, recall=recall)),
-            _address(interface, peers), _Step(_buffer(interface))]
+            _filter(interface, self.ports), *confined, _link(interface),
+            _Step(_configure(interface, peers, recall=recall)), _address(interface, peers),
+            _Step(_buffer(interface))]
 
 
 def dds_ports(domain: int) -> tuple[int, int]:
@@ -207,41 +226,133 @@ def _name(interface: VpnInterface) -> str:
     return name
 
 
-def _firewall(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
+def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
-    Return the step that admits only DDS and ping from a machine, which may be hijacked.
+    Return the step that creates the host's filter.
+
+    No host accepts packets for its VPN address from another interface, as Linux does. On the
+    robot, the filter admits only DDS and ping from a machine, which may be hijacked. A machine of
+    a launch accepts DDS from the VPN and from itself only.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
     nor an accept here a drop there (the user's own firewall has to admit the VPN).
     """
     name = _name(interface)
-    let_in = ', '.join(f'{first}-{last}' for first, last in ports)
-    # check the address, because a peer may send to any address of this computer, a LAN's included
+    outside = _outside(interface)
     rules = [
         f'table inet {name}',
         f'delete table inet {name}',
         f'table inet {name} {{',
+        f'  set lan {{ type ipv4_addr; size 4096; flags dynamic; timeout {LAN_TIMEOUT}; }}'
+        if interface.firewall else '',
         '  chain input {',
         '    type filter hook input priority filter; policy accept;',
-        f'    iifname != "{name}" accept',
-        f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
-        '    ct state established,related accept',
-        f'    udp dport {{ {let_in} }} accept',
-        '    icmp type echo-request accept',
-        '    drop',
-        '  }',
-        '  chain forward {',
-        '    type filter hook forward priority filter; policy accept;',
-        f'    iifname "{name}" drop',
-        f'    oifname "{name}" drop',
-        '  }',
-        '}']
+        f'    {outside} ip daddr {interface.address} drop']
+    if interface.firewall:
+        rules += [
+            # an address of the LAN is known if it sends DDS from where an answer would go
+            f'    {outside} udp dport {_set(ports)} {RTPS} fib saddr . iif oif exists'
+            ' update @lan { ip saddr }',
+            f'    iifname != "{name}" accept',
+            # a peer may send to any address of this computer, a LAN's included
+            f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
+            '    ct state established,related accept',
+            f'    udp dport {_set(ports)} accept',
+            '    icmp type echo-request accept',
+            '    drop',
+            '  }',
+            '  chain forward {',
+            '    type filter hook forward priority filter; policy accept;',
+            f'    iifname "{name}" drop',
+            f'    oifname "{name}" drop']
+    elif not interface.process:
+        rules += [f'    {outside} {RTPS} drop']
+    rules += ['  }', '}']
     # the first line creates the table if missing, so that the second cannot fail
     return _Step(
-        f'{_print(rules)} | nft -f -',
+        f'{_print(rules)} | nft -f - || '
+        '{ echo "nft: the packet filter takes no rules" >&2; exit 1; }',
         f'! command -v nft >/dev/null || '
         f'{_print(rules[:2])} | nft -f -')
+
+
+def _confine(
+    interface: VpnInterface, ports: Sequence[tuple[int, int]], asked: Sequence[str],
+) -> _Step:
+    """
+    Return the step that filters the DDS of one process and its children, in a control group.
+
+    A hijacked machine may announce any address and port as its own. The robot's processes send
+    only to the VPN, and to DDS's ports of this computer and of the computers of the LAN that sent
+    DDS themselves, or that the user configured. The processes of a machine accept DDS from the VPN
+    and from the machine only. Multicast is an exception there: one packet is for all processes of
+    the host, the user's own included.
+
+    The group is a child of the group of the process, so that limits and systemd's units stay. The
+    step prints a line and does not fail where control groups (version 2) cannot be used.
+    """
+    name = _name(interface)
+    match = f'{RTPS} socket cgroupv2 level %s "%s"'
+    if interface.firewall:
+        rules = [
+            'chain confined {',
+            f'udp dport != {_set(ports)} drop',
+            'oifname "lo" accept',
+            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, *asked])} }} accept',
+            'ip daddr @lan accept',
+            'drop',
+            '}',
+            'chain output {',
+            'type filter hook output priority filter; policy accept;',
+            f'oifname "{name}" accept',
+            f'{match} goto confined']
+    else:
+        rules = ['chain input {', f'{_outside(interface)} ip daddr != 224.0.0.0/4 {match} drop']
+    text = shlex.quote('\n'.join([f'table inet {name} {{', *rules, '}', '}', '']))
+    process = interface.process
+    pid = process if process.isdigit() else f'$(cat {shlex.quote(process)})'
+    # the name of the group enters the rules, and users can make groups
+    do = f"""\
+confine() {{
+  pid={pid}
+  {_GROUPS}
+  group=$(sed -n 's/^0:://p' "/proc/$pid/cgroup") || return
+  group=${{group%/{name}}}; group=${{group%/}}/{name}
+  case $group in *[!-A-Za-z0-9/_.@:\\\\]* | */..*) echo "odd name: $group"; return 1;; esac
+  mkdir -p "$top$group" && echo "$pid" >"$top$group/cgroup.procs" || return
+  path=${{top#/sys/fs/cgroup}}$group
+  printf {text} "$(($(printf %s "$group" | tr -cd / | wc -c)))" "${{path#/}}" | nft -f -
+}}
+said=$(confine 2>&1) || echo "no control group for process {process}: $said" """
+    undo = f"""\
+groups() {{ {_GROUPS}; find $top -type d -name {name}; }}
+for group in $(groups 2>/dev/null); do
+  # another launch of this process has a group below, and the last one removes all
+  while [ -z "$(find "$group" -mindepth 1 -type d)" ]; do
+    n=0
+    until rmdir "$group" 2>/dev/null || [ $n -gt 9 ]; do
+      n=$((n + 1))
+      for pid in $(cat "$group/cgroup.procs"); do
+        echo "$pid" >"$group/../cgroup.procs" || :
+      done 2>/dev/null
+    done
+    [ ! -e "$group" ] || {{ failed=1; break; }}
+    group=${{group%/*}}
+    case ${{group##*/}} in fog{'[0-9a-f]' * 6}*) ;; *) break;; esac
+    ! nft list table inet "${{group##*/}}" >/dev/null 2>&1 || break
+  done
+done"""
+    return _Step(do, undo)
+
+
+def _outside(interface: VpnInterface) -> str:
+    """Return the match of packets that came neither through the VPN nor from the host itself."""
+    return f'iifname != {{ "lo", "{_name(interface)}" }}'
+
+
+def _set(ports: Sequence[tuple[int, int]]) -> str:
+    return f'{{ {", ".join(f"{first}-{last}" for first, last in ports)} }}'
 
 
 def _link(interface: VpnInterface) -> _Step:

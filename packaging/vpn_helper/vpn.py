@@ -45,7 +45,7 @@ from fogros2.vpn import addresses  # noqa: E402
 from fogros2.vpn.wireguard import WireGuard  # noqa: E402
 
 #: What both sides mean by the words and fields below.
-PROTOCOL = 1
+PROTOCOL = 2
 #: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are. Not
 #: where agents are: a robot may be a machine, too.
 RECORDS = Path('/run/fogros2-vpn')
@@ -55,6 +55,8 @@ POOLS = Path('/etc/fogros2/pools')
 LIMIT = 16
 #: Machines that an interface leads to: what a /24 holds beside the robot.
 PEERS = 253
+#: Computers that nodes ask beside their network.
+ASKED = 64
 #: Bytes of a request: all peers, with the longest endpoints.
 LONGEST = 256 * 1024
 #: Seconds that the caller has to say what it wants, and that a script has.
@@ -120,6 +122,19 @@ def ports_of(value: object) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
+def asked_of(value: object) -> tuple[str, ...]:
+    """Return the addresses of computers that nodes may send to, as IPv4 writes them."""
+    if not isinstance(value, list) or len(value) > ASKED:
+        raise Refused(f'asked is a list of up to {ASKED} addresses')
+    for entry in value:
+        try:
+            if not isinstance(entry, str) or str(ipaddress.IPv4Address(entry)) != entry:
+                raise ValueError
+        except ValueError:
+            raise Refused('asked has addresses like 192.0.2.7') from None
+    return tuple(value)
+
+
 def peers_of(value: object, network: str) -> list[Peer]:
     """Return the machines that an interface leads to, each at an address of its network."""
     if not isinstance(value, list) or len(value) > PEERS:
@@ -160,7 +175,7 @@ def own_address(network: str) -> str:
 #: Fields of a request, by its verb.
 FIELDS = {
     'check': set[str](), 'keys': {'name', 'pid'},
-    'up': {'name', 'network', 'port', 'domain', 'ports', 'peers'},
+    'up': {'name', 'network', 'port', 'domain', 'ports', 'asked', 'peers'},
     'peers': {'name', 'peers'}, 'repair': {'name', 'peers'}, 'status': {'name'}, 'down': {'name'}}
 
 
@@ -202,16 +217,17 @@ class Record:
     port: int = 0
     domain: int = 0
     ports: tuple[tuple[int, int], ...] = ()
+    asked: tuple[str, ...] = ()
 
     def interface(self) -> VpnInterface:
         """Return what the VPN makes of it."""
         network = self.network or '127.0.0.0/24'
         return VpnInterface(self.name, own_address(network), network, self.port,
-                            str(RECORDS / self.name / 'key'), firewall=True)
+                            str(RECORDS / self.name / 'key'), firewall=True, process=str(self.pid))
 
     def vpn(self) -> WireGuard:
         """Return what knows the commands."""
-        return WireGuard(domain=self.domain, ports=self.ports)
+        return WireGuard(domain=self.domain, ports=self.ports, asked=self.asked)
 
     def save(self, folder: Path) -> None:
         """Write it into its folder, whole or not at all."""
@@ -224,6 +240,7 @@ def load(folder: Path) -> Record:
     """Return what was written of an interface."""
     fields = json.loads((folder / 'record').read_text())
     fields['ports'] = tuple((first, last) for first, last in fields['ports'])
+    fields['asked'] = tuple(fields.get('asked', ()))
     return Record(**fields)
 
 
@@ -395,11 +412,11 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     network = network_of(request['network'], pools())
     port = number(request['port'], FIRST_PORT, 65535, 'the port')
     domain = number(request['domain'], 0, 232, 'the ROS domain')
-    ports = ports_of(request['ports'])
+    ports, asked = ports_of(request['ports']), asked_of(request['asked'])
     peers = peers_of(request['peers'], network)
     with own(request['name'], uid) as before:
         record = dataclasses.replace(
-            before, network=network, port=port, domain=domain, ports=ports)
+            before, network=network, port=port, domain=domain, ports=ports, asked=asked)
         if before.network and before != record:
             raise Refused(f'{record.name} is up already, with other settings')
         with locked(RECORDS):

@@ -19,7 +19,7 @@ from fogros2.host.wheels import Wheels
 from fogros2.model import MachineSpec
 from fogros2.plan import Underlay
 
-TOOLS = frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
+TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 ROS = HostFacts(
     system='ubuntu', release='24.04', architecture='x86_64', uid=1000,
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,

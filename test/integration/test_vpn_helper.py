@@ -140,7 +140,7 @@ def interface(copy: Copy, user: str, name: str, network: str, port: int) -> Iter
     assert made.returncode == 0, made.stderr
     try:
         up = copy.ask(user, 'up', name=name, network=network, port=port, domain=0, ports=[],
-                      peers=[])
+                      asked=[], peers=[])
         assert up.returncode == 0, up.stderr
         yield made.stdout.strip()
     finally:
@@ -154,7 +154,7 @@ def peer(address: str, key: str = KEY) -> dict[str, object]:
 
 
 def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
-    assert copy.ask('fogada', 'check').stdout == '1\n'
+    assert copy.ask('fogada', 'check').stdout == '2\n'
     with interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820) as key:
         assert re.fullmatch('[A-Za-z0-9+/]{43}=', key)
         assert NAME in copy.links()
@@ -186,7 +186,7 @@ def test_interfaces_of_others_are_refused(copy: Copy) -> None:
                     ('keys', {'pid': pid}), ('down', {}), ('status', {}),
                     ('peers', {'peers': []}), ('repair', {'peers': []}),
                     ('up', {'network': '198.18.8.0/24', 'port': 5000, 'domain': 0, 'ports': [],
-                            'peers': []})):
+                            'asked': [], 'peers': []})):
                 said = copy.ask('fogbob', verb, name=NAME, **more)
                 assert said.returncode == 2 and 'another user' in said.stderr, (verb, said)
                 said = copy.ask('fogbob', verb, name=OTHER, **more)
@@ -199,10 +199,10 @@ def test_interfaces_of_others_are_refused(copy: Copy) -> None:
             for network, why in (('198.18.7.0/24', 'in use'), ('127.0.0.0/24', 'not in'),
                                  ('10.0.0.0/24', 'not in'), ('0.0.0.0/0', '24 bits')):
                 said = copy.ask('fogbob', 'up', name='fogbbbbbb', network=network, port=5000,
-                                domain=0, ports=[], peers=[])
+                                domain=0, ports=[], asked=[], peers=[])
                 assert said.returncode == 2 and why in said.stderr, said
             said = copy.ask('fogbob', 'up', name='fogbbbbbb', network='198.18.9.0/24', port=53,
-                            domain=0, ports=[], peers=[])
+                            domain=0, ports=[], asked=[], peers=[])
             assert said.returncode == 2 and '1024' in said.stderr
             assert copy.ask('fogbob', 'down', name='fogbbbbbb').returncode == 0
             # somebody else's process would keep it for ever
@@ -414,4 +414,4 @@ def test_it_is_removed_without_a_trace(copy: Copy) -> None:
             assert copy.run('root', 'test', '-e', path).returncode == 1, path
         assert copy.run('root', 'getent', 'group', 'fogros2').returncode != 0
         copy.run('root', install, 'fogada', 'fogbob', check=True)
-    assert copy.ask('fogada', 'check').stdout == '1\n'
+    assert copy.ask('fogada', 'check').stdout == '2\n'

@@ -21,7 +21,7 @@ from fogros2.host.wheels import Wheels
 from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import Underlay
 
-TOOLS = frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
+TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 NOBLE = HostFacts(
     system='ubuntu', release='24.04', architecture='x86_64', uid=1000,
@@ -377,7 +377,7 @@ def test_missing_programs_are_installed_first_or_named() -> None:
     for package in ('rsync', 'wireguard-tools', 'wireguard-go'):
         assert package in tools[0].argv[-1]
     assert 'iproute2' not in tools[0].argv[-1]
-    with pytest.raises(PrerequisiteError, match=r'lacks rsync, wireguard-tools \(on the machine'):
+    with pytest.raises(PrerequisiteError, match=r'lacks nftables, rsync, wireguard-tools \('):
         plan(dataclasses.replace(bare, root=False))
     kernel = dataclasses.replace(
         NOBLE, kernel_wireguard=True, programs=TOOLS - {'wireguard-go'})

@@ -400,6 +400,7 @@ class Members:
                 if name in self.away:
                     raise ConnectError(f"'{name}' is out of reach")
                 self.told.append((name, [*command.argv[1:]]))
+            return ''
 
         member = VpnMember(route, self.robot.interface, run, lambda peers: None)
         member.up(self.robot)

@@ -27,13 +27,13 @@ def test_rmw_without_a_plugin_is_refused_by_name():
 
 
 def test_addresses_are_robot_first_then_machines_in_order():
-    assert plan.robot_interface('a1b2c3', NETWORK, 4, '/k').address == '198.18.7.1'
+    assert plan.robot_interface('a1b2c3', NETWORK, 4, '/k', 7).address == '198.18.7.1'
     assert plan.machine_interface('a1b2c3', NETWORK, 0, 4, '/k').address == '198.18.7.2'
     assert plan.machine_interface('a1b2c3', NETWORK, 9, 4, '/k').address == '198.18.7.11'
 
 
 def test_interface_names_are_short_and_unique():
-    robot = plan.robot_interface('a1b2c3', NETWORK, 4, '/k')
+    robot = plan.robot_interface('a1b2c3', NETWORK, 4, '/k', 7)
     machine = plan.machine_interface('a1b2c3', NETWORK, 250, 4, '/k')
     assert robot.name != machine.name
     assert len(machine.name) <= 15

@@ -83,6 +83,15 @@ def test_ports_are_no_service_s(value: object) -> None:
     assert all(1024 <= first <= last <= 65535 for first, last in found)
 
 
+@given(BAD | st.lists(BAD | st.just('192.0.2.7'), max_size=3))
+def test_hosts_to_ask_are_addresses(value: object) -> None:
+    try:
+        found = vpn.asked_of(value)
+    except vpn.Refused:
+        return
+    assert set(found) <= {'192.0.2.7', '198.18.7.1', '198.18.7.255'}
+
+
 @given(st.lists(st.fixed_dictionaries({
     'key': BAD | st.sampled_from([KEY, OTHER]),
     'address': BAD | st.sampled_from(['198.18.7.2', '198.18.7.3']),
@@ -179,14 +188,15 @@ def test_both_sides_mean_the_same() -> None:
 # -- the caller's side ---------------------------------------------------------------------------
 
 def interface(key_file: str) -> VpnInterface:
-    return VpnInterface('fog0a1b2c', '198.18.7.1', NETWORK, 51820, key_file, firewall=True)
+    return VpnInterface('fog0a1b2c', '198.18.7.1', NETWORK, 51820, key_file, firewall=True,
+                        process='1')
 
 
 PEERS = [Peer('first', KEY, '198.18.7.2', '203.0.113.9:51820'), Peer('b', OTHER, '198.18.7.3')]
 
 
 def test_what_is_asked_of_it_is_what_it_takes() -> None:
-    plugin = helped.HelpedWireGuard(domain=3, ports=((7000, 7119),))
+    plugin = helped.HelpedWireGuard(domain=3, ports=((7000, 7119),), asked=['192.0.2.7'])
     made = interface(helped.key_file('fog0a1b2c'))
     commands = [plugin.keys(made), *plugin.up(made, []), *plugin.peers(made, PEERS),
                 *plugin.repair(made, PEERS), plugin.status(made), *plugin.down(made)]
@@ -196,9 +206,10 @@ def test_what_is_asked_of_it_is_what_it_takes() -> None:
         if verb == 'up':
             record = vpn.Record('fog0a1b2c', 1000, 1, 1, vpn.network_of(
                 request['network'], vpn.pools()), request['port'], request['domain'],
-                vpn.ports_of(request['ports']))
+                vpn.ports_of(request['ports']), vpn.asked_of(request['asked']))
             assert record.interface() == made
             assert record.vpn().ports == plugin.ports
+            assert record.vpn().asked == plugin.asked
         if 'peers' in request:
             assert [(p.public_key, p.address, p.endpoint) for p in vpn.peers_of(
                 request['peers'], NETWORK)] == [
@@ -218,7 +229,7 @@ def test_all_other_interfaces_are_root_s_commands() -> None:
 
 
 @pytest.mark.parametrize(('answer', 'expected'), [
-    (Result(0, '1\n', ''), True), (Result(0, '2\n', ''), False),
+    (Result(0, '2\n', ''), True), (Result(0, '1\n', ''), False),
     (Result(1, '', 'sudo: a password is required'), False)])
 def test_it_is_used_where_it_is_permitted(
     monkeypatch: pytest.MonkeyPatch, answer: Result, expected: bool,

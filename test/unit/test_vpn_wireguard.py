@@ -11,7 +11,7 @@ import pytest
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.wireguard import dds_ports, WireGuard
+from fogros2.vpn.wireguard import dds_ports, RTPS, WireGuard
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 OTHER = 'Kg7ZbFqs9cU1UuPHc9zzQUoyo+MdSEgx7xQ7iDqIexk='
@@ -82,8 +82,39 @@ def test_large_images_have_room_on_both_hosts(interface: VpnInterface) -> None:
     assert 'pidfd_getfd' in script(*wireguard.up(interface, []))
 
 
-def test_a_machine_is_not_filtered() -> None:
-    assert 'nft' not in script(*every_command(MACHINE, TO_ROBOT))
+def test_machine_of_a_launch_takes_dds_from_the_vpn_only() -> None:
+    text = script(*WireGuard().up(MACHINE, [TO_ROBOT]))
+    assert 'iifname != { "lo", "foga1b2c3m0" } ip daddr 198.18.7.2 drop' in text
+    assert f'iifname != {{ "lo", "foga1b2c3m0" }} {RTPS} drop' in text
+    assert 'confine' not in text
+
+
+def test_only_the_launch_is_filtered_where_it_is_a_guest() -> None:
+    guest = dataclasses.replace(MACHINE, process='/run/a/agent.pid')
+    text = script(*WireGuard().up(guest, [TO_ROBOT]))
+    assert f'{RTPS} drop' not in text and f'{RTPS} socket cgroupv2 level %s "%s" drop' in text
+    assert 'pid=$(cat /run/a/agent.pid)' in text
+    assert 'rmdir "$group"' in script(*WireGuard().down(guest))
+
+
+def test_robot_sends_to_the_hosts_that_the_user_names() -> None:
+    robot = dataclasses.replace(ROBOT, process='77')
+    text = script(*WireGuard(asked=['192.0.2.7']).up(robot, []))
+    assert 'ip daddr { 239.255.0.1, 192.0.2.7 } accept' in text and 'pid=77\n' in text
+
+
+@pytest.mark.parametrize('odd', ['/a" accept; #', '/a/../b', '/a b', '/a$(id)', '/a\\"'])
+def test_group_with_an_odd_name_enters_no_rule(tmp_path: Path, odd: str) -> None:
+    (tmp_path / '77').mkdir()
+    (tmp_path / '77/cgroup').write_text(f'0::{odd}\n')
+    (tmp_path / 'cgroup.procs').touch()
+    robot = dataclasses.replace(ROBOT, process='77')
+    text = script(*WireGuard().up(robot, []))
+    text = text[text.index('confine() {'):text.index('[ -e /sys/class/net')]
+    text = text.replace('/proc/', f'{tmp_path}/').replace('/sys/fs/cgroup', str(tmp_path))
+    said = subprocess.run(['sh', '-ec', text], capture_output=True, text=True, check=True).stdout
+    assert said.startswith('no control group for process 77: odd name: /a')
+    assert not list(tmp_path.glob('a*'))
 
 
 @pytest.mark.parametrize('domain, ports', [(0, '7400-7649'), (5, '8650-8899')])
@@ -199,9 +230,10 @@ def test_status_that_isnt_wireguards_is_an_error(text: str) -> None:
 
 def test_machine_without_tun_is_reported(tmp_path: Path) -> None:
     """A pod has no such device, and some runtimes let nobody make it."""
-    for name in ('wg', 'ip', 'mknod', 'wireguard-go'):
+    for name in ('wg', 'ip', 'mknod', 'wireguard-go', 'nft'):
         program = tmp_path / name
-        program.write_text(f'#!/bin/sh\necho "{name} refuses" >&2\nexit 1\n')
+        program.write_text('#!/bin/sh\n' if name == 'nft' else
+                           f'#!/bin/sh\necho "{name} refuses" >&2\nexit 1\n')
         program.chmod(0o755)
     command, = WireGuard().up(MACHINE, [TO_ROBOT])
     text = command.argv[-1].replace('/dev/net', str(tmp_path / 'net'))

@@ -118,7 +118,7 @@ def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
     robot = HostFacts(
         'ubuntu', '24.04', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
         (Python('/usr/bin/python3', (3, 12), True),),
-        frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
+        frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
         {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_cyclonedds_cpp',)},
         environments={'/opt/ros/jazzy': '1-1'})
     under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {

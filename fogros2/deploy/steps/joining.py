@@ -43,7 +43,8 @@ class Joining(Step):
         port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch)
         job.interface = plan.machine_interface(
             context.launch, context.vpn.interface.network, context.index, port,
-            f'{job.directory}/vpn.key')
+            f'{job.directory}/vpn.key',
+            '' if context.capabilities.owned else f'{job.directory}/agent.pid')
         job.save(vpn=job.interface)
 
     def avoid(self, routes: Sequence[str]) -> None:
@@ -88,6 +89,11 @@ class Joining(Step):
                     raise VpnError(
                         f"UDP port {interface.port} of '{job.name}' is in use already",
                         'launch again: each launch takes another port') from error
+                if 'nft: ' in error.result.stderr:
+                    raise VpnError(
+                        f"'{job.name}' can't keep strangers from its nodes: "
+                        f'{error.result.stderr.strip().splitlines()[-1]}',
+                        'use an image or a kernel with nftables (nf_tables)') from error
                 if 'in use already:' in error.result.stderr:
                     raise VpnError(
                         f"'{job.name}' uses addresses of the VPN's network itself: "

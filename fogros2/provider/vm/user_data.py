@@ -86,10 +86,11 @@ systemd-run --no-block --unit=fogros2-agent --property=DefaultDependencies=no \\
 
 # the launch installs these too: apt's lock makes one wait for the other
 _TOOLS = """\
-command -v wg && command -v rsync && exit 0
+command -v wg && command -v rsync && command -v nft && exit 0
 export DEBIAN_FRONTEND=noninteractive
 { apt-get -q -o DPkg::Lock::Timeout=300 update
-apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends wireguard-tools rsync
+apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
+    wireguard-tools rsync nftables
 } >/var/log/fogros2-tools.log 2>&1 </dev/null &
 """
 

@@ -17,7 +17,7 @@ from fogros2 import process
 from fogros2.model import Command
 
 if TYPE_CHECKING:
-    from conftest import Child, Lab
+    from rigs.vpn_lab import Child, Lab
 
 #: Messages a second that the nodes send unless told otherwise.
 RATE = 10

@@ -19,7 +19,7 @@ from fogros2.dds.fastdds import FastDds
 from fogros2.model import DdsInterface
 
 if TYPE_CHECKING:
-    from conftest import Child, Lab
+    from rigs.vpn_lab import Child, Lab
 
 SOURCE = Path(__file__).with_name('fastdds_node.cpp')
 
@@ -128,7 +128,10 @@ def test_unicast_alone_finds_the_other_side(nodes: Nodes) -> None:
     robot.wait('topic', '/down', count=3)
 
 
-def test_machines_find_each_other(nodes: Nodes) -> None:
+def test_machines_find_each_other(nodes: Nodes, request: pytest.FixtureRequest) -> None:
+    if request.node.callspec.params['program'] == 'debian':
+        # they met by multicast outside of the VPN, which machines do not take
+        pytest.skip('Fast DDS 2.9 asks no peers where a profile has netmask_filter')
     nodes.lab.second()
     addresses = {host: one.address for host, one in nodes.lab.interfaces.items()}
     first = nodes.machine('to:/over', peers=(addresses['second'],))

@@ -13,7 +13,7 @@ import pytest
 from fogros2.dds.zenoh import Zenoh
 
 if TYPE_CHECKING:
-    from conftest import Child, Lab
+    from rigs.vpn_lab import Child, Lab
 
 pytest.importorskip('zenoh', reason='eclipse-zenoh is not installed')
 NODE = Path(__file__).with_name('zenoh_node.py')

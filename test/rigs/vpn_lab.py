@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A robot, a machine and the bad network between them, each in a network namespace.
+
+::
+
+    robot 198.51.100.2 --- .1  net (relay, no forwarding)  203.0.113.1 --- .2 machine
+      | 192.168.77.1
+    lan 192.168.77.2  (a second computer beside the robot)
+
+The relay passes UDP on, as a NAT would, so that the machine can't dial the robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+import itertools
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import threading
+from typing import Any
+
+import pytest
+
+from fogros2 import process
+from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.model import Command, Peer, Result, VpnInterface
+from fogros2.vpn.wireguard import WireGuard
+from fogros2.waiting import wait_until
+
+TEST = Path(__file__).parents[1]
+RELAY = TEST / 'relay.py'
+NODE = TEST / 'integration/vpn/dds_node.py'
+NETWORK = '198.18.7.0/24'
+ROBOT, MACHINE, SECOND = '198.18.7.1', '198.18.7.2', '198.18.7.3'
+PORT = 51820
+#: What makes a node find its Python, its packages and its middleware.
+#: `ip netns exec` hides the control groups of the host; $1 is the group to be in, if it is there.
+ENTER = """\
+mount -t cgroup2 cgroup2 /sys/fs/cgroup
+group=$(find /sys/fs/cgroup -type d -name "${1:-none}"); shift
+[ -z "$group" ] || echo $$ >"$group/cgroup.procs"
+exec "$@"
+"""
+PASSED = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'HOME', 'ROS_DISTRO',
+          'ROS_VERSION', 'ROS_PYTHON_VERSION')
+_numbers = itertools.count()
+
+
+class Child:
+    """A program in a namespace that prints JSON objects, one a line."""
+
+    def __init__(self, argv: Sequence[str]) -> None:
+        words = process.argv(Command(tuple(argv), sudo=True))
+        self.process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+            # a group and no session of its own: sudo's ticket is the terminal's
+            preexec_fn=os.setpgrp)
+        self.said: list[dict[str, Any]] = []
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if not line.startswith('{'):
+                continue
+            with self._news:
+                self.said.append(json.loads(line))
+                self._news.notify_all()
+
+    def wait(self, key: str, value: object = None, *, after: float = 0.0, count: int = 1,
+             timeout: float = 10.0) -> list[dict[str, Any]]:
+        """
+        Return the first ``count`` lines with ``key`` (equal to ``value``), sent after a time.
+
+        :param after: on the monotonic clock; compared with when the message was sent.
+        """
+        def found() -> list[dict[str, Any]]:
+            return self.lines(key, value, after=after)
+
+        with self._news:
+            done = self._news.wait_for(lambda: len(found()) >= count, timeout)
+            lines = found()
+        assert done, f'{len(lines)} of {count} lines with {key} {value or ""} in {timeout} s'
+        return lines[:count]
+
+    def lines(
+        self, key: str, value: object = None, *, after: float = 0.0,
+    ) -> list[dict[str, Any]]:
+        return [line for line in self.said
+                if key in line and value in (None, line[key])
+                and line.get('arrival', after) - line.get('latency', 0.0) >= after]
+
+    def tell(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a line to a program that answers each with one, and return the answer."""
+        assert self.process.stdin is not None
+        begin = len(self.said)
+        self.process.stdin.write(json.dumps(settings) + '\n')
+        with self._news:
+            assert self._news.wait_for(lambda: len(self.said) > begin, 5.0)
+            return self.said[begin]
+
+    def stop(self) -> None:
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait(5)
+        self._thread.join(2.0)
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+class Lab:
+    """The namespaces, and what runs in them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        # the sockets of wireguard-go are the computer's, so names are unique there
+        self.mark = f'fogt{os.getpid() % 100000}x{next(_numbers)}'
+        self.spaces = {host: f'{self.mark}{host[0]}' for host in (
+            'robot', 'machine', 'net', 'lan')}
+        self.vpn = WireGuard()
+        self.dds = CycloneDds()
+        self.interfaces = {
+            'robot': VpnInterface(f'{self.mark}r', ROBOT, NETWORK, PORT,
+                                  str(folder / 'r/vpn.key'), firewall=True),
+            'machine': VpnInterface(f'{self.mark}m', MACHINE, NETWORK, PORT,
+                                    str(folder / 'm/vpn.key'))}
+        self.children: list[Child] = []
+        self.relay: Child | None = None
+        self.lan_name: str | None = None
+
+    # the network
+
+    def open(self) -> None:
+        for space in self.spaces.values():
+            self.ip('netns', 'add', space)
+            self.ip('-n', space, 'link', 'set', 'lo', 'up')
+        self.link('robot', 'e0', '198.51.100.2/24', 'net', 'e0', '198.51.100.1/24')
+        self.link('machine', 'e0', '203.0.113.2/24', 'net', 'e1', '203.0.113.1/24')
+
+    def link(self, host: str, name: str, address: str, other: str, other_name: str,
+             other_address: str) -> None:
+        spaces = self.spaces
+        self.ip('link', 'add', name, 'netns', spaces[host], 'type', 'veth',
+                'peer', 'name', other_name, 'netns', spaces[other])
+        for space, link, at in ((spaces[host], name, address),
+                                (spaces[other], other_name, other_address)):
+            self.ip('-n', space, 'address', 'add', at, 'dev', link)
+            self.ip('-n', space, 'link', 'set', link, 'up')
+
+    def lan(self) -> None:
+        """Put a second computer beside the robot."""
+        self.lan_name = 'lan0'
+        self.link('robot', 'lan0', '192.168.77.1/24', 'lan', 'lan0', '192.168.77.2/24')
+
+    def second(self) -> None:
+        """Add a second machine to the VPN, beside the first."""
+        self.spaces['second'] = f'{self.mark}s'
+        self.ip('netns', 'add', self.spaces['second'])
+        self.ip('-n', self.spaces['second'], 'link', 'set', 'lo', 'up')
+        self.link('robot', 'e1', '198.51.100.130/26', 'second', 'e0', '198.51.100.131/26')
+        self.link('machine', 'e1', '203.0.113.130/26', 'second', 'e1', '203.0.113.131/26')
+        interface = VpnInterface(f'{self.mark}s', SECOND, NETWORK, PORT,
+                                 str(self.folder / 's/vpn.key'))
+        self.interfaces['second'] = interface
+        key = self.run('second', self.vpn.keys(interface)).stdout.strip()
+        peers = self.peers()
+        first, robot = peers['robot'][0], peers['machine'][0]
+        self.do('second', self.vpn.up(interface, [
+            robot, dataclasses.replace(first, endpoint=f'203.0.113.130:{PORT}')]))
+        self.do('machine', self.vpn.peers(self.interfaces['machine'], [
+            robot, Peer('second', key, SECOND, f'203.0.113.131:{PORT}')]))
+        self.do('robot', self.vpn.peers(self.interfaces['robot'], [
+            first, Peer('second', key, SECOND, f'198.51.100.131:{PORT}')]))
+
+    def close(self) -> None:
+        for child in reversed(self.children):
+            child.stop()
+        for host in self.interfaces:
+            for command in self.vpn.down(self.interfaces[host]):
+                self.run(host, command, check=False)
+        for space in self.spaces.values():
+            process.run(Command(('ip', 'netns', 'delete', space), sudo=True),
+                        timeout=10.0, check=False)
+
+    def ip(self, *words: str) -> None:
+        process.run(Command(('ip', *words), sudo=True), timeout=10.0)
+
+    def argv(self, host: str, words: Sequence[str], group: str = '') -> tuple[str, ...]:
+        return ('ip', 'netns', 'exec', self.spaces[host], 'sh', '-c', ENTER, 'sh', group, *words)
+
+    def run(self, host: str, command: Command, *, check: bool = True) -> Result:
+        """Run a command of the VPN's on a host."""
+        return process.run(
+            Command(self.argv(host, command.argv), sudo=True, what=command.what),
+            timeout=20.0, check=check)
+
+    def shell(self, host: str, text: str, *, check: bool = True) -> str:
+        return self.run(host, Command(('sh', '-c', text)), check=check).stdout
+
+    # what runs in it
+
+    def launch(self, host: str) -> None:
+        """Start what stands for a host's launch; nodes that start later belong to it."""
+        child = self.start(host, ['sh', '-c', 'echo "{\\"pid\\": $$}"; exec sleep 600'])
+        self.interfaces[host] = dataclasses.replace(
+            self.interfaces[host], process=str(child.wait('pid')[0]['pid']))
+
+    def start(
+        self, host: str, words: Sequence[str], *, group: str = '', **environment: str,
+    ) -> Child:
+        passed = {name: os.environ[name] for name in PASSED if name in os.environ}
+        pairs = [f'{key}={value}' for key, value in {**passed, **environment}.items()]
+        child = Child(self.argv(host, ['env', '-i', *pairs, *words], group))
+        self.children.append(child)
+        return child
+
+    def relayed(self, **settings: float) -> Child:
+        """Start the relay that stands before the machine's VPN port."""
+        options = [word for key, value in settings.items() for word in (f'--{key}', str(value))]
+        self.relay = self.start('net', [
+            sys.executable, str(RELAY), f'198.51.100.1:{PORT}', f'203.0.113.2:{PORT}',
+            '--seed', '1', *options])
+        self.relay.wait('listen')
+        return self.relay
+
+    def bad(self, **settings: object) -> None:
+        """Change what the relay does to packets."""
+        assert self.relay is not None
+        answer = self.relay.tell(settings)
+        assert 'error' not in answer, answer
+
+    def repair(self, host: str) -> None:
+        self.do(host, self.vpn.repair(self.interfaces[host], self.peers()[host]))
+
+    def alive(self, host: str) -> bool:
+        command = self.vpn.health_check(self.interfaces[host])
+        return self.run(host, command, check=False).returncode == 0
+
+    def peers(self) -> dict[str, list[Peer]]:
+        """Make the keys, and return each host's peers."""
+        keys = {host: self.run(host, self.vpn.keys(interface)).stdout.strip()
+                for host, interface in self.interfaces.items()}
+        return {'robot': [Peer('machine', keys['machine'], MACHINE, f'198.51.100.1:{PORT}')],
+                'machine': [Peer('robot', keys['robot'], ROBOT)]}
+
+    def do(self, host: str, commands: Iterator[Command]) -> None:
+        for command in commands:
+            said = self.run(host, command).stdout
+            assert said == '', said
+
+    def connect(self, endpoint: str = '') -> None:
+        """
+        Set the VPN up as a deployment does: the robot, the machine, the robot's peer.
+
+        :param endpoint: the machine's, where no relay stands before it.
+        """
+        self.launch('robot')
+        peers = self.peers()
+        if endpoint:
+            peers['robot'] = [dataclasses.replace(peers['robot'][0], endpoint=endpoint)]
+        elif self.relay is None:
+            self.relayed()
+        self.do('robot', self.vpn.up(self.interfaces['robot'], []))
+        self.do('machine', self.vpn.up(self.interfaces['machine'], peers['machine']))
+        self.do('robot', self.vpn.peers(self.interfaces['robot'], peers['robot']))
+        wait_until(self.handshaken, timeout=10.0, what='the handshake')
+
+    def handshaken(self) -> bool:
+        interface = self.interfaces['robot']
+        output = self.run('robot', self.vpn.status(interface)).stdout
+        return any(peer['handshake'] for peer in self.vpn.parse_status(output).values())
+
+    def carried(self, host: str) -> float:
+        """Return the bytes that a host's VPN interface has carried, both ways."""
+        output = self.run(host, self.vpn.status(self.interfaces[host])).stdout
+        return sum(p['received'] + p['sent'] for p in self.vpn.parse_status(output).values())
+
+    def wireguard_go(self, host: str) -> int:
+        """Return the id of a host's wireguard-go, 0 where there is none."""
+        name = self.interfaces[host].name
+        for path in Path('/proc').glob('[0-9]*/cmdline'):
+            try:
+                if path.read_bytes().split(b'\0')[:2] == [b'wireguard-go', name.encode()]:
+                    return int(path.parent.name)
+            except OSError:
+                continue
+        return 0
+
+    def node(self, host: str, *words: str, uri: str | None = None) -> Child:
+        """
+        Start a node and wait until it is there: see ``dds_node.py`` for the words.
+
+        :param uri: in place of what a deployment configures; '' for nothing.
+        """
+        environment = {'RMW_IMPLEMENTATION': self.dds.rmw}
+        if uri is None:
+            path = self.folder / f'dds {host}.xml'
+            name = self.interfaces[host].name
+            if host == 'robot':
+                text = self.dds.render(self.dds.robot_interfaces(name, self.lan_name, {}), [])
+            else:
+                others = {'machine': SECOND, 'second': MACHINE}
+                peers = [others[host]] if 'second' in self.interfaces else []
+                text = self.dds.render(self.dds.machine_interfaces(name), peers)
+            path.write_text(text)
+            environment.update(self.dds.environment(str(path), {}))
+        elif uri:
+            environment['CYCLONEDDS_URI'] = uri
+        group = self.interfaces[host].name if uri is None else ''
+        child = self.start(host, [sys.executable, str(NODE), *words], group=group, **environment)
+        child.wait('ready', timeout=20.0)
+        return child
+
+    def ping(self, host: str, address: str, *, timeout: float = 1.0) -> bool:
+        """Tell whether an echo comes back within some seconds; asks again and again."""
+        seconds = max(1, round(timeout))
+        words = ('ping', '-n', '-q', '-c1', '-i0.2', f'-w{seconds}', address)
+        return self.run(host, Command(words), check=False).returncode == 0
+
+
+@pytest.fixture
+def lab(tmp_path: Path, tun: None) -> Iterator[Lab]:
+    """Return hosts without a VPN, gone after the test."""
+    network = Lab(tmp_path)
+    try:
+        network.open()
+        yield network
+    finally:
+        network.close()
+
+
+@pytest.fixture
+def vpn(lab: Lab) -> Lab:
+    """Return hosts with the VPN between them."""
+    lab.connect()
+    return lab

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hosts outside the VPN that send DDS to machines, and machines that lie about their addresses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigs.vpn_lab import Child, Lab
+
+RTPS = str(Path(__file__).parents[1] / 'rigs/rtps.py')
+ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
+#: The machine's address outside of the VPN, where a stranger is its neighbour.
+OUTSIDE = '203.0.113.2'
+#: Prints what UDP packets say that arrive at its arguments, host:port; joins DDS's group.
+LISTENER = '''
+import json, selectors, socket, struct, sys
+chosen = selectors.DefaultSelector()
+for word in sys.argv[1:]:
+    host, _, port = word.partition(':')
+    one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    one.bind((host, int(port)))
+    for _, name in socket.if_nameindex():
+        if name != 'lo':
+            one.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, struct.pack(
+                '4s4si', socket.inet_aton('239.255.0.1'), bytes(4), socket.if_nametoindex(name)))
+    chosen.register(one, selectors.EVENT_READ, word)
+print(json.dumps({'ready': True}), flush=True)
+while True:
+    for key, _ in chosen.select():
+        print(json.dumps({'said': key.fileobj.recv(2000)[4:].decode(errors='replace'),
+                          'at': key.data}), flush=True)
+'''
+#: Sends a DDS message with a text to each argument, host:port.
+SENDER = '''
+import socket, sys
+one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+for word in sys.argv[2:]:
+    host, _, port = word.partition(':')
+    one.sendto(b'RTPS' + sys.argv[1].encode(), (host, int(port)))
+'''
+
+
+def listener(vpn: Lab, host: str, *at: str, group: str = '') -> Child:
+    child = vpn.start(host, [sys.executable, '-c', LISTENER, *at], group=group)
+    child.wait('ready')
+    return child
+
+
+def send(vpn: Lab, host: str, text: str, *to: str) -> None:
+    vpn.start(host, [sys.executable, '-c', SENDER, text, *to]).process.wait(10)
+
+
+def test_machine_hears_dds_from_its_launch_only(vpn: Lab) -> None:
+    machine = listener(vpn, 'machine', '0.0.0.0:7400')
+    # Linux takes packets for any of its addresses on any interface
+    vpn.ip('-n', vpn.spaces['net'], 'route', 'add', MACHINE, 'via', OUTSIDE)
+    vpn.ip('-n', vpn.spaces['net'], 'route', 'add', '239.255.0.1', 'dev', 'e1')
+    send(vpn, 'net', 'stranger', f'{OUTSIDE}:7400', f'{MACHINE}:7400', '239.255.0.1:7400')
+    send(vpn, 'machine', 'itself', '127.0.0.1:7400')
+    send(vpn, 'robot', 'robot', f'{MACHINE}:7400')
+    machine.wait('said', 'robot')
+    assert [line['said'] for line in machine.lines('said')] == ['itself', 'robot']
+
+
+def test_stranger_cannot_publish_on_a_machine(vpn: Lab) -> None:
+    """Cyclone 0.10 (ROS 2 Jazzy) would take these messages, 11 (embedded) would not."""
+    machine = vpn.node('machine', 'from:/cmd_vel', 'from:/ok')
+    vpn.node('robot', 'to:/ok')
+    stranger = vpn.start('net', [sys.executable, RTPS, 'inject', OUTSIDE, '/cmd_vel', '1 0 bad'])
+    stranger.wait('round', 5)
+    machine.wait('topic', '/ok', count=5)
+    assert machine.lines('topic', '/cmd_vel') == []
+
+
+def test_host_of_others_filters_the_launch_only(lab: Lab) -> None:
+    lab.launch('machine')
+    lab.connect()
+    ours = listener(lab, 'machine', '0.0.0.0:7410', group=lab.interfaces['machine'].name)
+    theirs = listener(lab, 'machine', '0.0.0.0:7412')
+    send(lab, 'net', 'stranger', f'{OUTSIDE}:7410', f'{OUTSIDE}:7412')
+    send(lab, 'robot', 'robot', f'{MACHINE}:7410')
+    theirs.wait('said', 'stranger')
+    ours.wait('said', 'robot')
+    assert [line['said'] for line in ours.lines('said')] == ['robot']
+
+
+def test_robot_sends_no_dds_where_a_machine_points(vpn: Lab) -> None:
+    vpn.lan()
+    robot = vpn.node('robot', 'to:/up')
+    traps = ['192.168.77.2:7410', '192.168.77.2:5000', '127.0.0.1:14550', '192.168.77.1:9000']
+    lan = listener(vpn, 'lan', *traps[:2])
+    local = listener(vpn, 'robot', *traps[2:])
+    machine = listener(vpn, 'machine', f'{MACHINE}:6000')
+    vpn.start('machine', [sys.executable, RTPS, 'announce', ROBOT, *traps, f'{MACHINE}:6000'])
+    # the robot answers all participants alike, and may answer in the VPN
+    machine.wait('said', count=20, timeout=20.0)
+    assert lan.lines('said') == [] and local.lines('said') == []
+    assert robot.process.poll() is None
