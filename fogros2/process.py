@@ -156,7 +156,8 @@ def run(
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
-            f'sudo apt-get install {words[0]}') from error
+            'run it as root, or install sudo' if words[0] == 'sudo'
+            else f'sudo apt-get install {words[0]}') from error
     except OSError as error:
         raise PrerequisiteError(
             f"{words[0]} can't be started on this computer: {error.strerror}",

@@ -26,6 +26,8 @@ from fogros2 import model
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 
+#: Name of a file that is being written, with the process that writes it.
+_UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 
@@ -252,11 +254,16 @@ class Store:
         return records
 
     def sweep(self) -> None:
-        """Remove the locks that killed launches left."""
-        for path in (self.root / 'machines').glob('.*.lock'):
-            with contextlib.suppress(NameTaken, ConfigurationError):
-                with self.lock(path.name[1:-len('.lock')]):
-                    pass
+        """Remove the locks, unfinished files and empty folders that killed launches left."""
+        for path in self.root.rglob('.*'):
+            unfinished = _UNFINISHED.fullmatch(path.name)
+            if unfinished and process_start(int(unfinished[1])) is None:
+                path.unlink(missing_ok=True)
+        for path in (self.root / 'machines').glob('*'):
+            with contextlib.suppress(NameTaken, ConfigurationError, OSError):
+                if path.name.startswith('.') or not any(path.iterdir()):
+                    with self.lock(path.name.removeprefix('.').removesuffix('.lock')):
+                        path.rmdir()
 
 
 def robot_name() -> str:
@@ -282,6 +289,11 @@ def robot_id() -> str:
             error = problem
     assert error is not None
     raise _not_written(state_home() / 'robot.json', error) from error
+
+
+def is_another_robot(noted: str) -> bool:
+    """Return whether a tag has the id of another robot; older versions noted only a name."""
+    return bool(re.fullmatch('.*-[0-9]+-[0-9a-f]{8}', noted)) and noted != robot_id()
 
 
 def _digits(folder: Path) -> str:
@@ -329,7 +341,7 @@ def write_private(path: Path, data: bytes) -> None:
     """
     _make_folder(path.parent)
     try:
-        handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.{os.getpid()}.')
         try:
             with os.fdopen(handle, 'wb') as file:
                 file.write(data)

@@ -17,7 +17,7 @@ from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import Reporter, step, StepFailed
-from fogros2.vpn import addresses, helped, Vpn
+from fogros2.vpn import addresses, helped, owner, Vpn
 from fogros2.waiting import Periodic
 
 #: Seconds between two refreshes of sudo's ticket, which is valid for some minutes.
@@ -117,6 +117,12 @@ class RobotVpn:
                     f'ss -lunp shows by whom; {addresses.PORT_VARIABLE} names another, and '
                     'without it each launch takes a free one') from error
             raise
+        self._note_owner()
+
+    def _note_owner(self) -> None:
+        """Let gc recognise the interface; the helper knows whose its interfaces are."""
+        if not helped.made(self.interface):
+            process.run(owner.note(self.interface), timeout=self._timeout, check=False)
 
     def peers_of(self, member: VpnMember) -> list[Peer]:
         """Return the current peers of a machine."""
@@ -192,6 +198,7 @@ class RobotVpn:
                                timeout=self._timeout).returncode != 0:
                     with step(self.report, '', 'VPN repair', fatal=False):
                         self._run(self.vpn.repair(self.interface, self._peers()), cancel=False)
+                        self._note_owner()
                 self._poll_interval = POLL_INTERVAL
             except FogError:
                 pass  # the step has reported a failed repair; the next check tries again

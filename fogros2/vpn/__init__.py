@@ -3,8 +3,8 @@
 The plugin interface of VPNs: pure functions from interfaces and peers to commands.
 
 ``addresses`` chooses the subnet of a launch. ``wireguard`` writes the commands, and
-``receive_buffer`` is a program that they run. ``helped`` is the plugin: on the robot it may use
-the root helper.
+``receive_buffer`` is a program that they run. ``owner`` tells whose an interface is. ``helped`` is
+the plugin: on the robot it may use the root helper.
 """
 
 from __future__ import annotations

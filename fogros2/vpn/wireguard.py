@@ -95,7 +95,10 @@ class WireGuard(Vpn):
         return Command.script(
             f'umask 077; set -C\n'
             f'if [ ! -s {key} ]; then\n'
-            f'  mkdir -p {folder}; wg genkey >{key}.$$; mv -f {key}.$$ {key}\n'
+            f'  mkdir -p {folder}; wg genkey >{key}.$$ || :\n'
+            f'  [ -s {key}.$$ ] || {{ rm -f {key}.$$\n'
+            f'    echo {key}" can\'t be written: is the disk full?" >&2; exit 1; }}\n'
+            f'  mv -f {key}.$$ {key}\n'
             f'fi\n'
             f'wg pubkey <{key}',
             sudo=True, what='make the VPN key')

@@ -33,7 +33,7 @@ from fogros2.model import Command, Machine, MachineState, VpnInterface
 from fogros2.report import Reporter
 from fogros2.shell import Shell
 from fogros2.store import process_alive, Record, robot_id, Store
-from fogros2.vpn import helped, Vpn
+from fogros2.vpn import helped, owner, Vpn
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
@@ -258,7 +258,11 @@ def due(
         elif dead and record is not None and not record.damage:
             yield Due('leftovers of', entry.name, 'its launch is gone',
                       functools.partial(let_go, record, store))
-    for folder in leftovers(store, now):
+    folders = leftovers(store, now)
+    known = {record.launch for record in store.machines()}
+    folders += [store.root / 'launches' / launch for launch in owner.abandoned(store.root)
+                if launch not in known and store.root / 'launches' / launch not in folders]
+    for folder in folders:
         yield Due('leftovers of launch', folder.name, 'the launch is gone',
                   functools.partial(clear, folder))
 
@@ -346,8 +350,9 @@ def _dead(folder: Path, now: float) -> bool:
         return not process_alive(int(data['pid']), int(data['pid_start']),
                                  str(data.get('boot', '')))
     except (OSError, ValueError, KeyError, TypeError):
+        runs = owner.alive(f'fog{folder.name}', folder.parents[1])
         try:
-            return now - folder.stat().st_mtime > FOLDER_AGE
+            return not runs if runs is not None else now - folder.stat().st_mtime > FOLDER_AGE
         except OSError:
             return False
 

@@ -27,6 +27,8 @@ from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
 T = TypeVar('T')
+#: Seconds by which the robot's clock may be behind the provider's.
+CLOCK_TOLERANCE = 86400.0
 #: Stands for a machine that its provider does not know, or that nobody has asked for.
 _UNKNOWN = Machine('', '', '', MachineState.DELETED)
 
@@ -105,7 +107,9 @@ class Entry:
             known.append(record.armed + record.spec.lifetime)
         elif record is not None and record.created and not known:
             known.append(record.created + record.spec.lifetime)
-        return max(known, default=None)
+        # a robot whose clock is wrong may note an end that is long before the beginning
+        begin = (self._known.created or 0.0) - CLOCK_TOLERANCE
+        return max((at for at in known if at > begin), default=None)
 
     @property
     def address(self) -> str:
@@ -279,13 +283,17 @@ def _ask(
     provider = load(name, regions)
     provider.cancel = cancel
     try:
-        return list(provider.find(tags))
+        found = list(provider.find(tags))
     except Unsupported:
-        return _described(provider, [r for r in records if r.provider == name])
+        found = []
+    # it may have no tags, or not be able to search where the machine is
+    ids = {machine.id for machine in found}
+    return found + _described(
+        provider, [r for r in records if r.provider == name and r.machine_id not in ids])
 
 
 def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
-    """Return the machines that the store knows, for a provider that has no tags."""
+    """Return the machines that the store knows, and a search did not find."""
     machines = []
     for record in records:
         if record.machine_id is not None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 import shutil
 import signal
 import subprocess
@@ -12,9 +13,11 @@ import uuid
 
 import pytest
 
+from fogros2 import process
 from fogros2.deploy import Launch
 from fogros2.model import Command, MachineSpec
 from fogros2.store import Store
+from rigs.launched import ros2
 from ros2fog_cli.api import endings
 
 pytestmark = [
@@ -56,3 +59,46 @@ def test_the_next_launch_takes_the_kept_machine_of_a_killed_one(cloud_network):
         for leftover in endings.leftovers(store):
             endings.clear(leftover)
     assert os.listdir(store.root / 'machines') == []
+
+
+ROBOT = """
+import signal
+from fogros2.deploy import Launch
+launch = Launch()
+launch.robot_vpn().ensure()
+print(launch.id, flush=True)
+signal.pause()
+"""
+
+
+@pytest.mark.parametrize('what', ['process.json', 'state folder'])
+def test_gc_deletes_interface_without_the_launchs_notes(tun, what):
+    """The interface itself names its owner; that of a launch that runs stays."""
+    launches = [subprocess.Popen([sys.executable, '-c', ROBOT], stdout=subprocess.PIPE)
+                for _ in range(2)]
+    killed, alive = (launch.stdout.readline().decode().strip() for launch in launches)
+    store = Store()
+    try:
+        launches[0].kill()
+        launches[0].communicate()
+        for name in (killed, alive):
+            folder = store.root / 'launches' / name
+            if what == 'state folder':
+                shutil.rmtree(folder)
+            else:
+                (folder / 'process.json').write_text('{"pid"')
+        said = ros2('fog', 'gc').stdout
+        assert f'cleared leftovers of launch {killed}' in said and alive not in said
+        assert Path('/sys/class/net', f'fog{alive}').exists()
+    finally:
+        launches[1].kill()
+        launches[1].communicate()
+        ros2('fog', 'gc')
+    assert not any(f'fog{name}' in left for name in (killed, alive) for left in (
+        *os.listdir('/sys/class/net'), run(['nft', 'list', 'tables']), run(['ps', '-eo', 'args'])))
+    assert ros2('fog', 'gc').stdout == 'nothing to clear\n'
+
+
+def run(words):
+    """Return what a command of root prints."""
+    return process.run(Command(tuple(words), sudo=True), timeout=10).stdout

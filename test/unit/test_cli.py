@@ -19,6 +19,7 @@ from typing import Any, Optional
 import pytest
 from ros2cli.cli import main
 
+from fogros2 import process
 from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
 from fogros2.model import (
     Endpoint,
@@ -29,6 +30,7 @@ from fogros2.model import (
     VpnInterface,
 )
 from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.provider.container import ContainerProvider
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeShell, FakeStream
 from fogros2.testing.plugins import instead, MemoryProvider
@@ -415,6 +417,28 @@ def test_lifetime_of_a_reused_machine_starts_again() -> None:
     assert endings.why_end(entry, NOW, endings.KEEP_STOPPED) == ''
     assert 'lifetime' in endings.why_end(
         dataclasses.replace(entry, record=None), NOW, endings.KEEP_STOPPED)
+
+
+def test_machine_that_a_search_omits_is_not_gone() -> None:
+    """The search was in another region, say."""
+    found = machine('a')
+    Memory.machines['id-a'] = dataclasses.replace(found, tags={})
+    record('a', **dead())
+    assert [entry.state for entry in machines.survey(lambda text: None, name='a')] == [
+        'running (launch gone)']
+
+
+def test_container_without_an_engine_on_path_is_not_gone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    instead(monkeypatch, 'fogros2.provider', {'container': ContainerProvider})
+    monkeypatch.setattr(process, 'which', lambda program: None)
+    assert run('list') == 0 and capsys.readouterr() == ('no machines\n', '')
+    record('a', None, provider='container', **dead())
+    assert run('list') == 0
+    said = capsys.readouterr()
+    assert ' unknown ' in said.out and 'neither podman nor docker found' in said.err
+    assert run('gc') == 1 and Store().exists('a')
 
 
 def test_gc_stops_the_daemon_of_a_kept_machines_launch(

@@ -40,6 +40,14 @@ def test_sudo_stays_in_the_session_whose_ticket_it_has(as_user: None) -> None:
     assert child.poll() is not None
 
 
+def test_missing_sudo_is_named_with_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    monkeypatch.setattr(process, '_ENVIRONMENT', {'PATH': '/nowhere'})
+    monkeypatch.setenv('PATH', '/nowhere')
+    with pytest.raises(PrerequisiteError, match='sudo not found .*run it as root, or install'):
+        process.run(Command(('nft', 'list', 'tables'), sudo=True), timeout=10.0)
+
+
 def test_without_sudo_it_is_a_session_of_its_own() -> None:
     child = started(Command(('sleep', '60')))
     try:

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from fogros2 import store as store_module
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 from fogros2.store import boot_id, process_start, Record, Store, write_private
@@ -107,6 +108,29 @@ def test_a_killed_holder_frees_the_name(store):
         with pytest.raises(NameTaken):
             with store.lock('planner'):
                 pass
+
+
+def test_sweep_removes_what_killed_writers_left(store, monkeypatch):
+    """An unfinished file, and the folder of a machine whose first record it was."""
+    code = (
+        'import os, sys; from pathlib import Path; from fogros2 import store\n'
+        'store.os.replace = lambda *paths: os.kill(os.getpid(), 9)\n'
+        'store.write_private(Path(sys.argv[1]), b"{}")')
+    first, later = store.machine('first') / 'record.json', store.machine('later') / 'record.json'
+    write_private(later, b'{}')
+    for path in (first, later):
+        subprocess.run([sys.executable, '-c', code, str(path)])
+        assert len(list(path.parent.glob('.record.json.*'))) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module.os, 'replace', lambda *paths: store.sweep() or fail())
+        with pytest.raises(KeyboardInterrupt):
+            write_private(later, b'{}')
+    store.sweep()
+    assert [path.name for path in (store.root / 'machines').rglob('*')] == ['later', 'record.json']
+
+
+def fail():
+    raise KeyboardInterrupt
 
 
 def test_process_differs_from_another_with_its_id():

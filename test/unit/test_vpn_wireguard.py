@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 import subprocess
 
@@ -62,6 +63,18 @@ def test_the_private_key_is_made_where_it_stays() -> None:
     assert text.splitlines()[0] == 'umask 077; set -C'
     assert 'wg genkey >/state/vpn.key' in text
     assert text.splitlines()[-1] == 'wg pubkey </state/vpn.key'
+
+
+def test_full_disk_is_the_reason_that_the_key_is_not_written(tmp_path: Path) -> None:
+    """``wg genkey`` ends well there, and ``wg pubkey`` would speak of the key's length."""
+    (tmp_path / 'wg').write_text('#!/bin/sh\n')
+    (tmp_path / 'wg').chmod(0o755)
+    key = tmp_path / 'launch/vpn.key'
+    command = WireGuard().keys(dataclasses.replace(ROBOT, key_file=str(key)))
+    done = subprocess.run(command.argv, capture_output=True, text=True, env={
+        **os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    assert done.returncode != 0 and not [*key.parent.iterdir()]
+    assert done.stderr.strip() == f"{key} can't be written: is the disk full?"
 
 
 def test_filter_exists_before_and_after_the_interface() -> None:

@@ -64,6 +64,7 @@ until mkdir "$top" 2>/dev/null; do
     # it exists: another attempt with this token, or one that was interrupted
     [ -e "$top" ] || [ $tries -gt 9 ] && exit 17  # _TOKEN_USED
     mkdir -p "${top%/*}"
+    chmod 711 "${top%/*}"
     tries=$((tries + 1))
 done
 trap failed EXIT
@@ -108,6 +109,11 @@ class ContainerProvider(Provider):
 
     def __init__(self) -> None:
         self._host_keys: dict[str, str] = {}
+
+    @classmethod
+    def configured(cls) -> bool:
+        """Return whether an engine is installed."""
+        return any(container_engine.installed())
 
     def check(self, spec: MachineSpec) -> None:
         """Check the engine, the rights, TUN, and what a machine without an image needs."""
@@ -255,7 +261,11 @@ class ContainerProvider(Provider):
         """Yield the containers of both engines that have all of ``tags`` as labels."""
         filters = [f'--filter=label={container_machine.ATTEMPT}',
                    *(f'--filter=label={key}={value}' for key, value in tags.items())]
-        for engine in container_engine.installed():
+        engines = list(container_engine.installed())
+        if not engines:
+            raise PrerequisiteError('neither podman nor docker found on this computer',
+                                    'sudo apt-get install podman')
+        for engine in engines:
             result = engine.call('ps', '-aq', *filters, what='listing containers', check=False)
             if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
                 raise ProviderError(
