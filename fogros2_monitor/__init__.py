@@ -4,7 +4,8 @@ Watch a deployment in a browser: the Foxglove bridge, its gate, and the dashboar
 
 :mod:`~fogros2_monitor.serve` starts the bridge on a machine. :mod:`~fogros2_monitor.gate` admits
 requests that have the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_monitor.page`,
-:mod:`~fogros2_monitor.credentials`). :mod:`~fogros2_monitor.bridge` implements Foxglove's
+:mod:`~fogros2_monitor.credentials`) and come from no other account of the computer
+(:mod:`~fogros2_monitor.accounts`). :mod:`~fogros2_monitor.bridge` implements Foxglove's
 WebSocket protocol, with the message definitions of :mod:`~fogros2_monitor.definitions`.
 :mod:`~fogros2_monitor.application` runs the web application in a container.
 :mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open the bridge on the robot.

@@ -31,7 +31,7 @@ import ssl
 import sys
 from typing import Optional, Union
 
-from fogros2_monitor import page
+from fogros2_monitor import accounts, page
 from fogros2_monitor.request import check, check_site, parse, Refused, Request
 
 #: Environment variable of all nodes on a machine: its VPN address.
@@ -103,6 +103,8 @@ class Gate:
                 who = plain_address(peer[0])
                 why = '' if len(connections) < CONNECTIONS else \
                     f'{CONNECTIONS} connections are open'
+                if guard is None and accounts.is_foreign(connection):
+                    why = 'from another account of this computer'
                 if guard is not None and not guard.lets_knock(who):
                     why = 'not among the networks that are allowed'
                 if why:

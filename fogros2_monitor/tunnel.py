@@ -12,6 +12,7 @@ import threading
 from fogros2.errors import FogError
 from fogros2.model import Command
 from fogros2.shell import Shell, Stream
+from fogros2_monitor import accounts
 
 #: Bytes in one line of base64.
 _BLOCK = 32768
@@ -68,6 +69,9 @@ class Tunnel:
                 link, _ = self._listener.accept()
             except OSError:
                 return
+            if accounts.is_foreign(link):  # each connection runs a program on the machine
+                link.close()
+                continue
             with self._lock:
                 self._open.add(link)
             threading.Thread(target=self._carry, args=(link,), name='fog-tunnel',

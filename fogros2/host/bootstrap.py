@@ -628,11 +628,14 @@ def _apt(
     return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))
 
 
-#: As in ROS's installation instructions: a package with the source list and its key.
+#: Fingerprint of the key that signs ROS's package lists.
+ROS_KEY = 'C1CF6E31E6BADE8868B172B4F42ED6FBAB17C654'
+# ROS's package with the source list and its key is only the carrier of the key: its scripts do
+# not run, and another key is refused.
 _APT_SOURCE = f"""
 export DEBIAN_FRONTEND=noninteractive
 apt-get update -q
-apt-get install -qy -o DPkg::Lock::Timeout=300 --no-install-recommends ca-certificates curl
+apt-get install -qy -o DPkg::Lock::Timeout=300 --no-install-recommends ca-certificates curl gpg
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 base=https://github.com/ros-infrastructure/ros-apt-source/releases
@@ -640,7 +643,22 @@ version=$(curl -fsSLo /dev/null --retry 3 -w '%{{url_effective}}' "$base/latest"
 version=${{version##*/}}
 curl -fsSL --retry 3 -o "$folder/source.deb" \\
     "$base/download/$version/ros2-apt-source_$version.{APT_CODENAME}_all.deb"
-dpkg -i "$folder/source.deb"
+dpkg-deb -x "$folder/source.deb" "$folder/content"
+keyring=usr/share/keyrings/ros2-archive-keyring.gpg
+found=$(gpg --homedir "$folder" --batch --show-keys --with-colons "$folder/content/$keyring" |
+    awk -F: '$1 == "pub" {{ key = 1 }} $1 == "fpr" && key {{ print $10; key = 0 }}')
+[ "$found" = {ROS_KEY} ] || {{
+    echo "ros2-apt-source $version has the key $found, which is not ROS's" >&2
+    exit 1
+}}
+install -m 644 "$folder/content/$keyring" "/$keyring"
+cat >/etc/apt/sources.list.d/ros2.sources <<END
+Types: deb
+URIs: http://packages.ros.org/ros2/ubuntu
+Suites: {APT_CODENAME}
+Components: main
+Signed-By: /$keyring
+END
 """
 
 

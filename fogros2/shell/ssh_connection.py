@@ -107,6 +107,16 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
 
     known = known_keys(endpoint)
     transport = paramiko.Transport(_dial(endpoint, name, timeout))
+    # paramiko's own limits follow the clock, which may be set back meanwhile
+    late = threading.Event()
+
+    def give_up() -> None:
+        late.set()
+        transport.close()
+
+    limit = threading.Timer(3 * timeout, give_up)
+    limit.daemon = True
+    limit.start()
     try:
         transport.daemon = True
         transport.banner_timeout = transport.handshake_timeout = timeout
@@ -116,12 +126,19 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
         _verify(endpoint, name, transport.get_remote_server_key(), known)
         _log_in(transport, endpoint, name)
         transport.set_keepalive(KEEPALIVE)
-    except (paramiko.SSHException, EOFError, OSError) as error:
+    except (paramiko.SSHException, EOFError, OSError, AuthenticationError) as error:
         transport.close()
+        if late.is_set():
+            raise ConnectError(f"'{name}' ({endpoint.host} port {endpoint.port}) did not complete "
+                               f'the login within {3 * timeout:g} s', 'try again') from error
+        if isinstance(error, AuthenticationError):
+            raise
         raise _explained(error, endpoint, name, bool(known)) from error
     except BaseException:
         transport.close()
         raise
+    finally:
+        limit.cancel()
     return transport
 
 

@@ -24,6 +24,7 @@ from typing import Any, Optional, Protocol
 import urllib.parse
 
 from fogros2.errors import FogError
+from fogros2_monitor import accounts
 
 #: The header with the token.
 HEADER = 'X-Fogros2-Token'
@@ -93,6 +94,10 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, address: tuple[str, int], dashboard: Dashboard) -> None:
         self.dashboard = dashboard
         super().__init__(address, _Handler)
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Refuse other accounts of this computer: each connection takes a thread."""
+        return not accounts.is_foreign(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore errors of clients that disconnect."""

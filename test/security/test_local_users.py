@@ -7,15 +7,22 @@ The account is ``nobody``: it owns nothing and belongs to no group.
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 import shlex
+import socket
 import subprocess
 import sys
+import threading
 
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
+from fogros2.testing.fakes import FakeShell
+from fogros2_monitor.dashboard.server import Dashboard
+from fogros2_monitor.gate import Gate
+from fogros2_monitor.tunnel import Tunnel
 from rigs.stranger import stranger
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,6 +73,22 @@ except TimeoutError as error:
 finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
+"""
+#: Opens many connections to a port of the loopback, and counts those that the server closes.
+MANY = """\
+import socket
+links = [socket.create_connection(('127.0.0.1', int(sys.argv[1]))) for _ in range(150)]
+closed = 0
+for link in links:
+    link.settimeout(10)
+    try:
+        closed += link.recv(1) == b''
+    except ConnectionError:
+        closed += 1
+    except OSError:
+        break
+print(closed, flush=True)
+sys.stdin.read()
 """
 #: Connects to the abstract sockets of relays before rsync does, and holds the connections.
 FIRST = """\
@@ -141,3 +164,46 @@ def test_an_account_that_connects_first_stops_no_sync(root: None) -> None:
         done = subprocess.run([*shlex.split(rsh), 'machine', 'rsync', '--server'], timeout=10,
                               stdin=subprocess.DEVNULL, capture_output=True)
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
+
+
+def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
+    dashboard = Dashboard(None)  # type: ignore[arg-type]
+    threading.Thread(target=dashboard.serve, daemon=True).start()
+    before = threading.active_count()
+    with stranger(MANY, str(dashboard.port)) as child:
+        assert child.stdout and child.stdout.readline() == b'150\n'
+        assert threading.active_count() == before
+        with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
+            own.sendall(b'GET / HTTP/1.0\r\nHost: %b\r\n\r\n' % dashboard.hosts[0].encode())
+            assert own.recv(100).startswith(b'HTTP/1.1 200 OK')
+    dashboard.close()
+
+
+def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
+    shell = FakeShell(streams=[])
+    made = Tunnel(shell, ('127.0.0.1', 9))
+    threading.Thread(target=made.serve, daemon=True).start()
+    with stranger(MANY, str(made.port)) as child:
+        assert child.stdout and child.stdout.readline() == b'150\n'
+    assert shell.opened == []
+    made.close()
+
+
+def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
+    async def knock() -> bytes:
+        listener = socket.create_server(('127.0.0.1', 0))
+        listener.setblocking(False)
+        port = listener.getsockname()[1]
+        serving = asyncio.ensure_future(Gate(('127.0.0.1', 9), 'token').serve(listener))
+        with stranger(MANY, str(port)) as child:
+            assert child.stdout
+            closed = await asyncio.to_thread(child.stdout.readline)
+            assert closed == b'150\n'
+            reader, writer = await asyncio.open_connection('127.0.0.1', port)
+            writer.write(b'GET / HTTP/1.1\r\nHost: localhost\r\n\r\n')
+            answer = await reader.read(100)
+            writer.close()
+        serving.cancel()
+        return answer
+
+    assert asyncio.run(knock()).startswith(b'HTTP/1.1 401 ')

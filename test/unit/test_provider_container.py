@@ -37,6 +37,20 @@ from fogros2.provider.container.options import Options
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
 
 
+def test_tokens_of_machines_are_not_listed_for_others(tmp_path: Path) -> None:
+    roots = tmp_path / 'fogros2'
+    words = ('sh', str(roots / '0123-token'), '', '', 'true')
+    subprocess.run(['sh', '-c', container._CREATE, *words], input=archive(), check=True)
+    assert (roots / '0123-token/root').is_dir()
+    assert stat.S_IMODE(roots.stat().st_mode) == 0o711
+
+
+def archive() -> bytes:
+    made = io.BytesIO()
+    tarfile.open(fileobj=made, mode='w').close()
+    return made.getvalue()
+
+
 def content(data: bytes) -> dict[str, tarfile.TarInfo]:
     with tarfile.open(fileobj=io.BytesIO(data)) as tar:
         return {member.name: member for member in tar.getmembers()}

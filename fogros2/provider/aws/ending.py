@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Optional
 
-from fogros2.provider import TAG_NAME
+from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws import instances, network
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm.cloud import own_name, TAG_ATTEMPT, TAG_MADE, VmId
+from fogros2.store import is_another_robot
 from fogros2.waiting import wait_until
 
 #: Time-out in seconds for the end of an instance; usually it takes half a minute.
@@ -137,7 +138,7 @@ def end_instances(account: Account, region: str, attempt: str) -> None:
 
 def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
     """
-    Return attempts of which only a group or a key is left, with the machine's name.
+    Return this robot's attempts of which only a group or a key is left, with the machine's name.
 
     The end of a machine deletes its disk and address, but not these.
 
@@ -150,8 +151,10 @@ def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
         *account.call('ec2', region, 'describe_key_pairs', 'looking for what is left',
                       Filters=ours)['KeyPairs']]
     tags = [instances.tags_of(entry) for entry in entries]
+    # another robot's clock may differ, and its machine may be about to be created
     left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
-            if now - float(t.get(TAG_MADE, 0)) > SETTLED}
+            if not is_another_robot(t.get(TAG_ROBOT, ''))
+            and now - float(t.get(TAG_MADE, 0)) > SETTLED}
     if left:
         for instance in instances.instances_in(account.pages(
                 'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',

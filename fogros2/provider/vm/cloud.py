@@ -308,7 +308,7 @@ class VmCloud(abc.ABC):
         raise Unsupported(f"a machine at {self.title} can't be started")
 
     def leftovers(self, region: str, now: float) -> Mapping[str, str]:
-        """Return attempts of which no machine is left, with the machine's name."""
+        """Return this robot's attempts of which no machine is left, with the machine's name."""
         return {}
 
     def sweep(self, region: str, attempt: str) -> None:

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A clock that is wrong, on this robot or on a neighbour, ends and deletes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import socket
+import threading
+import time
+
+import paramiko
+import pytest
+
+from fogros2.errors import ConnectError
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import TAG_EXPIRES, TAG_ROBOT
+from fogros2.shell import ssh_connection
+from fogros2.store import Record, robot_id, robot_name
+from ros2fog_cli.api import endings
+from ros2fog_cli.api.machines import Entry
+
+REGION = 'eu-central-1'
+
+
+@pytest.mark.parametrize(('robot', 'collected'), [
+    (f'{robot_name()}-00000000', False), ('', True), (robot_name(), True)])
+def test_neighbour_s_group_stays_during_its_creation(
+    moto_aws: str, robot: str, collected: bool,
+) -> None:
+    """The neighbour's clock is a quarter of an hour behind this robot's."""
+    boto3 = pytest.importorskip('boto3')
+    from fogros2.provider.aws import AWSProvider
+    from fogros2.provider.aws.instances import tag_list
+    attempt = '0123456789abcdef'
+    boto3.client('ec2', REGION).create_security_group(
+        GroupName=f'fogros2-{attempt}', Description='FogROS2', TagSpecifications=[{
+            'ResourceType': 'security-group', 'Tags': tag_list({
+                'fogros2-attempt': attempt, 'fogros2-name': 'slam', TAG_ROBOT: robot,
+                'fogros2-made': str(int(time.time() - 1000))})}])
+    assert bool(AWSProvider().tidy()) is collected
+
+
+@pytest.mark.parametrize('armed', [0.0, 60.0])
+def test_gc_keeps_a_machine_that_was_made_in_1970(armed: float) -> None:
+    """By the robot's clock, that is; the provider knows better."""
+    spec = MachineSpec('slam', 'fake', on_exit='keep', lifetime=3600.0)
+    machine = Machine('id', 'slam', 'fake', MachineState.RUNNING, time.time() - 600, tags={
+        TAG_ROBOT: robot_id(), TAG_EXPIRES: '3660'})
+    entry = Entry('slam', 'fake', machine, Record(
+        'slam', 'fake', spec, machine_id='id', created=60.0, armed=armed))
+    assert endings.why_end(entry, time.time(), 86400.0) == ''
+
+
+class Silent(paramiko.ServerInterface):
+    """An SSH server that does not decide about a key."""
+
+    def __init__(self) -> None:
+        self.over = threading.Event()
+
+    def get_allowed_auths(self, username: str) -> str:
+        return 'publickey'
+
+    def check_auth_publickey(self, username: str, key: paramiko.PKey) -> int:
+        self.over.wait(60.0)
+        return paramiko.common.AUTH_FAILED
+
+
+def test_login_ends_in_time_when_the_clock_is_set_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    key, silent, servers = paramiko.ECDSAKey.generate(), Silent(), []
+    key.write_private_key_file(str(tmp_path / 'key'))
+    said: list[str] = []
+
+    def serve() -> None:
+        servers.append(paramiko.Transport(listener.accept()[0]))
+        servers[0].add_server_key(key)
+        servers[0].start_server(server=silent)
+
+    def connect() -> None:
+        with pytest.raises(ConnectError) as caught:
+            ssh_connection.connect(endpoint, name='slam', timeout=3.0)
+        said.append(str(caught.value))
+
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        endpoint = Endpoint('ssh', '127.0.0.1', listener.getsockname()[1], 'fog',
+                            f'{key.get_name()} {key.get_base64()}', str(tmp_path / 'key'))
+        threading.Thread(target=serve, daemon=True).start()
+        begin, real = time.monotonic(), time.time
+        monkeypatch.setattr(time, 'time', lambda: real() - 100 * (time.monotonic() - begin))
+        login = threading.Thread(target=connect, daemon=True)
+        login.start()
+        login.join(30.0)
+        silent.over.set()
+    for server in servers:
+        server.close()
+    assert said and 'did not complete the login within 9 s' in said[0]
