@@ -96,6 +96,12 @@ def size(data: bytes) -> tuple[int, int]:
     if data[:8] == b'\x89PNG\r\n\x1a\n' and data[12:16] == b'IHDR' and len(data) > 25:
         if data[24] == 16 and data[25] != 0:
             raise Damaged('16-bit colours, which no encoding has', 'damage')
+        at = 8
+        while at < len(data) and data[at + 4:at + 8] != b'IEND':
+            at += 12 + int.from_bytes(data[at:at + 4], 'big')
+        if at > len(data):
+            # OpenCV would reserve the claimed length
+            raise Damaged('a chunk that claims to be longer than the file', 'damage')
         return int.from_bytes(data[16:20], 'big'), int.from_bytes(data[20:24], 'big')
     at = 2 if data[:3] == b'\xff\xd8\xff' else len(data)
     # Segments of JPEG (ITU-T T.81, B.1.1.4): FF, marker, length; a frame header has the size.

@@ -13,6 +13,7 @@ from pathlib import Path
 import secrets
 import subprocess
 import time
+from typing import Optional
 
 from figures.places import Container, Ec2, Place, Pod
 from figures.robots import Robot, robot, UP
@@ -65,18 +66,20 @@ def own_keys(its: Robot, agent: Path) -> dict[str, str]:
     return found
 
 
-def agent_of(name: str) -> tuple[int, Path]:
+def agent_of(name: str) -> Optional[tuple[int, Path]]:
     """Return the process of a machine's agent, and its folder as seen from here."""
     for process in Path('/proc').glob('[0-9]*'):
-        with contextlib.suppress(OSError, ValueError, LookupError):
+        with contextlib.suppress(OSError, ValueError):
             words = (process / 'cmdline').read_bytes().decode().split('\0')
-            if 'serve' in words and words[words.index('serve') - 1].endswith('agent.py'):
-                config = Path(words[words.index('--config') + 1])
-                for folder in (config.parent, Path('/run/fogros2')):
-                    here = Path(f'{process}/root{folder}')
+            if not {'serve', '--config'} <= set(words):
+                continue
+            parent = os.path.dirname(words[words.index('--config') + 1])
+            for folder in (parent, '/run/fogros2'):
+                here = Path(f'{process}/root{folder}')
+                with contextlib.suppress(OSError, ValueError, KeyError):
                     if json.loads((here / 'config.json').read_text())['machine'] == name:
                         return int(process.name), here
-    raise SystemExit(f"the agent of '{name}' was not found")
+    return None
 
 
 def processes(agent: int) -> Found:

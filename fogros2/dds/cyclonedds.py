@@ -269,7 +269,7 @@ def _check_multicast(listed: Sequence[str]) -> None:
 def _has_multicast(interface: str) -> bool:
     try:
         flags = Path('/sys/class/net', interface, 'flags').read_text()
-    except OSError:
+    except (OSError, ValueError):  # ValueError: no file has this name
         return True  # Cyclone itself reports a missing interface
     return bool(int(flags, 16) & _IFF_MULTICAST)
 

@@ -38,6 +38,8 @@ from rigs.stranger import NOBODY
 
 #: Seconds without an answer after which an input counts as a hang.
 WAIT = 60
+#: Bytes that an agent may take.
+AGENT = 150e6
 TOKEN, OTHER = 'a' * 32, 'z' * 32
 KEY = 'Sg3Q0Y1Y0bZ2v6q0ZkzJbb0pRk3S8u1u4hJ0lWm8VHo='
 HELPER = Path(__file__).resolve().parents[2] / 'packaging' / 'vpn_helper' / 'vpn.py'
@@ -56,6 +58,12 @@ class Target:
     valid: Sequence[bytes]
     read: Callable[[bytes], object]
     refusals: tuple[type[Exception], ...]
+
+
+def peak(pid: int) -> int:
+    """Return the most bytes of memory that a process has held."""
+    status = Path(f'/proc/{pid}/status').read_text()
+    return 1024 * int(status.partition('VmHWM:')[2].split()[0])
 
 
 @contextlib.contextmanager
@@ -156,6 +164,7 @@ def _agent() -> Iterator[Target]:
                 assert child.poll() is None, 'the agent did not start'
                 time.sleep(0.01)
             yield Target([json.dumps({'id': 1, **each}).encode() for each in commands], talk, ())
+            assert peak(child.pid) < AGENT, 'the agent took too much memory'
         finally:
             child.kill()
             child.communicate()

@@ -14,16 +14,16 @@ import argparse
 import base64
 from collections.abc import Iterator, Sequence
 import json
+import os
 from pathlib import Path
 import random
-import resource
 import signal
 import time
 import traceback
 from types import FrameType
 from typing import NoReturn, Optional
 
-from rigs.fuzz_targets import Target, TARGETS, WAIT
+from rigs.fuzz_targets import peak, Target, TARGETS, WAIT
 
 #: Seconds of the processor after which an input counts as a hang.
 HANG = 10
@@ -121,9 +121,7 @@ def main() -> None:
     given = parser.parse_args()
     done, found = run(given.target, given.seed, count=given.count, seconds=given.seconds,
                       note=given.note)
-    peak = max(resource.getrusage(who).ru_maxrss
-               for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(json.dumps({'done': done, 'peak': peak * 1024, 'found': {
+    print(json.dumps({'done': done, 'peak': peak(os.getpid()), 'found': {
         wrong: base64.b64encode(data).decode() for wrong, data in found.items()}}))
 
 

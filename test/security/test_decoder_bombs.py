@@ -97,6 +97,13 @@ def test_a_large_png_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
 
 
+def test_a_png_chunk_longer_than_its_file_is_refused(tmp_path: Path) -> None:
+    data = bytearray(png(64, 48, 8, 2))
+    data[33:37] = struct.pack('>I', 1_900_000_000)  # the length of IDAT
+    taken, shown, why = decode(tmp_path, ('png', bytes(data)))
+    assert taken < LIMIT and shown == 'None' and 'longer than the file' in why, (taken, why)
+
+
 def test_a_png_of_deep_colours_is_refused(tmp_path: Path) -> None:
     taken, shown, why = decode(tmp_path, ('bgra8; png', png(SIDE, SIDE, 16, 6)))
     assert taken < LIMIT and shown == 'None' and '16-bit' in why, (taken, why)
