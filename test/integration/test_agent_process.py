@@ -718,7 +718,7 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
     heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', KEY, interval=0.1)
     begin = time.monotonic()
     wait_until(lambda: time.monotonic() - begin > 1.5, timeout=5, what='longer than the timeout')
-    assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 0.1
+    assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 1.0
     assert heartbeat.age is not None and heartbeat.age < 1.0
     assert client.request('status')['heartbeat_age'] < 1.0
     heartbeat.close()

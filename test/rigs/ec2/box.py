@@ -190,7 +190,9 @@ class Ec2Box:
 
     def on_robot(self, words: Sequence[str]) -> list[str]:
         """Return the command line that runs ``words`` on the robot, as this user."""
-        inside = ['ip', 'netns', 'exec', self.robot]
+        # `ip netns exec` hides the control groups of the host
+        inside = ['ip', 'netns', 'exec', self.robot, 'sh', '-c',
+                  'mount -t cgroup2 cgroup2 /sys/fs/cgroup && exec "$@"', 'sh']
         if os.geteuid() == 0:
             return [*inside, *words]
         # sudo has a path of its own, and its loader drops the libraries'
