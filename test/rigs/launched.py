@@ -44,6 +44,9 @@ class Launched:
     def _read(self) -> None:
         assert self.child.stdout is not None
         for line in self.child.stdout:
+            # a computer of the tests is a container, and has no control groups (version 2)
+            if 'DDS filter failed' in line and ' robot: ' not in line:
+                continue
             self.times.append(time.monotonic())
             self.said.append(line)
 
