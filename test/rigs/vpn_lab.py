@@ -38,7 +38,6 @@ NODE = TEST / 'integration/vpn/dds_node.py'
 NETWORK = '198.18.7.0/24'
 ROBOT, MACHINE, SECOND = '198.18.7.1', '198.18.7.2', '198.18.7.3'
 PORT = 51820
-#: What makes a node find its Python, its packages and its middleware.
 #: `ip netns exec` hides the control groups of the host; $1 is the group to be in, if it is there.
 ENTER = """\
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
@@ -46,6 +45,7 @@ group=$(find /sys/fs/cgroup -type d -name "${1:-none}"); shift
 [ -z "$group" ] || echo $$ >"$group/cgroup.procs"
 exec "$@"
 """
+#: What makes a node find its Python, its packages and its middleware.
 PASSED = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'HOME', 'ROS_DISTRO',
           'ROS_VERSION', 'ROS_PYTHON_VERSION')
 _numbers = itertools.count()

@@ -48,7 +48,7 @@ def test_regions_that_do_not_answer_come_last() -> None:
         ('sa-east-1', 200.0), ('us-west-2', 300.0), ('us-west-1', None)]
 
 
-def test_a_region_that_hangs_holds_nobody_up() -> None:
+def test_hanging_region_does_not_delay_the_others() -> None:
     over = threading.Event()
 
     def connect(host: str, port: int, timeout: float) -> float:
@@ -63,7 +63,7 @@ def test_a_region_that_hangs_holds_nobody_up() -> None:
     over.set()
 
 
-def test_who_wants_the_nearest_alone_waits_for_no_far_one() -> None:
+def test_nearest_region_does_not_wait_for_far_ones() -> None:
     over = threading.Event()
 
     def connect(host: str, port: int, timeout: float) -> float:
