@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterator, Mapping
 import contextlib
 import json
@@ -37,7 +38,7 @@ launch.Timeouts = functools.partial(launch.Timeouts, boot={boot}, ssh={ssh})
 """
 
 
-class Place:
+class Place(abc.ABC):
     """
     Machines of one provider.
 
@@ -69,9 +70,9 @@ class Place:
         return LAUNCH.format(kind=self.kind, name=name, node=name.replace('-', '_'), patch=patch,
                              options=options)
 
+    @abc.abstractmethod
     def things(self, name: str) -> dict[str, bool]:
         """Return what there is for machines of that name, and whether it is a running machine."""
-        raise NotImplementedError
 
     def clear(self, name: str) -> None:
         """Delete what there is for machines of that name, after it was counted."""
