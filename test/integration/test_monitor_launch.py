@@ -14,6 +14,7 @@ import signal
 import socket
 import ssl
 import subprocess
+from typing import Optional
 
 import pytest
 
@@ -99,12 +100,15 @@ def second_address(network: str, address: str) -> Iterator[None]:
         run(Command(('ip', 'address', 'del', *words), sudo=True), timeout=60)
 
 
-def knock(at: tuple[str, int], target: str, *, source: str = '', tls: bool = True) -> bytes:
+def knock(
+    at: tuple[str, int], target: str, *, source: Optional[str] = None, tls: bool = True,
+) -> bytes:
     """Return what answers a request, nothing where the connection just ends."""
+    bound = (source, 0) if source else None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError, ssl.SSLZeroReturnError), \
-            socket.create_connection(at, timeout=20, source_address=(source, 0)) as plain, \
+            socket.create_connection(at, timeout=20, source_address=bound) as plain, \
             context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
         connection.sendall(f'GET {target} HTTP/1.1\r\nHost: {at[0]}\r\n\r\n'.encode())
         return connection.recv(4096)
