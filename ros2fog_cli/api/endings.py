@@ -16,7 +16,7 @@ import shutil
 import time
 from typing import Optional
 
-from fogros2 import deploy, plugin_system, process, ros2_daemon
+from fogros2 import deploy, plan, plugin_system, process, ros2_daemon
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.errors import (
@@ -364,8 +364,8 @@ def clear(folder: Path) -> None:
     :raises FogError: a resource could not be deleted.
     """
     name = f'fog{folder.name}'
-    interface = VpnInterface(name, '127.0.0.1', '127.0.0.1/32', 0,
-                             helped.key_of(name) or str(folder / 'vpn.key'), firewall=True)
+    interface = plan.robot_interface(
+        folder.name, '127.0.0.0/24', 0, helped.key_of(name) or str(folder / 'vpn.key'), 0)
     _take_down(folder, interface, 'wireguard')
 
 

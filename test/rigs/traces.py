@@ -145,6 +145,8 @@ def look(state: Path, files: Path, run: str) -> set[Trace]:
     """Return everything on this computer now that a launch may leave behind; see ``Traces``."""
     found = {_named('interface', name) for name in os.listdir('/sys/class/net')
              if name.startswith('fog') and not name.startswith(_SINGLE)}
+    found |= {_named('control group', name) for _, names, _ in os.walk('/sys/fs/cgroup')
+              for name in names if name.startswith('fog') and not name.startswith(_SINGLE)}
     containers = _containers()
     found |= {container.trace for container in containers.values() if container.of_a_launch}
     found |= set(_programs(containers, files, run))
