@@ -50,7 +50,7 @@ def test_node_imports_from_an_underlay_on_an_isolated_machine(
                    timeout=30, what='the node to end')
     finally:
         assert launch.down() == []
-    said = ' '.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == 'n-1')
+    said = ''.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == 'n-1')
     assert 'top below' in said
     (detail,) = [e.detail for e in events if isinstance(e, StepDone) and e.step == 'workspace']
     assert '/srv/acme stays here' in detail
