@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Optional
+from typing import BinaryIO, Optional
 
 from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command, Result
@@ -150,9 +150,9 @@ def run(
     path = _ENVIRONMENT.get('PATH', os.defpath)
     environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
-        child = start(
-            command, environment=environment, stderr=subprocess.PIPE,
-            stdin=subprocess.PIPE if command.input else subprocess.DEVNULL)
+        with _file_of(command.input) if command.input else open(os.devnull, 'rb') as stdin:
+            child = start(
+                command, environment=environment, stdin=stdin.fileno(), stderr=subprocess.PIPE)
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
@@ -175,17 +175,7 @@ def run(
         output[name] = b''.join(lines)
         stream.close()
 
-    def feed() -> None:
-        assert child.stdin is not None
-        try:
-            child.stdin.write(command.input)
-            child.stdin.close()
-        except BrokenPipeError:
-            pass  # the command ended without reading its input; the exit status shows why
-
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
-    if command.input:
-        threads.append(threading.Thread(target=feed, daemon=True))
     for thread in threads:
         thread.start()
     deadline = begin + timeout
@@ -216,6 +206,14 @@ def run(
             hint = 'run `sudo -v` first, or allow it without a password'
         raise CommandError(command, result, HERE, hint)
     return result
+
+
+def _file_of(data: bytes) -> BinaryIO:
+    """Return a file in memory, opened at its beginning: unlike a pipe, nobody has to feed it."""
+    file = open(os.memfd_create('input'), 'w+b')
+    file.write(data)
+    file.seek(0)
+    return file
 
 
 def end(child: subprocess.Popen[bytes], *, sudo: bool) -> None:

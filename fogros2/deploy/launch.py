@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
 from decimal import Decimal
+import functools
 import os
 from pathlib import Path
 import secrets
@@ -31,6 +32,7 @@ from fogros2.model import MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, StepFailed
 from fogros2.store import Store, this_process, write_private
+from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
 
 
@@ -230,7 +232,8 @@ class Launch:
                     choose_interface(
                         self.id, folder, self.user_environment, self.timeouts.vpn), vpn,
                     report=self.report, undo=self.undo, timeout=self.timeouts.vpn,
-                    cancel=self.cancel, ending=self._ending)
+                    cancel=self.cancel, ending=self._ending,
+                    choose_port=functools.partial(addresses.choose_port, self.user_environment))
             return self._vpn
 
     def _remove_folder(self, folder: Path) -> None:

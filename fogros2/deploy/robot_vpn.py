@@ -56,11 +56,13 @@ class RobotVpn:
     :param timeout: of the commands for the interface, in seconds.
     :param cancel: set when the launch is cancelled.
     :param ending: set when the launch is on its way down.
+    :param choose_port: returns the user's UDP port, or one that is free now.
     """
 
     def __init__(
         self, interface: VpnInterface, vpn: Vpn, *, report: Reporter, undo: UndoStack,
         timeout: float, cancel: threading.Event, ending: threading.Event,
+        choose_port: Callable[[], int],
     ) -> None:
         self.interface = interface
         self.vpn = vpn
@@ -71,6 +73,7 @@ class RobotVpn:
         self._timeout = timeout
         self._cancel = cancel
         self._ending = ending
+        self._choose_port = choose_port
         self._lock = threading.Lock()
         self._members: dict[str, VpnMember] = {}
         #: The robot as the machines' peer while the interface is up.
@@ -108,15 +111,21 @@ class RobotVpn:
         return run(commands, timeout=self._timeout, cancel=self._cancel if cancel else None)
 
     def _bring_up(self) -> None:
-        try:
-            report_unfiltered(self.report, '', self._run(self.vpn.up(self.interface, [])))
-        except CommandError as error:
-            if 'Address already in use' in error.result.stderr:
-                raise VpnError(
-                    f'UDP port {self.interface.port} of this computer is in use already',
-                    f'ss -lunp shows by whom; {addresses.PORT_VARIABLE} names another, and '
-                    'without it each launch takes a free one') from error
-            raise
+        """Bring the interface up, with another port if a program takes the free one first."""
+        for last in (False, False, True):
+            try:
+                report_unfiltered(self.report, '', self._run(self.vpn.up(self.interface, [])))
+                break
+            except CommandError as error:
+                if 'Address already in use' not in error.result.stderr:
+                    raise
+                port = self._choose_port()
+                if last or port == self.interface.port:
+                    raise VpnError(
+                        f'UDP port {self.interface.port} of this computer is in use already',
+                        f'ss -lunp shows by whom; {addresses.PORT_VARIABLE} names another, and '
+                        'without it each launch takes a free one') from error
+                self.interface = dataclasses.replace(self.interface, port=port)
         self._note_owner()
 
     def _note_owner(self) -> None:

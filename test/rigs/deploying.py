@@ -18,6 +18,7 @@ from fogros2.provider import Provider
 from fogros2.report import Reporter, silent
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider, FakeVpn
+from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
 
 ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', firewall=True)
@@ -41,7 +42,8 @@ def job(
         'failures': failures, 'timeouts': Timeouts(), 'cancel': cancel, 'ending': ending,
         'provider': machines, 'choices': Choices(lambda name: machines, report),
         'vpn': RobotVpn(ROBOT, FakeVpn(), report=report, undo=UndoStack(report, '', failures),
-                        timeout=30.0, cancel=cancel, ending=ending),
+                        timeout=30.0, cancel=cancel, ending=ending,
+                        choose_port=addresses.choose_port),
         'dds': CycloneDds(), **changes}
     context = Context(**fields)
     return context, MachineJob(context, spec)

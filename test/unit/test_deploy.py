@@ -617,6 +617,22 @@ def test_a_port_of_the_robot_that_is_taken_says_what_to_do(launch, monkeypatch):
             robot._bring_up()
 
 
+def test_a_free_port_that_was_taken_meanwhile_is_replaced(launch, monkeypatch):
+    ports = []
+
+    def up(self, interface, peers):
+        ports.append(interface.port)
+        if len(ports) == 1:
+            raise CommandError(
+                Command(('true',)), Result(1, '', 'Address already in use'), 'this computer')
+        return iter(())
+
+    robot = launch.robot_vpn()
+    monkeypatch.setattr(FakeVpn, 'up', up)
+    robot._bring_up()
+    assert len(ports) == 2 and ports[0] != ports[1] == robot.interface.port
+
+
 @pytest.mark.parametrize(('on_exit', 'owned', 'hint'), [
     ('keep', True, 'ros2 fog delete planner'), ('delete', False, 'nothing needs to be done')])
 def test_what_stays_on_a_machine_out_of_reach_is_told_once(
