@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from typing import BinaryIO, Optional
@@ -209,8 +210,12 @@ def run(
 
 
 def _file_of(data: bytes) -> BinaryIO:
-    """Return a file in memory, opened at its beginning: unlike a pipe, nobody has to feed it."""
-    file = open(os.memfd_create('input'), 'w+b')
+    """
+    Return a file in memory with this content; unlike a pipe, it needs no thread that writes.
+
+    Not ``os.memfd_create``, which a Python built for an old libc, such as conda's, does not have.
+    """
+    file = tempfile.TemporaryFile(dir='/dev/shm')
     file.write(data)
     file.seek(0)
     return file
