@@ -66,7 +66,7 @@ setup(
     extras_require={
         'applications': APPLICATIONS,
         'aws': AWS,
-        'bench': ['matplotlib', 'websockets'],
+        'bench': ['atheris; platform_machine == "x86_64"', 'matplotlib', 'websockets'],
         'docs': DOCS,
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,

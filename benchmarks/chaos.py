@@ -232,7 +232,9 @@ def main() -> None:
     for provider in [options.provider] if options.provider else PROVIDERS:
         kill_all(provider, state, options, until)
     done = read(state)
-    write(name, f'ros2 launch killed at random moments, seed {options.seed}', list(rows(done)))
+    pace = 'default' if options.defaults else 'short'
+    write(name, f'ros2 launch killed at random moments, {pace} time-outs, seed {options.seed}',
+          list(rows(done)))
     sys.exit(any(each['alive'] or each['left'] or each.get('neighbour') for each in done))
 
 

@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 SECONDS = 12.0
 #: Messages of the beginning that don't count.
 WARM_UP = 10
-PATIENCE = 30.0
+TIMEOUT = 30.0
 VIEWERS = 5
 RATE = 30.0
 #: A packet's stand-in for the frames of a stream: so many, over and over.
@@ -201,7 +201,7 @@ async def watch(
     crowd = [Seen() for _ in range(count)]
     tasks = [asyncio.ensure_future(viewer(url, what, seen)) for seen in crowd]
     try:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while not all(len(seen.sizes) > WARM_UP for seen in crowd):
             for task in tasks:
                 if task.done():
@@ -250,7 +250,7 @@ def process(*words: str) -> Iterator[subprocess.Popen[bytes]]:
         finally:
             started.send_signal(signal.SIGINT)
             try:
-                started.wait(PATIENCE)
+                started.wait(TIMEOUT)
             except subprocess.TimeoutExpired:
                 started.kill()
                 started.wait()
@@ -264,7 +264,7 @@ def free_port() -> int:
 
 def listens(port: int) -> None:
     """Wait until somebody listens at a port."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while True:
         with contextlib.suppress(OSError), socket.create_connection(('127.0.0.1', port), 1):
             return
@@ -332,7 +332,7 @@ def dashboard(seconds: float) -> list[Row]:
                 share = 100 * (cpu([started]) - spent) / (time.monotonic() - begin)
         finally:
             started.send_signal(signal.SIGINT)
-            started.wait(PATIENCE)
+            started.wait(TIMEOUT)
     return [
         Row("dashboard: the page's first content is seen after", statistics.median(paints), 'ms',
             1000.0, runs=len(paints)),

@@ -2,11 +2,13 @@
 """
 How the promises of ``doc/security.md`` hold against inputs that nobody sent on purpose.
 
-``fuzz`` feeds mutated inputs to each reader of others' inputs for ``--minutes``. ``secrets``
-launches a machine of each provider for a user with planted credentials, and looks for these and
-for the launch's own keys in arguments, variables, logs, store, tags, user data and files.
+``fuzz`` feeds mutated inputs to each reader of others' inputs for ``--minutes``, guided by
+coverage where the reader is Python code in one process. ``secrets`` launches a machine of each
+provider for a user with planted credentials, and looks for these and for the launch's own keys in
+arguments, variables, logs, store, tags, user data and files. ``strangers`` launches a machine of
+each, and sends ``--packets`` to the open ports of the machine, and a quarter of that to the robot.
 
-    python benchmarks/security.py [fuzz] [secrets] [--minutes 10] [--seed 1]
+    python benchmarks/security.py [fuzz] [secrets] [strangers] [--minutes 10] [--seed 1]
 """
 
 from __future__ import annotations
@@ -21,10 +23,12 @@ import sys
 from figures import Row, write
 from figures.places import place
 from figures.secrets_scan import scan
+from figures.strangers import attack, CONTROL
 
-from rigs.fuzz_targets import TARGETS
+from rigs.fuzz_targets import PYTHON, TARGETS
 
 NOTES = Path('.cache/fuzz')
+PROVIDERS = ('container', 'aws', 'kubernetes', 'ssh')
 
 
 def fuzz(seed: int, seconds: float) -> Iterator[Row]:
@@ -34,12 +38,13 @@ def fuzz(seed: int, seconds: float) -> Iterator[Row]:
         note = NOTES / target.replace(' ', '-')
         child = subprocess.run(
             [sys.executable, '-m', 'rigs.fuzzing', target, str(seed), '--seconds', str(seconds),
-             '--note', str(note)], capture_output=True, text=True, check=False)
+             '--note', str(note), *(['--guided'] if target in PYTHON else [])],
+            capture_output=True, text=True, check=False)
         if child.returncode:
             print(f'{target}: crashed by {note}:\n{child.stderr[-2000:]}')
             yield Row(f'{target}: crashes', 1, 'inputs', 0.0)
             continue
-        result = json.loads(child.stdout)
+        result = json.loads(child.stdout.splitlines()[-1])  # Atheris prints a line before
         for wrong, data in result['found'].items():
             print(f'{target}: {wrong}: {data[:2000]}')
         yield Row(f'{target}: crashes, hangs, unexpected errors', len(result['found']), 'inputs',
@@ -60,22 +65,47 @@ def secrets(provider: str) -> Iterator[Row]:
               len(sees) - len(blind), 'kinds', float(len(sees)), better='more')
 
 
+def strangers(provider: str, packets: int, seed: int) -> Iterator[Row]:
+    """Yield what strangers got from the machine and the robot of a launch."""
+    with place(provider) as here:
+        found = attack(here, packets, seed)
+    print(f'{provider}: {found}', flush=True)
+    yield Row(f'{provider}: replies to a stranger', sum(found.replies.values()), 'packets', 0.0,
+              runs=found.sent)
+    yield Row(f"{provider}: WireGuard's cookie replies", found.cookies, 'packets', runs=found.sent)
+    aside = {'container': ', its SSH server aside', 'ssh': ', those of before the launch aside'}
+    yield Row(f"{provider}: TCP ports that accept a stranger{aside.get(provider, '')}",
+              len(found.accepted), 'ports', 0.0)
+    yield Row(f'{provider}: UDP ports that were open on machine and robot', len(found.ports),
+              'ports')
+    yield Row(f'{provider}: replies of a socket that echoes', min(found.control), 'packets', 1.0,
+              better='more', runs=CONTROL)
+    yield Row(f'{provider}: packets dropped unread', found.dropped, 'packets', runs=found.sent)
+    yield Row(f'{provider}: problems of launch, VPN and machine afterwards', len(found.problems),
+              'problems', 0.0)
+
+
 def main() -> None:
     """Take the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('parts', nargs='*', help='fuzz, secrets (default: both)')
+    parser.add_argument('parts', nargs='*', help='fuzz, secrets, strangers (default: all)')
     parser.add_argument('--minutes', type=float, default=10.0, help='for each reader of inputs')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--provider', action='append')
+    parser.add_argument('--packets', type=int, default=10**6, help='of strangers to each machine')
+    parser.add_argument('--provider', action='append', choices=PROVIDERS)
     given = parser.parse_args()
-    parts = given.parts or ['fuzz', 'secrets']
+    parts = given.parts or ['fuzz', 'secrets', 'strangers']
+    providers = given.provider or PROVIDERS
     if 'fuzz' in parts:
         write('fuzzing', f'Mutated inputs for {given.minutes:g} minutes each, seed {given.seed}',
               list(fuzz(given.seed, 60 * given.minutes)))
     if 'secrets' in parts:
         write('secrets', 'Planted credentials and own keys where others could read them', [
-            row for provider in given.provider or ('container', 'aws', 'kubernetes')
-            for row in secrets(provider)])
+            row for provider in providers for row in secrets(provider)])
+    if 'strangers' in parts:
+        write('strangers', f'Packets of strangers, seed {given.seed}', [
+            row for provider in providers
+            for row in strangers(provider, given.packets, given.seed)])
 
 
 if __name__ == '__main__':

@@ -52,7 +52,7 @@ def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
     """
     rmw = environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW
     if rmw not in known:
-        raise DdsError(f'RMW_IMPLEMENTATION={rmw} is none that FogROS2 can lead over a VPN',
+        raise DdsError(f'FogROS2 does not support RMW_IMPLEMENTATION={rmw}',
                        f"use one of {', '.join(known)}, or unset it")
     return rmw
 
@@ -66,7 +66,7 @@ def rmw_of(name: str, known: Sequence[str]) -> str:
     rmw = {'fastdds': 'rmw_fastrtps_cpp'}.get(name, name)
     rmw = rmw if rmw in known else f'rmw_{rmw}_cpp'
     if rmw not in known:
-        raise DdsError(f"dds='{name}' is none that FogROS2 can lead over a VPN",
+        raise DdsError(f"FogROS2 does not support dds='{name}'",
                        f"use one of {', '.join(known)}")
     return rmw
 
@@ -97,8 +97,8 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
                 'set RMW_IMPLEMENTATION for the whole launch, before it')
         if spec.bootstrap == 'embedded' and rmw != DEFAULT_RMW:
             raise DdsError(
-                f"machine '{spec.name}' would get the embedded default, which has {DEFAULT_RMW}"
-                f' alone, and nodes here have {rmw}',
+                f"machine '{spec.name}' would get the embedded default, which has only "
+                f'{DEFAULT_RMW}, but nodes on the robot use {rmw}',
                 "leave bootstrap='embedded' out, or unset RMW_IMPLEMENTATION")
 
 
@@ -135,8 +135,8 @@ def _host(network: str, number: int) -> str:
     subnet = ipaddress.ip_network(network)
     if number >= subnet.num_addresses - 1:
         raise ConfigurationError(
-            f'{network} has no address for another machine',
-            f'a launch takes {subnet.num_addresses - 2 - 1} machines')
+            f'{network} has no free address for another machine',
+            f'a launch can have {subnet.num_addresses - 2 - 1} machines')
     return str(subnet[number])
 
 
@@ -177,7 +177,7 @@ def route(machine: Machine, peer: Peer, port: int, robot_port: int) -> Route:
         robot = host_port(machine.robot_host, robot_port)
     else:
         raise VpnError(
-            f"the robot has no way to '{machine.name}' for the VPN, nor it to the robot",
+            f"neither the robot nor '{machine.name}' can reach the other's UDP port of the VPN",
             'one of the two has to be reachable by UDP: see the options of its provider')
     if machine.private_network and machine.private_ip:
         private = host_port(machine.private_ip, port)

@@ -48,7 +48,7 @@ def load(group: str, name: str) -> Any:
     """
     points = _entry_points(group)
     if name not in points:
-        raise ConfigurationError(f"no {GROUPS.get(group, group)} is called '{name}'",
+        raise ConfigurationError(f"there is no {GROUPS.get(group, group)} '{name}'",
                                  did_you_mean(name, sorted(points)))
     try:
         return points[name].load()

@@ -192,7 +192,7 @@ class Store:
         try:
             return record_from_json(json.loads(path.read_text()))
         except FileNotFoundError:
-            raise StoreError(f"nothing is known of a machine '{name}' here",
+            raise StoreError(f"this robot has no record of a machine '{name}'",
                              'ros2 fog list shows the machines that exist') from None
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise StoreError(

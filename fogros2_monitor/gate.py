@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Guard the bridge: listen on the network, and admit only requests that have the token.
+Protect the bridge: listen on the network, and admit only requests that have the token.
 
 The bridge itself has no authentication, and any web page can make the user's browser connect to
 it. So the gate forwards only requests that carry the token (``ws://ADDRESS:PORT/?token=TOKEN``)
@@ -52,7 +52,7 @@ Network = Union[ipaddress.IPv4Network, ipaddress.IPv6Network]
 
 
 @dataclasses.dataclass(frozen=True)
-class Guard:
+class PublicPort:
     """
     TLS and allowed networks of a port that is open to other computers than the robot.
 
@@ -62,7 +62,7 @@ class Guard:
     tls: ssl.SSLContext
     allowed: tuple[Network, ...] = ()
 
-    def lets_knock(self, peer: str) -> bool:
+    def allows(self, peer: str) -> bool:
         """Return whether an address is in an allowed network."""
         address = ipaddress.ip_address(peer)
         return not self.allowed or any(address in network for network in self.allowed)
@@ -88,12 +88,12 @@ class Gate:
         self._name = name
         self._logged: set[tuple[str, str]] = set()
 
-    async def serve(self, listener: socket.socket, guard: Optional[Guard] = None) -> None:
+    async def serve(self, listener: socket.socket, public: Optional[PublicPort] = None) -> None:
         """
         Accept connections until cancelled.
 
         :param listener: a listening, non-blocking socket.
-        :param guard: for a port that is open to other computers than the robot.
+        :param public: for a port that is open to other computers than the robot.
         """
         loop = asyncio.get_running_loop()
         connections: set[asyncio.Task[None]] = set()
@@ -103,30 +103,30 @@ class Gate:
                 who = plain_address(peer[0])
                 why = '' if len(connections) < CONNECTIONS else \
                     f'{CONNECTIONS} connections are open'
-                if guard is None and accounts.is_foreign(connection):
+                if public is None and accounts.is_foreign(connection):
                     why = 'from another account of this computer'
-                if guard is not None and not guard.lets_knock(who):
+                if public is not None and not public.allows(who):
                     why = 'not among the networks that are allowed'
                 if why:
                     self._turn_away(who, why)
                     connection.close()
                     continue
-                task = loop.create_task(self._greet(connection, who, guard))
+                task = loop.create_task(self._greet(connection, who, public))
                 connections.add(task)
                 task.add_done_callback(connections.discard)
         finally:
             listener.close()
 
     async def _greet(
-        self, connection: socket.socket, peer: str, guard: Optional[Guard],
+        self, connection: socket.socket, peer: str, public: Optional[PublicPort],
     ) -> None:
         loop = asyncio.get_running_loop()
         reader = asyncio.StreamReader(limit=HEAD, loop=loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
         try:
             transport, _ = await loop.connect_accepted_socket(
-                lambda: protocol, connection, ssl=guard.tls if guard else None,
-                ssl_handshake_timeout=HANDSHAKE if guard else None)
+                lambda: protocol, connection, ssl=public.tls if public else None,
+                ssl_handshake_timeout=HANDSHAKE if public else None)
         except OSError as error:  # includes errors of TLS
             self._turn_away(peer, f'no TLS: {getattr(error, "reason", "") or error}')
             connection.close()
@@ -134,9 +134,9 @@ class Gate:
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         try:
             request = parse(await _head(reader))
-            check_site(request, self._name, encrypted=guard is not None)
+            check_site(request, self._name, encrypted=public is not None)
             check(request, self._token)
-            await self._lead(request, reader, writer, encrypted=guard is not None)
+            await self._lead(request, reader, writer, encrypted=public is not None)
         except Refused as refused:
             self._turn_away(peer, str(refused))
             writer.write(page.refusal(refused.status, self._name))
@@ -240,7 +240,7 @@ def endpoint(text: str) -> tuple[str, int]:
     :raises argparse.ArgumentTypeError: the text has another form.
     """
     host, separator, port = text.rpartition(':')
-    if not separator or not port.isdigit() or int(port) > 65535:
+    if not separator or not port.isdecimal() or int(port) > 65535:
         raise argparse.ArgumentTypeError(f"'{text}' isn't ADDRESS:PORT")
     return host.strip('[]'), int(port)
 
@@ -280,9 +280,9 @@ async def _run(options: argparse.Namespace) -> None:
         loop.add_reader(0, ended.cancel)  # the parent never writes: readable means closed
     gate = Gate(options.to, _token(options.token_file), options.application, options.name)
     serving = [asyncio.ensure_future(gate.serve(_listen(address))) for address in options.listen]
-    if options.guarded:
+    if options.public:
         serving.append(asyncio.ensure_future(
-            gate.serve(_listen(options.guarded), _guard(options))))
+            gate.serve(_listen(options.public), _public_port(options))))
     await asyncio.wait({ended, *serving}, return_when=asyncio.FIRST_COMPLETED)
     for task in serving:
         if task.done():
@@ -297,11 +297,11 @@ def _token(path: str) -> str:
     return token
 
 
-def _guard(options: argparse.Namespace) -> Guard:
+def _public_port(options: argparse.Namespace) -> PublicPort:
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     tls.minimum_version = ssl.TLSVersion.TLSv1_2
     tls.load_cert_chain(options.certificate, options.key)
-    return Guard(tls, tuple(options.allow))
+    return PublicPort(tls, tuple(options.allow))
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
@@ -313,7 +313,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument('--vpn', type=int, metavar='PORT', help=f'the same, at ${VPN_ADDRESS}')
     parser.add_argument('--until-eof', action='store_true',
                         help='end with the process that has the other end of the input')
-    parser.add_argument('--guarded', type=endpoint,
+    parser.add_argument('--public', type=endpoint,
                         help='where to listen with TLS; :PORT for every address')
     parser.add_argument('--allow', type=network, action='append', default=[],
                         help='network (CIDR) that may knock there; all unless given')
@@ -328,8 +328,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         if VPN_ADDRESS not in os.environ:
             parser.error(f'--vpn takes {VPN_ADDRESS}, which nodes on a machine have')
         options.listen.append((os.environ[VPN_ADDRESS], options.vpn))
-    if options.guarded and not (options.certificate and options.key):
-        parser.error('--guarded takes --certificate and --key')
+    if options.public and not (options.certificate and options.key):
+        parser.error('--public takes --certificate and --key')
     asyncio.run(_run(options))
 
 

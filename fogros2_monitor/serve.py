@@ -6,7 +6,7 @@ Start the bridge on a machine, with its gate and the web application.
 
 ``--topic PATTERN``     topics to show; default: all
 ``--secrets FOLDER``    folder of the token and the TLS files, created if missing
-``--guarded PORT``      also open this port to other computers, over TLS
+``--public PORT``       also open this port to other computers, over TLS
 ``--image IMAGE``       image of the web application, '' for none
 
 The bridge is ROS 2's own ``foxglove_bridge`` if it is installed, otherwise
@@ -86,7 +86,7 @@ def hidden_place() -> tuple[str, int]:
         return address, int(probe.getsockname()[1])
 
 
-def guard(port: int, folder: str, name: str) -> list[str]:
+def public_port(port: int, folder: str, name: str) -> list[str]:
     """
     Return the gate's options for other computers; none if the certificate cannot be created.
 
@@ -101,7 +101,7 @@ def guard(port: int, folder: str, name: str) -> list[str]:
         return []
     say('the certificate has the SHA-256 '
         + credentials.fingerprint(made.certificate.read_text()))
-    return ['--guarded', f':{port}', '--certificate', str(made.certificate),
+    return ['--public', f':{port}', '--certificate', str(made.certificate),
             '--key', str(made.key)]
 
 
@@ -112,7 +112,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(allow_abbrev=False)
     parser.add_argument('--topic', action='append', default=[])
     parser.add_argument('--vpn', type=int)
-    parser.add_argument('--guarded', type=int)
+    parser.add_argument('--public', type=int)
     parser.add_argument('--secrets', required=True)
     parser.add_argument('--image', default='')
     parser.add_argument('--name', default=socket.gethostname())
@@ -126,8 +126,8 @@ def main() -> None:
     gate += ['--name', ours.name, '--token-file', str(made.token)]
     if ours.vpn is not None:
         gate += ['--vpn', str(ours.vpn)]
-    if ours.guarded is not None:
-        gate += guard(ours.guarded, folder, ours.name)
+    if ours.public is not None:
+        gate += public_port(ours.public, folder, ours.name)
     address, port = hidden_place()
     end, kept = os.pipe()
     os.set_inheritable(kept, True)  # the bridge keeps this end open; at its end the others exit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places where robots have their machines: this computer's podman, EC2 in a box, a cluster."""
+"""Places of robots' machines: this computer's podman, EC2 in a box, a cluster, an SSH host."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import contextlib
 import json
 import os
 from pathlib import Path
+import secrets
 import subprocess
+import tempfile
 import time
 from typing import Any, ClassVar
 
+from fogros2.provider.container import root
+from rigs.bare_computer import bare_computer, BareComputer
 from rigs.cluster import Client, Cluster, cluster, READY, running_cluster
 from rigs.cluster.namespaces import making_namespaces, Namespace
 from rigs.ec2 import Ec2Box
@@ -52,6 +56,8 @@ class Place(abc.ABC):
     patch = ''
     prefix: list[str] = []
     environment: Mapping[str, str] = {}
+    #: Name or file of the robot's network namespace.
+    network = '/proc/self/ns/net'
 
     def __init__(self, *, short: bool = True) -> None:
         self.short = short
@@ -76,6 +82,9 @@ class Place(abc.ABC):
 
     def clear(self, name: str) -> None:
         """Delete what there is for machines of that name, after it was counted."""
+
+    def admit(self, name: str) -> None:
+        """Open the provider's firewall of a machine for all UDP."""
 
 
 class Container(Place):
@@ -108,6 +117,7 @@ class Ec2(Place):
         super().__init__(short=short)
         self.box = box
         self.prefix = box.on_robot([])
+        self.network = box.robot
         self.environment = {**box.environment(REGION), 'FOGROS2_AWS_CHECKIP': box.checkip,
                             'FOGROS2_AWS_REGIONS': REGION}
 
@@ -127,6 +137,14 @@ class Ec2(Place):
                 ('VolumeId', api.describe_volumes(Filters=tag)['Volumes'])):
             found.update({f'{kind} {entry[kind]}': False for entry in entries})
         return found
+
+    def admit(self, name: str) -> None:
+        """Open the machine's security groups for all UDP."""
+        api, tag = self.api(), [{'Name': 'tag:fogros2-name', 'Values': [name]}]
+        for group in api.describe_security_groups(Filters=tag)['SecurityGroups']:
+            api.authorize_security_group_ingress(GroupId=group['GroupId'], IpPermissions=[{
+                'IpProtocol': 'udp', 'FromPort': 0, 'ToPort': 65535,
+                'IpRanges': [{'CidrIp': '0.0.0.0/0'}]}])
 
     def plant(self, name: str) -> None:
         """Create the group and the key of a machine whose instance another robot now creates."""
@@ -149,9 +167,9 @@ class Pod(Place):
     patch = 'from fogros2.provider.kubernetes import manifests\nmanifests.BOOT = 20.0\n'
     boot, ssh = 20.0, 5.0
 
-    def __init__(self, space: Namespace, *, short: bool = True) -> None:
+    def __init__(self, nodes: Cluster, space: Namespace, *, short: bool = True) -> None:
         super().__init__(short=short)
-        self.space = space
+        self.nodes, self.space = nodes, space
         self.environment = {'KUBECONFIG': str(space.kubeconfig)}
 
     @property
@@ -169,6 +187,31 @@ class Pod(Place):
             if name in json.dumps(each['metadata'].get('labels', {}))}
 
 
+class Host(Place):
+    """A computer with an SSH server."""
+
+    kind = 'SSHInstance'
+
+    def __init__(self, computer: BareComputer, *, short: bool = True) -> None:
+        super().__init__(short=short)
+        self.computer = computer
+        self.options = (f", host='{computer.address}', user='{computer.user}', "
+                        f"key='{computer.key}', host_key='{computer.host_key}'")
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return the processes that name the machine."""
+        return {f'process {line}': True for line in self.computer.processes() if name in line}
+
+
+@contextlib.contextmanager
+def computer() -> Iterator[BareComputer]:
+    """Run a computer of this robot's environment on podman's default network."""
+    with tempfile.TemporaryDirectory(prefix='place-') as folder, bare_computer(
+            f'fogt-{secrets.token_hex(4)}', Path(folder, 'computer'), 'podman',
+            mounts=root.environment_mounts()) as running:
+        yield running
+
+
 @contextlib.contextmanager
 def place(provider: str, *, short: bool = True) -> Iterator[Place]:
     """Open a place, for as long as the block runs."""
@@ -177,11 +220,13 @@ def place(provider: str, *, short: bool = True) -> Iterator[Place]:
             yield Container(short=short)
         elif provider == 'aws':
             yield Ec2(stack.enter_context(Ec2Box()), short=short)
+        elif provider == 'ssh':
+            yield Host(stack.enter_context(computer()), short=short)
         else:
             there = _cluster(stack)
             make = stack.enter_context(making_namespaces(
                 there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
-            yield Pod(make(), short=short)
+            yield Pod(there, make(), short=short)
 
 
 def _cluster(stack: contextlib.ExitStack) -> Cluster:

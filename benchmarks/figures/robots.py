@@ -19,6 +19,7 @@ from rigs.traces import RUN
 
 #: What a launch says when its node runs.
 UP = 'process started with pid'
+DOMAIN = 86
 #: Moves the clock of every Python program of a robot.
 CLOCK = """\
 import os, time
@@ -51,7 +52,7 @@ class Robot:
         return {
             **os.environ, 'HOME': str(self.home), 'XDG_CONFIG_HOME': str(self.home / 'config'),
             'FOGROS2_STATE_HOME': str(self.state), 'ROS_LOG_DIR': str(self.home / 'log'),
-            'ROS_DOMAIN_ID': '86', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'PYTHONPATH': str(self.home),
             'TMPDIR': str(self.home / 'tmp'), 'CHAOS_CLOCK': str(self.clock),
             RUN: f'{os.getpid()}-{self.name}', **self.place.environment}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import gzip
 import json
@@ -14,14 +14,16 @@ import secrets
 import subprocess
 import time
 from typing import Optional
+from urllib.parse import unquote
 
-from figures.places import Container, Ec2, Place, Pod
+from figures.places import Container, Ec2, Host, Place, Pod
 from figures.robots import Robot, robot, UP
 from fogros2.waiting import wait_until
 
 #: Folders of a machine in which files may be new; the rest is its system's.
 FOLDERS = ('etc', 'home', 'root', 'opt', 'run', 'tmp', 'var', 'srv', 'dev/shm')
 LARGEST = 20 << 20
+KINDS = ('argv', 'environ', 'logs', 'store', 'files', 'tags', 'user data')
 Found = Iterator[tuple[str, str, bytes]]
 
 
@@ -49,6 +51,8 @@ def plant(its: Robot) -> dict[str, str]:
     if isinstance(its.place, Pod):
         config = json.loads(Path(its.place.environment['KUBECONFIG']).read_text())
         found['kubernetes'] = config['users'][0]['user']['token']
+    if isinstance(its.place, Host):
+        found['login key'] = its.place.computer.key.read_text().splitlines()[-3]
     return found
 
 
@@ -63,6 +67,7 @@ def own_keys(its: Robot, agent: Path) -> dict[str, str]:
             found['VPN key'] = text.strip()
     config = json.loads((agent / 'config.json').read_text())
     found['heartbeat key'] = config['heartbeat']['key']
+    found["machine's VPN key"] = (agent / 'vpn.key').read_text().strip()
     return found
 
 
@@ -127,6 +132,9 @@ def described(here: Place, name: str) -> Found:
             for each in here.space.all(kind):
                 yield 'tags', kind, json.dumps(each['metadata']).encode()
                 yield 'user data', kind, json.dumps(each).encode()
+        # the commands of each exec are in its address
+        for each in here.nodes.requests('robot'):
+            yield 'logs', 'audit', unquote(each['requestURI']).encode()
 
 
 def scan(here: Place) -> tuple[dict[str, bool], list[str], int]:
@@ -146,7 +154,7 @@ def scan(here: Place) -> tuple[dict[str, bool], list[str], int]:
             run.wait_for(UP, timeout=180.0)
             agent, folder = wait_until(lambda: agent_of(name), timeout=10.0, what='the agent')
             own = own_keys(its, folder)
-            assert len(own) == (2 if isinstance(here, Pod) else 3), own
+            assert len(own) == (3 if isinstance(here, (Pod, Host)) else 4), own
             sources = [
                 *processes(agent), *described(here, name), ('logs', 'output', run.text.encode()),
                 *files('store', its.state, begin), *files('logs', its.home / 'log', begin),
@@ -158,15 +166,16 @@ def scan(here: Place) -> tuple[dict[str, bool], list[str], int]:
             run.kill()
             here.clear(name)
             os.environ.pop('SOME_API_TOKEN')
-    return judge(sources, planted, own, name)
+    # nobody tags a computer that exists already, or hands it user data
+    kinds = KINDS[:5] if isinstance(here, Host) else KINDS
+    return judge(sources, planted, own, name, kinds)
 
 
 def judge(
     sources: list[tuple[str, str, bytes]], planted: Mapping[str, str], own: Mapping[str, str],
-    control: str,
+    control: str, kinds: Sequence[str],
 ) -> tuple[dict[str, bool], list[str], int]:
     """Return what ``scan`` does; the launch's own keys may stand in private files alone."""
-    kinds = ('argv', 'environ', 'logs', 'store', 'tags', 'user data', 'files')
     sees = {kind: any(control.encode() in data for its, _, data in sources if its == kind)
             for kind in kinds}
     leaks = [f'{name} in {kind}: {where}' for kind, where, data in sources

@@ -121,7 +121,7 @@ class CycloneDds(DdsVendor):
         text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
         if '<NetworkInterfaceAddress' in text:
             raise DdsError(
-                "CYCLONEDDS_URI's NetworkInterfaceAddress leaves no place for the VPN",
+                "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
         has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
         listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
@@ -261,8 +261,8 @@ def _check_multicast(listed: Sequence[str]) -> None:
         name = re.search(r'\bname="([^"]*)"', attributes)
         if name and 'multicast="true"' not in attributes and not _has_multicast(name[1]):
             raise DdsError(
-                f'CYCLONEDDS_URI has nodes use {name[1]}, which knows no multicast: they would'
-                ' hear of no machine',
+                f'CYCLONEDDS_URI makes nodes use {name[1]} without multicast, so they would'
+                ' discover no machine',
                 f'write <NetworkInterface name="{name[1]}" multicast="true"/>')
 
 

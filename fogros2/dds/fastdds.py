@@ -83,12 +83,12 @@ class FastDds(DdsVendor):
         """
         if user.get('ROS_DISCOVERY_SERVER'):
             raise DdsError(
-                'ROS_DISCOVERY_SERVER has nodes ask a server alone, which no machine knows',
+                'ROS_DISCOVERY_SERVER makes nodes use only a server that no machine knows',
                 'unset ROS_DISCOVERY_SERVER, or use rmw_cyclonedds_cpp')
         transports = user.get('FASTDDS_BUILTIN_TRANSPORTS', '')
         if transports.upper() not in _REACHABLE:
             raise DdsError(
-                f'FASTDDS_BUILTIN_TRANSPORTS={transports} has nodes that reach no machine',
+                f'with FASTDDS_BUILTIN_TRANSPORTS={transports}, nodes would reach no machine',
                 'unset it: machines speak UDP over IPv4')
         if local_only(user):
             return [DdsInterface(LOOPBACK, 10), DdsInterface(vpn, multicast=True)]
@@ -149,8 +149,8 @@ class FastDds(DdsVendor):
 
     def _locators(self, host: str) -> list[Element]:
         if not _PEER.fullmatch(host):
-            raise DdsError(f"'{host}' is no host that can be asked for nodes",
-                           'write addresses or names, with ; between them')
+            raise DdsError(f"'{host}' of ROS_STATIC_PEERS is no address or host name",
+                           'write addresses or names, separated by ;')
         if host == DISCOVERY_GROUP:
             # the domain's first port, which is Fast DDS's default for multicast
             return [_locator(host, PORT_BASE - 10 + PORTS_PER_DOMAIN * self.domain)]
@@ -204,8 +204,8 @@ def _default_participant(profiles: Element) -> Element:
                     rtps.find('userTransports') is not None
                     or rtps.findtext('useBuiltinTransports', 'true').strip() == 'false'):
                 raise DdsError(
-                    f'the default participant of {VARIABLE} has transports of its own, which leave'
-                    ' no place for the VPN', 'leave userTransports and useBuiltinTransports out')
+                    f'the default participant of {VARIABLE} has its own transports, which'
+                    ' exclude the VPN', 'leave userTransports and useBuiltinTransports out')
             return participant
     return ElementTree.SubElement(
         profiles, 'participant', profile_name='fogros2', is_default_profile='true')

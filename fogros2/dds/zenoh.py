@@ -52,13 +52,13 @@ class Zenoh(DdsVendor):
         """
         if user.get('ZENOH_SESSION_CONFIG_URI'):
             raise DdsError(
-                'ZENOH_SESSION_CONFIG_URI leads nodes past the router that knows the machines',
-                'say in ZENOH_CONFIG_OVERRIDE what shall differ, and unset the other')
+                "ZENOH_SESSION_CONFIG_URI makes nodes bypass the launch's router",
+                'unset it, and set your changes in ZENOH_CONFIG_OVERRIDE')
         override = user.get('ZENOH_CONFIG_OVERRIDE', '')
         if any(word in override for word in ('connect/', 'mode=')):
             raise DdsError(
-                f'ZENOH_CONFIG_OVERRIDE={override} leads nodes past the router that knows the'
-                ' machines', "leave 'connect/' and 'mode' out of it")
+                f"ZENOH_CONFIG_OVERRIDE={override} makes nodes bypass the launch's router",
+                "leave 'connect/' and 'mode' out of it")
         return [DdsInterface(vpn)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:

@@ -28,7 +28,7 @@ def check_names(specs: Sequence[MachineSpec]) -> None:
     for name in names:
         check_name(name)
         if names.count(name) > 1:
-            raise ConfigurationError(f"two machines of this launch are called '{name}'",
+            raise ConfigurationError(f"two machines of this launch have the name '{name}'",
                                      'give each a name= of its own')
 
 

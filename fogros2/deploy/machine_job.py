@@ -109,9 +109,9 @@ class MachineJob:
             # the agent may not have started yet
             agent = 'its agent' if self.first_event else 'its agent, if it has one by now,'
             raise ConnectError(
-                f"'{self.name}' does not answer, so what it has of this launch stays there "
+                f"'{self.name}' does not answer, so parts of this launch stay there "
                 f"({', '.join(dict.fromkeys(self._left))}): {agent} {ends} by itself, "
-                f'{self.spec.robot_timeout:g} s after it last heard of the launch', hint)
+                f'{self.spec.robot_timeout:g} s after the last heartbeat of the launch', hint)
 
         if self._left:
             self.undo.run('left there', left)

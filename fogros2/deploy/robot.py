@@ -71,7 +71,7 @@ def check_sudo(*, ask: bool = False) -> None:
     :raises PrerequisiteError: commands cannot run as root without a prompt.
     """
     if process.which('sudo') is None:
-        raise PrerequisiteError('a VPN interface takes root, and there is no sudo here',
+        raise PrerequisiteError('a VPN interface needs root, and there is no sudo here',
                                 'run the launch as root, or install sudo')
     trouble = process.sudo_trouble()
     if ask and trouble == process.PASSWORD and process.ask_for_ticket('for the VPN interface'):
@@ -80,7 +80,7 @@ def check_sudo(*, ask: bool = False) -> None:
         reason, remedy = trouble
         if Path(helped.HELPER).exists():
             remedy += f', or have an administrator put you into the group {helped.GROUP}'
-        raise PrerequisiteError(f'a VPN interface takes root, and {reason}', remedy)
+        raise PrerequisiteError(f'a VPN interface needs root, and {reason}', remedy)
 
 
 def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:

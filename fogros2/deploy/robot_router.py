@@ -41,7 +41,7 @@ class RobotRouter:
             path := Path(prefix, 'lib', router.package, router.executable), os.X_OK)]
         if not found:
             raise DdsError(
-                f'{router.package} has no {router.executable}, at which nodes would meet',
+                f'{router.package} has no {router.executable}, which connects the nodes',
                 f"sudo apt-get install ros-jazzy-{router.package.replace('_', '-')}")
         config = folder / 'router.json5'
         write_private(config, router.config.encode())

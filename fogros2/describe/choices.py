@@ -137,7 +137,7 @@ def find_cheapest_ec2_instance_type(
     if theirs and ours:
         raise ConfigurationError(
             f"{', '.join(theirs)} can't be combined with {', '.join(ours)}",
-            'say arch, min_cpu, min_memory_gb')
+            'use arch, min_cpu, min_memory_gb')
     ask: Callable[..., str]
     if not ours and isinstance(gpu, (bool, type(None))):
         ask = functools.partial(_type_of_fogros2, **theirs, **_said(gpu=gpu))

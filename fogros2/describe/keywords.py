@@ -45,7 +45,7 @@ def machine_class(provider: str) -> type[CloudInstance]:
     if provider == ROBOT:
         return Robot
     if provider not in plugin_system.names(GROUP):
-        raise ConfigurationError(f"no provider is called '{provider}'",
+        raise ConfigurationError(f"there is no provider '{provider}'",
                                  did_you_mean(provider, providers(), all_too=True))
     found: type[CloudInstance] = plugin_system.load(GROUP, provider)
     return found

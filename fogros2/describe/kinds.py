@@ -56,7 +56,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Keyword]:
     except NameError as error:
         raise ConfigurationError(
             f"{function.__qualname__} can't be called from a text: {error}",
-            'import what its annotations name, not for type checkers alone') from error
+            'import the types of its annotations, not only for type checkers') from error
     parameters = inspect.signature(function).parameters
     return {
         name: Keyword(name, *_kind(hint),

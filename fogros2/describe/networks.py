@@ -55,5 +55,5 @@ def normal(text: str) -> str:
         meant = str(ipaddress.ip_network(text.strip(), strict=False))
     except ValueError as error:
         raise ConfigurationError(f"monitor_allow: '{text}' is no network", _SUCH) from error
-    raise ConfigurationError(f"monitor_allow: '{text}' is an address within a network",
+    raise ConfigurationError(f"monitor_allow: '{text}' is not the address of a network",
                              f"write '{meant}', or the address alone")

@@ -116,7 +116,7 @@ def parse(text: str) -> Override:
     pattern, _, rest = text.partition('=')
     if not pattern.strip() or not rest.strip():
         raise ConfigurationError(
-            f"--machine '{text}' doesn't say which machine runs where",
+            f"--machine '{text}' lacks the name or the provider of a machine",
             f"write planner=container; there are: {', '.join(keywords.providers())}")
     provider, *settings = (part.strip() for part in _parts(rest))
     given: dict[str, Any] = {}

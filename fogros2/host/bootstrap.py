@@ -187,7 +187,7 @@ def ensure(
             wheels = wheel_cache.collect()
         except OSError as error:
             raise PrerequisiteError(
-                f"what '{spec.name}' lacks can't be packed on this computer: {error}",
+                f"the packages for '{spec.name}' can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, chain)
         if todo.install.kind == 'embedded':
@@ -497,7 +497,7 @@ def _why_not_apt(facts: HostFacts) -> str:
     if (facts.system, facts.release) != (APT_SYSTEM, APT_RELEASE):
         return f'ROS 2 {DISTRO} has packages for Ubuntu {APT_RELEASE} alone'
     if not facts.root:
-        return f'installing packages takes root, and {facts.user} has no sudo without a password'
+        return f'installing packages needs root, and {facts.user} has no sudo without a password'
     if facts.free_bytes is not None and facts.free_bytes < APT_BYTES:
         return f'{facts.free_bytes >> 20} MB are free, {APT_BYTES >> 20} are needed'
     return ''

@@ -249,7 +249,7 @@ def node_container(image: str, options: Sequence[str]) -> Container:
     :raises ConfigurationError: they are no such options.
     """
     wrong = ConfigurationError(
-        f"image_options={list(options)} are no options of 'docker run' alone",
+        f"image_options={list(options)} are not only options of 'docker run'",
         "such as ['--gpus=all', '-v', '/data:/data:ro']")
     try:
         container = parse(shlex.join(['docker', 'run', *options, image]))

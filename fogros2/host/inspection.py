@@ -194,7 +194,7 @@ def parse_facts(output: str) -> HostFacts:
         libc=one('libc'), root='root' in found, pythons=tuple(pythons.values()),
         programs=frozenset(found.get('program', ())), ros=dict(split('ros', 2)), rmw=rmw,
         kernel_wireguard='kernel-wireguard' in found,
-        free_bytes=int(disk) * 1024 if disk.isdigit() else None,
+        free_bytes=int(disk) * 1024 if disk.isdecimal() else None,
         routes=tuple(to for to in found.get('route', ()) if to != 'default'),
         network=one('network'), installed=frozenset(found.get('installed', ())),
         environments={path: signature for signature, path in split('environment', 2)},

@@ -205,8 +205,8 @@ def answer(output: str) -> Answer:
                       tuple(map(str, missing)), tuple(filter(None, map(str, missing.values()))))
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise PrerequisiteError(
-            f'no Python there says what it has: {output[-200:]!r}',
-            'is its python3 at least 3.10, and does a login there print nothing?') from error
+            f'no Python of the machine could list its modules: {output[-200:]!r}',
+            'is python3 there at least 3.10, and does a login there print nothing?') from error
 
 
 def copy(there: Answer) -> Optional[Copy]:

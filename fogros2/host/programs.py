@@ -41,7 +41,7 @@ def check_program(
         path.name for prefix in prefixes if Path(prefix, index).is_dir()
         for path in Path(prefix, index).iterdir()}
     raise WorkspaceError(
-        f"no package is called '{package}'",
+        f"there is no package '{package}'",
         _nearest(package, sorted(known)) or 'source the setup.bash of its workspace, or name that '
         'workspace with ros_workspace=')
 

@@ -216,8 +216,8 @@ def plan(
     if not reason:
         if workspace.outside:
             raise WorkspaceError(
-                f'{root}/install has a link to {workspace.outside[0]}, which does not travel',
-                'build without --symlink-install, or move it into the workspace')
+                f'{root}/install has a link to {workspace.outside[0]}, which is not sent',
+                'build without --symlink-install, or move that file into the workspace')
         includes = tuple(_include(workspace.links, root))
         return WorkspacePlan(
             root, str(root), includes,

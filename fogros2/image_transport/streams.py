@@ -72,7 +72,7 @@ def stream(entry: Entry, machine: str) -> Stream:
     known = plugin_system.names(GROUP)
     if entry.transport not in known:
         raise ConfigurationError(
-            f"{entry.topic}: no image transport is called '{entry.transport}'",
+            f"{entry.topic}: there is no image transport '{entry.transport}'",
             did_you_mean(entry.transport, known, all_too=True))
     if entry.direction not in ('to_cloud', 'to_robot'):
         raise ConfigurationError(f"{entry.topic}: direction '{entry.direction}' is unknown",

@@ -92,8 +92,8 @@ def _check_plugin(user: str, settings: Any) -> None:
         plugin = (each.get('user') or {}).get('exec') if each.get('name') == user else None
         if plugin:
             raise PrerequisiteError(
-                f"'{plugin.get('command')}', by which the kubeconfig logs '{user}' in, gave no "
-                'credentials', ' '.join(str(plugin.get('installHint') or '').split())
+                f"'{plugin.get('command')}', the login program of the kubeconfig for '{user}', "
+                'returned no credentials', ' '.join(str(plugin.get('installHint') or '').split())
                 or 'is it installed, and are you logged in? `kubectl get pods` asks the same')
 
 

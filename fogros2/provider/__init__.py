@@ -10,7 +10,7 @@ file's options), this module, then a module or package for each provider:
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import threading
@@ -138,9 +138,8 @@ class Provider(abc.ABC):
         if not self.capabilities.containers:
             raise Unsupported(
                 f"'{spec.name}' can't run containers: a machine of the provider '{self.name}' "
-                "hasn't the rights that an engine takes",
-                'run them on an EC2 instance, a computer that is reached by SSH or in a '
-                'container machine')
+                'lacks the rights that an engine needs',
+                'run them on an EC2 instance, an SSH host or a container machine')
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         """
@@ -276,11 +275,13 @@ class Provider(abc.ABC):
         """
         raise Unsupported(f"provider '{self.name}' can't start a machine")
 
-    def tidy(self) -> list[str]:
+    def tidy(self, dead: Collection[str] = ()) -> list[str]:
         """
         Delete the remains of machines that ended by themselves; describe them for people.
 
         Resources of a machine that exists, or that is being created, stay.
+
+        :param dead: tokens of requests (``CreateRequest``) whose launches have died.
         """
         return []
 
@@ -324,7 +325,7 @@ class Provider(abc.ABC):
 
         :raises Unsupported: the provider's host key needs no replacement.
         """
-        raise Unsupported(f"provider '{self.name}' hands no host key over at boot")
+        raise Unsupported(f"provider '{self.name}' has no one-time host keys")
 
     # -- images ---------------------------------------------------------------------------------
 

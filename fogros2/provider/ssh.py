@@ -52,7 +52,7 @@ class Options:
                 or options.host.startswith('-') or not _is_name(options.host):
             raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",
                                      'host= takes a name or an address')
-        if not options.port.isdigit() or not 0 < int(options.port) < 65536:
+        if not options.port.isdecimal() or not 0 < int(options.port) < 65536:
             raise ConfigurationError(f"'{options.port}' can't be the port of an SSH machine",
                                      'port= takes a number from 1 to 65535')
         if options.host_key and len(options.host_key.split()) < 2:

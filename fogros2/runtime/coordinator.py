@@ -287,7 +287,7 @@ class Coordinator:
             self._set_dds_environment()
             self.begin()
         elif session.requested != spec:
-            raise ConfigurationError(f"two machines of this launch are called '{spec.name}'",
+            raise ConfigurationError(f"two machines of this launch have the name '{spec.name}'",
                                      'give each a name= of its own')
         session.add(machine)
         return session

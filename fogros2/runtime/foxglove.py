@@ -51,7 +51,7 @@ def on_machine(
         provider.check_containers(session.spec)
         options += ['--image', image]
     if allow:
-        options += ['--guarded', str(addresses.gate_port(port)), *(
+        options += ['--public', str(addresses.gate_port(port)), *(
             argument for network in allow for argument in ('--allow', network))]
     process = AddedProcess(_bridge(session.spec.name, port, topics, options))
     return process, _once_started(process, lambda: _report(session, port, allow))

@@ -94,10 +94,10 @@ class RemoteRun:
             # nothing runs, so no exit will be reported
             self.end()
             return
-        self._context.asyncio_loop.call_later(self._patience, self.give_up)
+        self._context.asyncio_loop.call_later(self._timeout, self.give_up)
 
     @property
-    def _patience(self) -> float:
+    def _timeout(self) -> float:
         """Seconds until the machine has to have ended the process and reported it."""
         return self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
 
@@ -129,7 +129,7 @@ class RemoteRun:
             return
         self._moving = True
         if stop and self._session.stop(self) and not self.respawning:
-            self._context.asyncio_loop.call_later(self._patience, self._arrive)
+            self._context.asyncio_loop.call_later(self._timeout, self._arrive)
         else:
             self._arrive()
 

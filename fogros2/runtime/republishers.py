@@ -64,7 +64,7 @@ def _substitutions(text: Text) -> list[Substitution]:
         (kind, package), = part.items()
         if kind not in _PACKAGE_PATHS:
             raise ConfigurationError(
-                f"an image transport's node names a {kind} that travels",
-                'give its settings as parameters')
+                f"an image transport's node uses a {kind}, which can't be sent to a machine",
+                'pass its settings as parameters')
         found.append(_PACKAGE_PATHS[kind](package))
     return found

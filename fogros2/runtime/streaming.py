@@ -185,7 +185,7 @@ def _compare(one: Stream, other: Stream) -> None:
         if host == end:
             raise ConfigurationError(
                 f'{one.topic} is streamed both from {_host(host)} and to it',
-                'what comes in under that name would go out again: rename one of the two')
+                'images that arrive would be sent back: rename one of the two topics')
     if (one.source, one.target) == (other.source, other.target) and (
             one.transport != other.transport or one.options != other.options):
         raise ConfigurationError(

@@ -68,4 +68,4 @@ def parse(output: str) -> str:
         key = ' '.join(line.split()[:2])
         if _KEY.fullmatch(key):
             return key
-    raise HostKeyError(f'the machine made no host key, but said {output[:80]!r}')
+    raise HostKeyError(f'the machine returned no host key, but {output[:80]!r}')

@@ -295,7 +295,7 @@ def _explained(
     if known and 'host key' in text.lower() or 'ncompatible ssh peer (no acceptable host' in text:
         return HostKeyError(
             f"'{name}' ({endpoint.host}) has no host key of the type that is known",
-            'another machine answers there, or it was set up anew')
+            'another machine answers there, or the machine was reinstalled')
     where = f"'{name}' ({endpoint.host} port {endpoint.port})"
     if 'banner' in text or isinstance(error, EOFError):
         return ConnectError(f'{where} does not answer as an SSH server',

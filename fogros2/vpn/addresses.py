@@ -61,7 +61,7 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
             return str(candidate)
     raise VpnError(
         f'no /{PREFIX} of {pool} is free for the VPN',
-        f'{POOL_VARIABLE}=10.213.0.0/16 takes another pool')
+        f'{POOL_VARIABLE}=10.213.0.0/16 names another range')
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
@@ -134,7 +134,7 @@ def _pool(text: str) -> _Network:
             f"'{text}' is no IPv4 network: {error}", f'{POOL_VARIABLE} is like {POOL}') from error
     if network.prefixlen > PREFIX:
         raise ConfigurationError(
-            f"'{text}' holds no /{PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
+            f"'{text}' is smaller than a /{PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
     return network
 
 

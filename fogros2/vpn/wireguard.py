@@ -451,11 +451,11 @@ def _check(peer: Peer) -> None:
     try:
         ipaddress.IPv4Address(peer.address)
     except ValueError as error:
-        raise VpnError(f'{peer.name} has no VPN address: {error}') from error
+        raise VpnError(f'the VPN address of {peer.name} is invalid: {error}') from error
     if not _KEY.fullmatch(peer.public_key):
-        raise VpnError(f'{peer.name} has no WireGuard key, but {peer.public_key[:50]!r}')
+        raise VpnError(f'the WireGuard key of {peer.name} is invalid: {peer.public_key[:50]!r}')
     if peer.endpoint is not None and not _ENDPOINT.fullmatch(peer.endpoint):
-        raise VpnError(f'{peer.name} has no endpoint host:port, but {peer.endpoint[:50]!r}')
+        raise VpnError(f'the endpoint of {peer.name} is not host:port: {peer.endpoint[:50]!r}')
 
 
 def _noted(interface: VpnInterface) -> str:

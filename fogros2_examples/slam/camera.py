@@ -40,7 +40,7 @@ from fogros2_examples.slam.sources import Pixels, Shot
 from fogros2_examples.slam.tum import DatasetError
 
 #: Time-out of the last poses and of the path, in seconds.
-PATIENCE = 5.0
+TIMEOUT = 5.0
 #: Minimum number of poses for an error.
 FEWEST = 3
 #: Limits of the size in pixels: ORB needs a margin of 31, codecs accept no larger images.
@@ -112,13 +112,13 @@ class SlamCamera(Node):
             return
         if self.patient and len(self.sent) >= self.ahead:
             before, when = next(islice(reversed(self.sent.items()), self.ahead - 1, None))
-            if before not in self.answered and time.perf_counter() - when < PATIENCE / 2:
+            if before not in self.answered and time.perf_counter() - when < TIMEOUT / 2:
                 return
         if not self.next.done():
             return  # the disk is slower than the frame rate
         shot = self.next.result()
         if shot is None:
-            self.deadline = time.monotonic() + PATIENCE
+            self.deadline = time.monotonic() + TIMEOUT
             return
         self.next = self._read()
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.frame_id)

@@ -23,8 +23,8 @@ from image_transport_h264.message import KEY_REQUEST, picture
 from image_transport_h264.picture import Picture
 
 #: Seconds between two pictures of an image topic (IMAGE) and of a stream between machines
-#: (STREAM), and seconds without a picture after which the camera subscribes again (PATIENCE).
-IMAGE, STREAM, PATIENCE = 1.0, 5.0, 5.0
+#: (STREAM), and seconds without a picture after which the camera subscribes again (TIMEOUT).
+IMAGE, STREAM, TIMEOUT = 1.0, 5.0, 5.0
 #: Seconds by which a picture may be early, and seconds between two requests for a keyframe.
 SLACK, REQUEST = 0.25, 0.3
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=4,
@@ -59,7 +59,7 @@ class Camera:
         """
         self._stay = stay
         now = time.monotonic()
-        if self._subscription is not None and now - self._asked > PATIENCE:
+        if self._subscription is not None and now - self._asked > TIMEOUT:
             self.close()  # the publisher of this subscription may be gone
         if now - self._asked > self.interval - SLACK:
             if self._subscription is None:

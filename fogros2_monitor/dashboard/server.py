@@ -29,7 +29,7 @@ from fogros2_monitor import accounts
 #: The header with the token.
 HEADER = 'X-Fogros2-Token'
 #: Seconds to wait for a new state, idle time-out of a client in seconds, largest request in bytes.
-PATIENCE, SILENCE, MOST = 15.0, 60.0, 10_000
+TIMEOUT, SILENCE, MOST = 15.0, 60.0, 10_000
 _REFUSAL = ('the token is missing or wrong: open the address that `ros2 fog dashboard` has '
             'printed')
 PAGE = Path(__file__).with_name('page.html')
@@ -156,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path == '/':
             self._send(self.server.dashboard.page, 'text/html; charset=utf-8')
         elif path == '/api/state':
-            self._json(source.state(_number(query, 'after', -1), PATIENCE))
+            self._json(source.state(_number(query, 'after', -1), TIMEOUT))
         elif path == '/api/log':
             self._json(source.log(query.get('machine', ''), _number(query, 'after', 0)))
         elif path == '/api/picture':
@@ -170,13 +170,16 @@ class _Handler(BaseHTTPRequestHandler):
     def _post(self, path: str, query: dict[str, str]) -> None:
         if path != '/api/delete':
             raise _Refused(HTTPStatus.NOT_FOUND, 'there is no such page')
-        length = self.headers.get('Content-Length', '')
-        if not length.isdigit() or int(length) > MOST:
+        try:
+            length = int(self.headers.get('Content-Length', ''))
+        except ValueError:
+            length = -1
+        if not 0 <= length <= MOST:
             raise _Refused(HTTPStatus.BAD_REQUEST, 'the request needs a length, and a small one')
         if self.headers.get_content_type() != 'application/json':
             raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, 'the request must be JSON')
         try:
-            request = json.loads(self.rfile.read(int(length)))
+            request = json.loads(self.rfile.read(length))
         except (ValueError, RecursionError):
             request = None
         if not isinstance(request, dict) or not isinstance(request.get('name'), str):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contexts, nodes, topics, services, timers, clocks."""
 
+import contextlib
 import importlib.util
 import os
 import signal
@@ -464,6 +465,24 @@ def test_durations_and_times_are_calculated():
         Time(seconds=-1)
 
 
+@contextlib.contextmanager
+def repeated(call, values):
+    """Call with a value every 50 ms during the block: the first may come before anybody sleeps."""
+    awake = threading.Event()
+
+    def work():
+        for value in values:
+            if awake.wait(0.05):
+                return
+            call(value)
+
+    threading.Thread(target=work).start()
+    try:
+        yield
+    finally:
+        awake.set()
+
+
 def test_clock_sleeps_in_steady_and_simulated_time(context):
     assert isinstance(Clock(clock_type=ClockType.ROS_TIME), ROSClock)
     steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -474,21 +493,11 @@ def test_clock_sleeps_in_steady_and_simulated_time(context):
     simulated._set_ros_time_is_active(True)
     simulated.set_ros_time_override(Time(seconds=5, clock_type=ClockType.ROS_TIME))
     assert simulated.now().nanoseconds == 5_000_000_000
-    until = Time(seconds=6, clock_type=ClockType.ROS_TIME)
-    threading.Timer(0.05, simulated.set_ros_time_override, [until]).start()
-    assert simulated.sleep_until(until, context)
-
-    awake = threading.Event()
-
-    def switch() -> None:
-        for active in 300 * (False, True):  # the first may come before anybody sleeps
-            if awake.wait(0.05):
-                return
-            simulated._set_ros_time_is_active(active)
-
-    threading.Thread(target=switch).start()
-    assert not simulated.sleep_for(Duration(seconds=60), context)
-    awake.set()
+    times = [Time(seconds=number, clock_type=ClockType.ROS_TIME) for number in range(6, 606)]
+    with repeated(simulated.set_ros_time_override, times):
+        assert simulated.sleep_until(times[0], context)
+    with repeated(simulated._set_ros_time_is_active, 300 * (False, True)):
+        assert not simulated.sleep_for(Duration(seconds=60), context)
 
 
 def test_simulated_clock_drives_time_and_timers(world):

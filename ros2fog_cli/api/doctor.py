@@ -52,7 +52,7 @@ class Check:
 #: Providers that have checks of their own.
 _LOOKED_AT = ('container', 'ssh')
 #: Time-out of a provider's answer, in seconds.
-PATIENCE = 8.0
+TIMEOUT = 8.0
 
 
 def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[Check]:
@@ -73,7 +73,7 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
         return list(pool.map(lambda check: check(), checks))
 
 
-def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> Check:
+def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Check:
     """Check that a provider's SDK is installed, and that the provider accepts our credentials."""
     title = f"provider '{name}'"
     wrong: Verdict = 'failed' if needed else 'warning'
@@ -81,21 +81,21 @@ def provider(name: str, *, needed: bool = False, patience: float = PATIENCE) -> 
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
         if not needed and not kind.configured():
             return Check(title, 'ok', 'not set up here')
-        said = _in_time(lambda: kind().answers(), patience)
+        said = _in_time(lambda: kind().answers(), timeout)
     except Unsupported:
         return Check(title, 'ok', 'is there')
     except FogError as error:
         return Check(title, wrong, str(error.args[0]), error.hint)
     if said is None:
-        return Check(title, wrong, f'no answer within {patience:g} s',
+        return Check(title, wrong, f'no answer within {timeout:g} s',
                      'is there a way to the internet, and through a proxy?')
     return Check(title, 'ok', said)
 
 
-def _in_time(ask: Callable[[], str], patience: float) -> Optional[str]:
-    """Call ``ask`` and return its answer, or None after ``patience`` seconds."""
+def _in_time(ask: Callable[[], str], timeout: float) -> Optional[str]:
+    """Call ``ask`` and return its answer, or None after ``timeout`` seconds."""
     over = threading.Event()
-    timer = threading.Timer(patience, over.set)
+    timer = threading.Timer(timeout, over.set)
     timer.start()
     try:
         return cancellable(ask, over, what='asking a provider', grace=lambda: 0.0)

@@ -87,9 +87,11 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         record = entry.record
         if record is None:
             return
+        # The machine deleted itself, or was never created; its resources may still exist.
         if entry.machine is None and entry.asked and record.machine_id is not None:
-            # The machine deleted itself; resources that belong to it may still exist.
             machines.load(record.provider).destroy(record.machine_id)
+        elif entry.machine is None and entry.asked and record.token:
+            machines.load(record.provider).tidy(dead=[record.token])
         if record.damage:
             store.delete(record.name)
             return

@@ -131,7 +131,7 @@ class Follower:
             # Reading the state must not open a port.
             inside = reach.through_vpn(entry, to)
             if inside is None:
-                raise ConnectError(f"'{entry.name}' isn't in reach through the VPN")
+                raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
             to = inside
         shell = shells.connect(to, name=entry.name, timeout=10.0)
         undo.callback(shell.close)

@@ -20,7 +20,7 @@ from fogros2_monitor import GRAPH
 from ros2fog_cli.api import reach
 
 #: Seconds before an ended program is restarted, and time-out of a program's end in seconds.
-AGAIN, PATIENCE = 10.0, 5.0
+AGAIN, TIMEOUT = 10.0, 5.0
 
 
 class Graph:
@@ -73,7 +73,7 @@ class Graph:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         try:
-            self._process.wait(PATIENCE)
+            self._process.wait(TIMEOUT)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

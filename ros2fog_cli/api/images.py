@@ -16,7 +16,7 @@ from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
 
 #: Time-out of an image's creation in seconds; a large disk takes long.
-PATIENCE = 3600.0
+TIMEOUT = 3600.0
 #: Longest poll interval in seconds; each poll asks all regions.
 LOOK = 10.0
 READY, FAILED = 'available', ('failed', 'error', 'invalid')
@@ -54,7 +54,7 @@ def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:
     if entry.machine is None or entry.machine.state not in (
             MachineState.RUNNING, MachineState.STOPPED):
         raise ConfigurationError(f"no image can be made of '{entry.name}': it is {entry.state}",
-                                 'it has to run, or to be stopped')
+                                 'the machine has to be running or stopped')
     if not name:
         stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime(now))
         name = f'{entry.name}-image-{stamp}'
@@ -64,7 +64,7 @@ def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:
 
 
 def wait(
-    baking: Baking, *, timeout: float = PATIENCE,
+    baking: Baking, *, timeout: float = TIMEOUT,
     look: Callable[[str, float], None] = lambda state, seconds: None,
 ) -> Image:
     """

@@ -21,7 +21,7 @@ from fogros2.store import Record, Store
 from ros2fog_cli.api import reach
 
 #: Seconds to wait for a command's end after each signal.
-PATIENCE = 3.0
+TIMEOUT = 3.0
 
 
 def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
@@ -34,7 +34,7 @@ def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
     variables = reach.robot_environment(record, store)
     if variables is None:
         raise ConfigurationError(f"no launch is running with the machine '{name}'",
-                                 'its nodes can be joined while one is')
+                                 'join its nodes while a launch runs')
     return record, variables
 
 
@@ -126,5 +126,5 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL):
         child.send_signal(number)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(PATIENCE)
+            child.wait(TIMEOUT)
             return

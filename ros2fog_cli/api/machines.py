@@ -100,7 +100,7 @@ class Entry:
         if self._known.state is MachineState.STOPPED:
             return None
         tag = self._known.tags.get(TAG_EXPIRES, '')
-        known = [float(tag)] if tag.isdigit() else []
+        known = [float(tag)] if tag.isdecimal() else []
         record = self.record
         if record is not None and record.armed:
             # If a launch reused the machine, this is later than the tag of the creation.

@@ -24,7 +24,7 @@ from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
 #: Time-out of the answer of the machine's gate, in seconds.
-_PATIENCE = 15.0
+_TIMEOUT = 15.0
 
 
 @contextlib.contextmanager
@@ -47,7 +47,7 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
 
 def has_application(port: int, token: str) -> bool:
     """Return whether the gate at a loopback port serves the web application."""
-    connection = http.client.HTTPConnection('localhost', port, timeout=_PATIENCE)
+    connection = http.client.HTTPConnection('localhost', port, timeout=_TIMEOUT)
     with contextlib.closing(connection):
         try:
             connection.request('GET', f'/?{urllib.parse.urlencode({"token": token})}')
@@ -64,7 +64,7 @@ def on_robot(name: str) -> Optional[tuple[int, str]]:
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])
         with contextlib.suppress(OSError), socket.create_connection(
-                ('127.0.0.1', port), timeout=_PATIENCE):
+                ('127.0.0.1', port), timeout=_TIMEOUT):
             return port, path.read_text().strip()
     return None
 
@@ -93,7 +93,7 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
     record = entry.record
     if record is None or not record.monitor or not record.launch_alive or not record.agent:
         raise AgentError(f"no launch of this robot serves the topics of '{entry.name}' now",
-                         'ros2 fog list shows whose it is')
+                         'ros2 fog list shows the robot of the machine')
     if not record.monitor_open:
         raise ConfigurationError(
             f"only this robot may watch '{entry.name}'",
@@ -108,7 +108,7 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
 def _read(entry: Entry, shell: Shell, words: tuple[str, ...]) -> str:
     try:
         return shell.run(Command(words, sudo=True, what='read the token'),
-                         timeout=_PATIENCE).stdout.strip()
+                         timeout=_TIMEOUT).stdout.strip()
     except CommandError as error:
         raise AgentError(f"'{entry.name}' has no token yet, or can't make one: {error}",
                          f'ros2 fog logs {entry.name}') from error

@@ -99,14 +99,14 @@ def firewalled(entry: Entry) -> bool:
 
 
 def through_vpn(
-    entry: Entry, to: Endpoint, patience: float = 1.5,
+    entry: Entry, to: Endpoint, timeout: float = 1.5,
 ) -> Optional[Endpoint]:
-    """Return an endpoint in the VPN, None if it does not answer within ``patience`` seconds."""
+    """Return an endpoint in the VPN, None if it does not answer within ``timeout`` seconds."""
     record = entry.record
     if record is None or record.vpn is None or not record.launch_alive:
         return None
     try:
-        socket.create_connection((record.vpn.address, to.port), timeout=patience).close()
+        socket.create_connection((record.vpn.address, to.port), timeout=timeout).close()
     except OSError:
         return None
     return dataclasses.replace(to, host=record.vpn.address)
@@ -154,11 +154,11 @@ def agent(entry: Entry, to: Shell) -> AgentClient:
     """
     record = entry.record
     if let_go(entry):
-        raise AgentError(f"nothing of a launch runs on '{entry.name}': it is kept for the next "
-                         'one, and the agent of the last one has left with its log')
+        raise AgentError(f"no launch runs on '{entry.name}': the machine is kept for the next "
+                         'launch, and the agent of the last one has ended with its log')
     if record is None or not record.agent or not record.agent_program:
-        raise AgentError(f"this robot knows of no agent on '{entry.name}'",
-                         'only the robot that launched it does')
+        raise AgentError(f"this robot has no record of an agent on '{entry.name}'",
+                         'only the robot that launched the machine has one')
     return AgentClient(to, record.agent, agent_path=record.agent_program, python=record.python)
 
 

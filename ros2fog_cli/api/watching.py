@@ -19,7 +19,7 @@ from ros2fog_cli.api import reach, screen
 from ros2fog_cli.api.live import Live, PRESENT
 
 #: Time-out of the measurement of stream rates, in seconds.
-PATIENCE = 10.0
+TIMEOUT = 10.0
 _WAITING = 'no such machine yet'
 
 
@@ -65,14 +65,14 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
         found[:] = [one for one in live.state().get('streams', [])
                     if name in (one['source'], one['target'])]
         # Discovery takes time: a stream without subscribers may have one that is not known yet.
-        settled = time.monotonic() - begin > PATIENCE / 2
+        settled = time.monotonic() - begin > TIMEOUT / 2
         return bool(found) and all(
             one['rate'] is not None or settled and one['note'] for one in found)
 
     live.start()
     try:
         with contextlib.suppress(DeadlineExceeded):
-            wait_until(measured, timeout=PATIENCE, what='the rates of streams')
+            wait_until(measured, timeout=TIMEOUT, what='the rates of streams')
     finally:
         live.close()
     return found

@@ -59,7 +59,7 @@ class ImageVerb(VerbExtension):
                                          'ros2 fog image list shows them')
             return _delete(args, rest)
         if args.image_name and rest:
-            raise ConfigurationError('--image-name names the image of one machine alone',
+            raise ConfigurationError('--image-name is for the image of one machine',
                                      'leave it out, or make one image at a time')
         return max(_make(args, name) for name in [first, *rest])
 

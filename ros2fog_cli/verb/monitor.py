@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ros2fog_cli.api.machines import Entry
 
 #: Seconds to wait for a browser that opens the page of this computer's own bridge.
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 
 class MonitorVerb(VerbExtension):
@@ -75,7 +75,7 @@ def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     from ros2fog_cli.api.browser import browser_at
     page = say(f'{name} is at {{}}; in a browser:', host_port('localhost', port), token)
     with browser_at(page, start=browser) as came:
-        came.wait(PATIENCE)
+        came.wait(TIMEOUT)
     return 0
 
 

@@ -36,7 +36,7 @@ class StatusVerb(VerbExtension):
         if args.watch:
             from ros2fog_cli.api.watching import watch
             if not 0.1 <= args.interval <= 3600:
-                raise ConfigurationError(f'--interval {args.interval:g} makes no sense',
+                raise ConfigurationError(f'--interval {args.interval:g} is out of range',
                                          'give 0.1 to 3600 seconds')
             return watch(args.name, interval=args.interval, regions=args.region,
                          as_json=args.json, topics=args.topics)

@@ -11,6 +11,7 @@ from importlib import metadata
 import ipaddress
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import uuid
 
 import pytest
 
+from fogros2 import process
 from fogros2.agent_client import joined
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
@@ -25,12 +27,12 @@ from fogros2.process import run, which
 from fogros2.provider.container import debian_root
 from fogros2.provider.container import root as container_root
 from rigs.cluster import images as cluster_images
+from rigs.container_machines import cloud_network, engine
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
 
-#: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
-#: the tests may meet on one computer.
-SUBNETS = [f'198.51.100.{host}/28' for host in range(0, 256, 16)]
+__all__ = ['cloud_network', 'engine']
+
 #: Stands for ROS 2 without Cyclone DDS, and for the package manager that brings it.
 ROS = {
     'usr/bin/apt-get': """#!/bin/sh
@@ -78,6 +80,7 @@ def no_dds_of_others() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ('CYCLONEDDS_URI', 'RMW_IMPLEMENTATION'):
             patch.delenv(name, raising=False)
+            patch.delitem(process._ENVIRONMENT, name, raising=False)
         yield
 
 
@@ -90,6 +93,14 @@ def own_domain(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(RUN, f'{os.getpid()}-{domain}')
 
 
+@pytest.fixture(autouse=True)
+def no_filter_left() -> Iterator[None]:
+    """Remove the DDS filter of this process that a failed test left: it would fail others."""
+    yield
+    for name in re.findall(r'/(fog[0-9a-f]{6})\b', Path('/proc/self/cgroup').read_text()):
+        run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=10, check=False)
+
+
 @pytest.fixture
 def nothing_left(
     state_home: Path, root: None, own_domain: None, tmp_path_factory: pytest.TempPathFactory,
@@ -98,29 +109,6 @@ def nothing_left(
     traces = Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
     with nothing_left_of(traces, timeout=10.0):
         yield
-
-
-@pytest.fixture(scope='session')
-def engine(tun: None) -> str:
-    """Skip where no podman runs containers."""
-    if which('podman') is None:
-        pytest.skip('needs podman')
-    return 'podman'
-
-
-@pytest.fixture(scope='session')
-def cloud_network(engine: str) -> Iterator[str]:
-    """Return a container network without a way out, for the time of the tests."""
-    name = f'fogt{uuid.uuid4().hex[:8]}'
-    for subnet in SUBNETS:
-        made = run(Command((engine, 'network', 'create', '--internal', '--subnet', subnet, name),
-                           sudo=True), timeout=60, check=False)
-        if made.returncode == 0:
-            break
-    else:
-        pytest.fail(f'no subnet for the tests is free: {made.stderr}')
-    yield name
-    run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
 
 
 @pytest.fixture(scope='session')

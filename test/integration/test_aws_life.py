@@ -315,6 +315,16 @@ def test_tidy_deletes_leftovers_but_no_machine_in_creation(aws, monkeypatch):
     assert len(left()['groups']) == 1
 
 
+def test_tidy_deletes_a_dead_launch_s_group_at_once(aws):
+    spec, request = ask()
+    gone = aws.provider.create(spec, request)
+    ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
+    alive = aws.provider.create(*(mapper := ask('mapper')))
+    assert aws.provider.tidy(dead=[request.token, mapper[1].token]) == [
+        f"security group and key of 'planner' in {HOME}"]
+    assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
+
+
 def test_find_takes_at_most_two_calls_per_region(aws, monkeypatch):
     here = aws.provider.create(*ask('planner', region=HOME))
     there = aws.provider.create(*ask('mapper', region=AWAY))

@@ -144,7 +144,7 @@ def test_invalid_name_is_refused(refused, cloud_network):
 
 def test_unknown_package_is_refused(refused, cloud_network):
     error, text = refused(container(cloud_network), package='fogros2_exmples')
-    assert "no package is called 'fogros2_exmples'" in error
+    assert "there is no package 'fogros2_exmples'" in error
     assert "did you mean 'fogros2_examples'?" in error
     assert nothing_was_made(text)
 
@@ -174,7 +174,7 @@ def test_two_machines_of_one_name_are_refused(refused, cloud_network, write):
         f'    from launch import LaunchDescription\n'
         f'    return LaunchDescription([CloudNode(machine=m, package="fogros2_examples", '
         f'executable="talker") for m in (machine, other)])')
-    assert f"two machines of this launch are called '{NAME}'" in error
+    assert f"two machines of this launch have the name '{NAME}'" in error
     assert nothing_was_made(text)
 
 
@@ -198,7 +198,7 @@ def test_unknown_middleware_is_refused(refused, cloud_network):
     error, text = refused(
         f'{container(cloud_network)}\n    import os\n'
         f"    os.environ['RMW_IMPLEMENTATION'] = 'rmw_connextdds'")
-    assert 'RMW_IMPLEMENTATION=rmw_connextdds is none that FogROS2 can lead' in error
+    assert 'FogROS2 does not support RMW_IMPLEMENTATION=rmw_connextdds' in error
     assert 'rmw_cyclonedds_cpp' in error
     assert nothing_was_made(text)
 
@@ -249,7 +249,7 @@ def test_missing_root_is_reported(write, cloud_network):
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             env={**os.environ, 'HOME': own, 'ROS_LOG_DIR': own, 'FOGROS2_STATE_HOME': own})
     error, text = one_error(done.returncode, done.stdout)
-    assert 'a VPN interface takes root' in error and 'sudo' in error
+    assert 'a VPN interface needs root' in error and 'sudo' in error
     assert nothing_was_made(text)
 
 
@@ -291,14 +291,14 @@ def test_changed_host_key_is_refused(refused, computer):
     error, text = refused(ssh(computer, host_key=' '.join(other)))
     assert 'another host key than the pinned one' in error
     assert computer.host_key in error
-    assert f'{NAME}: guard' not in text
+    assert f'{NAME}: watchdog' not in text
 
 
 def test_unknown_host_key_is_refused(refused, computer):
     error, text = refused(ssh(computer, host_key=None))
     assert f"the host key of '{NAME}' ({computer.address}) is unknown" in error
     assert f'known_hosts: {computer.address} {computer.host_key}' in error
-    assert f'{NAME}: guard' not in text
+    assert f'{NAME}: watchdog' not in text
 
 
 def test_refused_login_key_is_reported(refused, computer, tmp_path):

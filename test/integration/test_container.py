@@ -27,105 +27,20 @@ from fogros2.errors import (
     ShellError,
     Unsupported,
 )
-from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
+from fogros2.model import Command, MachineState
 from fogros2.provider.container import ContainerProvider
-from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container import root as container_root
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ProviderContract
 from fogros2.waiting import wait_until
+from rigs.container_machines import cloud, key
+
+__all__ = ['cloud', 'key']
 
 pytestmark = [
     pytest.mark.usefixtures('engine'),
     pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)'),
 ]
-
-
-@pytest.fixture
-def key(tmp_path: Path) -> Path:
-    path = tmp_path / 'id'
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(path))),
-                timeout=10.0)
-    return path
-
-
-@dataclasses.dataclass
-class Cloud:
-    """What the tests do with machines."""
-
-    provider: ContainerProvider
-    key: Path
-    options: dict[str, object]
-    ids: list[str]
-    names: list[str]
-
-    def traces(self) -> list[str]:
-        """Return what is left of the machines on this computer."""
-        def lines(*words: str) -> list[str]:
-            return process.run(Command(words, sudo=True), timeout=30.0,
-                               check=False).stdout.split()
-
-        mounts = Path('/proc/self/mountinfo').read_text()
-        parts = [machine_id.split(':') for machine_id in self.ids]
-        return [
-            *(n for n in lines('podman', 'ps', '-a', '--format', '{{.Names}}')
-              if n in [f'fogros2-{name}' for name in self.names]),
-            *(t for t in lines('ls', str(container_machine.ROOTS)) if t in [p[2] for p in parts]),
-            *(p[1] for p in parts if p[1] in mounts)]
-
-    def create(self, spec: MachineSpec, **changes: object) -> str:
-        request = CreateRequest(**{
-            'token': str(uuid.uuid4()), 'authorized_key': self.key.with_suffix('.pub').read_text(),
-            'tags': {'fogros2-name': spec.name}, 'vpn_port': 51820, **changes})  # type: ignore
-        self.ids.append(self.provider.create(spec, request))
-        return self.ids[-1]
-
-    def spec(self, **changes: object) -> MachineSpec:
-        name = f't{uuid.uuid4().hex[:6]}'
-        self.names.append(name)
-        options = {**self.options, **changes.pop('options', {})}  # type: ignore
-        return MachineSpec(name, 'container', options, **changes)  # type: ignore
-
-    def reached(self, machine_id: str) -> Machine:
-        def look() -> Machine | None:
-            machine = self.provider.describe(machine_id)
-            return machine if machine.shell else None
-        return wait_until(look, timeout=20.0, what='the machine')
-
-    @contextlib.contextmanager
-    def shell(self, machine: Machine, user: str = '') -> Iterator[SSHShell]:
-        assert machine.shell is not None
-        endpoint = dataclasses.replace(machine.shell, key_file=str(self.key))
-        if user:
-            endpoint = dataclasses.replace(endpoint, user=user)
-        shell = SSHShell(endpoint, name=machine.name, timeout=5.0)
-
-        def answers() -> bool:
-            with contextlib.suppress(ShellError):
-                return shell.run(Command(('true',)), timeout=5.0).returncode == 0
-            return False
-
-        try:
-            if not user:
-                wait_until(answers, timeout=20.0, what='the SSH server')
-            yield shell
-        finally:
-            shell.close()
-
-    @contextlib.contextmanager
-    def machine(self, **changes: object) -> Iterator[tuple[Machine, SSHShell]]:
-        machine = self.reached(self.create(self.spec(**changes)))
-        with self.shell(machine) as shell:
-            yield machine, shell
-
-
-@pytest.fixture
-def cloud(cloud_network: str, key: Path) -> Iterator[Cloud]:
-    made = Cloud(ContainerProvider(), key, {'network': cloud_network}, [], [])
-    yield made
-    for machine_id in made.ids:
-        made.provider.destroy(machine_id)
-    wait_until(lambda: not made.traces(), timeout=10.0, what='all traces to be gone')
 
 
 class TestContainerProvider(ProviderContract):
@@ -258,10 +173,7 @@ def test_the_end_command_ends_it_for_good(cloud):
             return False
 
         wait_until(gone, timeout=10.0, what='the machine to end')
-        root = container_machine.directory(machine.id.split(':')[2])
-        wait_until(lambda: process.run(
-            Command(('test', '-e', str(root)), sudo=True), timeout=10.0, check=False).returncode,
-            timeout=10.0, what='its root to go')
+        wait_until(lambda: not cloud.traces(), timeout=10.0, what='its root and filter to go')
         cloud.provider.destroy(machine.id)
 
 
@@ -301,6 +213,8 @@ def test_a_machine_made_to_be_deleted_isn_t_stopped(cloud):
 def test_failed_creation_leaves_nothing(cloud):
     with pytest.raises(ProviderError, match='no-such-network'):
         cloud.create(cloud.spec(options={'network': 'no-such-network'}))
+    with pytest.raises(ProviderError, match='no network of its own.*takes a bridge network'):
+        cloud.create(cloud.spec(options={'network': 'host'}))
     with pytest.raises(ConfigurationError):
         cloud.create(cloud.spec(options={'nets': 'x'}))
 
@@ -363,24 +277,24 @@ def agent_config(*, robot_timeout, boot_timeout):
         'boot_timeout': boot_timeout, 'end_command': []}
 
 
-def test_the_guard_is_armed_at_boot_and_comes_back(cloud):
+def test_the_agent_is_armed_at_boot_and_comes_back(cloud):
     config = agent_config(robot_timeout=60, boot_timeout=600)
     machine = cloud.reached(cloud.create(cloud.spec(), agent_config=config))
     with cloud.shell(machine) as shell:
-        def guard() -> str:
+        def running() -> str:
             return shell.run(Command(('pgrep', '-f', 'agent.py serve')), timeout=10.0,
                              check=False).stdout.strip()
 
-        first = wait_until(lambda: guard() or None, timeout=10.0, what='the guard')
+        first = wait_until(lambda: running() or None, timeout=10.0, what='the agent')
         wait_until(lambda: shell.run(
             Command(('test', '-S', '/run/fogros2/agent.sock')), timeout=10.0,
-            check=False).returncode == 0, timeout=10.0, what="the guard's socket")
+            check=False).returncode == 0, timeout=10.0, what="the agent's socket")
         said(shell, 'kill', '-KILL', first, sudo=True)
         # the one that is killed may be there a moment longer
-        wait_until(lambda: guard() not in ('', first), timeout=10.0, what='the guard to come back')
+        wait_until(lambda: running() not in ('', first), timeout=10.0, what='the agent to return')
 
 
-def test_a_guard_that_waits_in_vain_ends_the_machine(cloud):
+def test_an_agent_that_waits_in_vain_ends_the_machine(cloud):
     config = agent_config(robot_timeout=1, boot_timeout=1)
     machine_id = cloud.create(cloud.spec(), agent_config=config)
 
@@ -432,8 +346,12 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
         assert said(shell, 'id', '-u', sudo=True) == '0'
         shell.put(b'kept', '~/file', mode=0o600)
     assert cloud.create(spec, token=machine.id.split(':')[2]) == machine.id
+    packet_filter = f'fogros2-{machine.id.split(":")[2]}'
+    assert cloud.traces().count(packet_filter) == 2
     cloud.provider.stop(machine.id)
+    assert packet_filter not in cloud.traces()
     cloud.provider.start(machine.id)
+    assert cloud.traces().count(packet_filter) == 2
     again = cloud.reached(machine.id)
     assert again.shell.host_key == machine.shell.host_key
     with cloud.shell(again) as shell:

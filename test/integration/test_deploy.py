@@ -136,7 +136,7 @@ def test_machine_with_a_slow_clock_is_warned_of_and_shown(
     assert found.verdict == 'warning' and re.search(rf'{name}: 1\.\d\d s behind', found.detail)
 
 
-STEPS = ['machine', 'connect', 'ROS 2', 'guard', 'VPN', 'agent']
+STEPS = ['machine', 'connect', 'ROS 2', 'watchdog', 'VPN', 'agent']
 
 
 @pytest.mark.parametrize('step', ['VPN interface', *STEPS])

@@ -42,7 +42,8 @@ def generate_launch_description():
 #: What a launch prints as a step begins, and at last when messages arrive.
 STEPS = {
     'create': f'{NAME}: machine ...', 'vpn interface': 'robot: VPN interface ...',
-    'connect': f'{NAME}: connect ...', 'guard': f'{NAME}: guard ...', 'ros': f'{NAME}: ROS 2 ...',
+    'connect': f'{NAME}: connect ...', 'watchdog': f'{NAME}: watchdog ...',
+    'ros': f'{NAME}: ROS 2 ...',
     'vpn': f'{NAME}: VPN ...', 'agent': f'{NAME}: agent ...', 'running': 'I heard',
 }
 

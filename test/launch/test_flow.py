@@ -155,7 +155,7 @@ def test_unknown_machine_name_is_refused(run, fake, planner, capfd):
 def test_two_machines_of_one_name_are_refused(run, fake, planner, capfd):
     twin = ContainerInstance(name='planner', ros_workspace='', memory='1g')
     assert run(LaunchDescription([talker(planner), talker(twin)])) == 1
-    assert "two machines of this launch are called 'planner'" in capfd.readouterr().out
+    assert "two machines of this launch have the name 'planner'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 
@@ -557,7 +557,7 @@ def test_checks_come_before_any_machine(run, fake, planner, capfd):
 
 
 @pytest.mark.parametrize(('where', 'what', 'message'), [
-    ('dmo', 'talker', "no package is called 'dmo' (did you mean 'demo'?)"),
+    ('dmo', 'talker', "there is no package 'dmo' (did you mean 'demo'?)"),
     ('demo', 'taker', "package 'demo' has no executable 'taker' (did you mean 'talker'?)"),
 ])
 def test_unknown_programs_are_found_before_any_machine(
@@ -606,7 +606,7 @@ def test_failing_undo_gives_status_1(run, fake, planner, capfd):
 
 def test_unknown_image_transport_is_refused(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner, stream_topics=[('/camera', 'h256')])])) == 1
-    assert "no image transport is called 'h256'" in capfd.readouterr().out
+    assert "there is no image transport 'h256'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 

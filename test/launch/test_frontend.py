@@ -219,7 +219,7 @@ launch:
 
 @pytest.mark.parametrize('text, expected', [
     ('<fog_machine name="p" provider="awz"/>',
-     ["no provider is called 'awz'", "did you mean 'aws'", 'container']),
+     ["there is no provider 'awz'", "did you mean 'aws'", 'container']),
     ('<fog_machine name="p"/>', ['needs a provider', 'aws, container, kubernetes, robot, ssh']),
     ('<fog_machine provider="aws"/>', ['needs a name']),
     ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),

@@ -254,7 +254,7 @@ def test_unknown_transport_is_refused_first(run, fake, planner, late, capfd):
     assert run(FogROSLaunchDescription([
         talker(planner), TimerAction(period=60.0, actions=[wrong]) if late else wrong])) == 1
     said = capfd.readouterr().out
-    assert "no image transport is called 'h265' (did you mean 'h264'? there are: h264, raw)" in (
+    assert "there is no image transport 'h265' (did you mean 'h264'? there are: h264, raw)" in (
         said)
     assert not fake.noted('up')
 

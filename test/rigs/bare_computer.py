@@ -3,7 +3,7 @@
 A computer that has an SSH server and this computer's system, and nothing of FogROS2.
 
 For tests of machines that exist already: it is a podman container made from this computer's root,
-as a container machine is, but without the Python environment, the guard and the tags. To FogROS2
+as a container machine is, but without the Python environment, the agent and the tags. To FogROS2
 it is somebody's computer at an address.
 """
 
@@ -46,6 +46,12 @@ class BareComputer:
     def endpoint(self) -> Endpoint:
         """Return how a Shell reaches it, the host key pinned."""
         return Endpoint('ssh', self.address, 22, self.user, self.host_key, str(self.key))
+
+    @property
+    def process(self) -> int:
+        """Return its first process, as this computer numbers it."""
+        (entry,) = self.engine.inspect([self.name])
+        return int(entry['State']['Pid'])
 
     def run(self, script: str, *, check: bool = True) -> Result:
         """Run a script there as root, not by SSH."""

@@ -299,3 +299,5 @@ TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
     'decoder': _decoder, 'stills': _stills, 'agent messages': _agent_messages,
     'heartbeats': _heartbeats, 'agent': _agent, 'gate': _gate, 'dashboard': _dashboard,
     'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+#: Targets whose readers are Python code in the process that feeds them.
+PYTHON = {'agent messages', 'heartbeats', 'gate', 'dashboard', 'VPN helper', 'DDS configuration'}

@@ -2,10 +2,11 @@
 """
 Feed mutations of valid inputs to what reads the inputs of others; see ``fuzz_targets``.
 
-The same seed gives the same inputs. The mutations know no coverage; instead they begin with valid
-inputs of each kind, and have words that decide much (limits of numbers, nested brackets, markup).
+The same seed gives the same inputs. The mutations begin with valid inputs of each kind, and have
+words that decide much (limits of numbers, nested brackets, markup). They know no coverage. With
+``--guided``, Atheris (libFuzzer) makes the inputs, and keeps those that reach new Python code.
 
-    python -m rigs.fuzzing TARGET SEED --count 400 | --seconds 60
+    python -m rigs.fuzzing TARGET SEED --count 400 | --seconds 60 [--guided]
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from __future__ import annotations
 import argparse
 import base64
 from collections.abc import Iterator, Sequence
+import contextlib
 import json
 import os
 from pathlib import Path
 import random
 import signal
+import sys
+import tempfile
 import time
 import traceback
 from types import FrameType
@@ -106,23 +110,64 @@ def run(name: str, seed: int, *, count: int = 0, seconds: float = 0.0,
     return done, found
 
 
+def run_guided(name: str, seed: int, seconds: float, note: Path) -> NoReturn:
+    """
+    Feed a target inputs that coverage of Python code guides, print what ``main`` prints, and exit.
+
+    :param note: start of the name of a file that gets the input of a crash or hang.
+    """
+    import atheris
+    found: dict[str, bytes] = {}
+    done = 0
+    with contextlib.ExitStack() as stack:
+        target = stack.enter_context(TARGETS[name]())
+        seeds = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='fogt-fuzz-')))
+        for number, data in enumerate(target.valid):
+            Path(seeds, str(number)).write_bytes(data)
+        atheris.instrument_all()
+        until = time.monotonic() + seconds
+
+        def read(data: bytes) -> None:
+            nonlocal done
+            if wrong := feed(target, data):
+                found.setdefault(wrong, data)
+            done += 1
+            if time.monotonic() >= until:
+                stack.close()
+                report(done, found)
+                sys.stdout.flush()
+                os._exit(0)  # libFuzzer has no other end without losing the result
+
+        atheris.Setup([name, f'-seed={seed}', f'-timeout={HANG}', '-max_len=65536',
+                       f'-artifact_prefix={note}-', str(seeds)], read)
+        atheris.Fuzz()
+    raise AssertionError('libFuzzer ends the process')
+
+
+def report(done: int, found: dict[str, bytes]) -> None:
+    """Print as JSON how many inputs a target got, what went wrong, and the memory it took."""
+    print(json.dumps({'done': done, 'peak': peak(os.getpid()), 'found': {
+        wrong: base64.b64encode(data).decode() for wrong, data in found.items()}}))
+
+
 def _hung(number: int, frame: Optional[FrameType]) -> NoReturn:
     raise TimeoutError('an input takes too long')
 
 
 def main() -> None:
-    """Feed a target, and print as JSON how many inputs it got, what went wrong, and its memory."""
+    """Feed a target, and report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('target', choices=TARGETS)
     parser.add_argument('seed', type=int)
     parser.add_argument('--count', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=0.0)
     parser.add_argument('--note', type=Path, help='file that always has the current input')
+    parser.add_argument('--guided', action='store_true', help='by coverage; needs --note')
     given = parser.parse_args()
-    done, found = run(given.target, given.seed, count=given.count, seconds=given.seconds,
-                      note=given.note)
-    print(json.dumps({'done': done, 'peak': peak(os.getpid()), 'found': {
-        wrong: base64.b64encode(data).decode() for wrong, data in found.items()}}))
+    if given.guided:
+        run_guided(given.target, given.seed, given.seconds, given.note)
+    report(*run(given.target, given.seed, count=given.count, seconds=given.seconds,
+                note=given.note))
 
 
 if __name__ == '__main__':

@@ -63,7 +63,11 @@ class Participant:
         self.count = 0
 
     def send(self, to: tuple[str, int], *parts: bytes) -> None:
-        self.socket.sendto(b'RTPS' + VERSION + VENDOR + self.prefix + b''.join(parts), to)
+        self.socket.sendto(self.message(*parts), to)
+
+    def message(self, *parts: bytes) -> bytes:
+        """Return a message of these submessages."""
+        return b'RTPS' + VERSION + VENDOR + self.prefix + b''.join(parts)
 
     def announcement(self, locators: list[bytes]) -> bytes:
         """Return the announcement of a participant that claims these addresses."""

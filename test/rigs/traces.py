@@ -38,6 +38,7 @@ _INTERFACE = re.compile(r'\bfog([0-9a-f]{6})(?:m\d+)?\b')
 #: Root folders of containers, by their ids.
 _roots: dict[str, str] = {}
 _ROOT = re.compile(r'/fogros2/([A-Za-z0-9_-]+)')
+_FILTER = re.compile(r'\bfogros2-([A-Za-z0-9_-]+)')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +170,7 @@ def look(state: Path, files: Path, run: str) -> set[Trace]:
 
 
 def _named(kind: str, line: str) -> Trace:
-    return Trace(f'{kind} {line}', frozenset(_INTERFACE.findall(line)))
+    return Trace(f'{kind} {line}', frozenset(_INTERFACE.findall(line) + _FILTER.findall(line)))
 
 
 @dataclasses.dataclass(frozen=True)

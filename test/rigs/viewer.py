@@ -16,7 +16,7 @@ import time
 from typing import Any, Optional
 
 #: Seconds in which a registry has to answer.
-PATIENCE = 40.0
+TIMEOUT = 40.0
 
 
 def install(source: Path, cache: Path) -> str:
@@ -40,11 +40,11 @@ def install(source: Path, cache: Path) -> str:
             try:
                 made = subprocess.run(
                     [npm, 'install', '--no-package-lock', '--no-audit', '--no-fund',
-                     '--fetch-retries=1', f'--fetch-timeout={PATIENCE * 500:.0f}'],
+                     '--fetch-retries=1', f'--fetch-timeout={TIMEOUT * 500:.0f}'],
                     cwd=cache, env=_environment(), capture_output=True, text=True,
-                    stdin=subprocess.DEVNULL, timeout=PATIENCE)
+                    stdin=subprocess.DEVNULL, timeout=TIMEOUT)
             except subprocess.TimeoutExpired:
-                return f'npm reaches no registry within {PATIENCE:g} s'
+                return f'npm reaches no registry within {TIMEOUT:g} s'
             if made.returncode:
                 return f'npm could not install the client: {(made.stderr or made.stdout)[-300:]}'
             done.write_bytes(wanted)

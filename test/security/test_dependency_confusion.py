@@ -126,7 +126,7 @@ def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProce
     facts = dataclasses.replace(
         host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(machine.home),
         libc='glibc 2.1', pythons=(Python(sys.executable, sys.version_info[:2], True),),
-        programs=frozenset({'ip', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'}))
+        programs=frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'}))
     todo = bootstrap.plan(
         MachineSpec('m', 'ssh', bootstrap='embedded'), facts, facts, UNDER, packed)
     target = Path(todo.wheels_target)

@@ -81,7 +81,7 @@ def bridge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bridge]:
         port = probe.getsockname()[1]
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.serve', '--name', 'planner',
-         '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--guarded', str(port + 1),
+         '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--public', str(port + 1),
          '--secrets', str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env={**os.environ, 'FOGROS2_VPN_ADDRESS': VPN, 'ROS_DOMAIN_ID': '97',

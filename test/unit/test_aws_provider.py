@@ -393,7 +393,7 @@ def test_user_data_fits_and_is_the_same_for_the_same_request():
     assert yaml.safe_load(text) == config(**REQUEST.agent_config)
 
 
-def test_the_guard_is_armed_before_anything_else_runs():
+def test_the_agent_is_armed_before_anything_else_runs():
     told = config(**REQUEST.agent_config)
     script, = (words[2] for words in told['bootcmd'])
     assert '"end_command": ["shutdown", "-h", "now"]' in script

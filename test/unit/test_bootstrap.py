@@ -350,7 +350,7 @@ def test_apt_installs_ros_on_noble_alone() -> None:
     assert plan(ROS, 'apt').commands[0].what == 'unpack fogros2'
     with pytest.raises(PrerequisiteError, match='Ubuntu 24.04 alone'):
         plan(DEBIAN, 'apt')
-    with pytest.raises(PrerequisiteError, match='takes root'):
+    with pytest.raises(PrerequisiteError, match='needs root'):
         plan(dataclasses.replace(NOBLE, root=False), 'apt')
     with pytest.raises(PrerequisiteError, match='are free'):
         plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'apt')

@@ -547,7 +547,7 @@ def test_shell_ends_a_command_that_ignores_signals(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ignored: str,
 ) -> None:
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(joining, 'PATIENCE', 0.5)
+    monkeypatch.setattr(joining, 'TIMEOUT', 0.5)
     machine('a')
     record('a', **alive())
     for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import json
@@ -216,7 +216,7 @@ def test_kept_machine_without_an_agent_has_no_problems(
     said = capsys.readouterr()
     assert 'launch     none: it is kept for the next one' in said.out and said.err == ''
     said = run('logs', 'slam')
-    assert 'it is kept for the next one' in f'{said}{capsys.readouterr().err}'
+    assert 'the machine is kept for the next launch' in f'{said}{capsys.readouterr().err}'
 
 
 # -- ending -------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def test_gc_uses_the_providers_time_of_the_stop(
 def test_gc_tidies_up_providers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def tidy(self: Cloud) -> list[str]:
+    def tidy(self: Cloud, dead: Collection[str] = ()) -> list[str]:
         self.calls.append(('tidy',))
         return [f"security group of 'old' ({self.name})"] if type(self) is Cloud else []
 
@@ -281,6 +281,19 @@ def test_gc_tidies_up_providers(
     Cloud.calls.clear()
     assert run('gc') == 0
     assert not Cloud.calls
+
+
+def test_gc_clears_what_a_killed_creation_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The launch died before it saved the machine's id."""
+    def tidy(self: Cloud, dead: Collection[str] = ()) -> list[str]:
+        self.calls.append(('tidy', *dead))
+        return []
+
+    monkeypatch.setattr(Cloud, 'tidy', tidy)
+    record('slam', machine_id=None, token='t1', launch='abc123')
+    assert run('gc') == 0
+    assert ('tidy', 't1') in Cloud.calls
+    assert not Store().machine('slam').exists()
 
 
 # -- the firewall -------------------------------------------------------------------------
@@ -627,6 +640,6 @@ def test_doctor_gives_up_a_silent_provider(monkeypatch: pytest.MonkeyPatch) -> N
     over = threading.Event()
     monkeypatch.setattr(Cloud, 'answers', lambda self: str(over.wait(30)))
     begin = time.monotonic()
-    assert 'no answer within 0.1 s' in doctor.provider('cloud', patience=0.1).detail
+    assert 'no answer within 0.1 s' in doctor.provider('cloud', timeout=0.1).detail
     assert time.monotonic() - begin < 5
     over.set()

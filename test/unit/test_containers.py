@@ -95,7 +95,7 @@ def test_machine_without_containers_is_refused_first(monkeypatch):
     monkeypatch.setattr('fogros2.deploy.launch.check_robot', lambda: None)
     launch = Launch()
     spec = MachineSpec('m', 'container', containers=('docker run image',))
-    with pytest.raises(Unsupported, match='rights that an engine takes'):
+    with pytest.raises(Unsupported, match='rights that an engine needs'):
         launch.prepare([spec])
     launch.down()
 

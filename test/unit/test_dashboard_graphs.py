@@ -111,7 +111,7 @@ def test_graph_program_that_hangs_is_killed(several: Graphs, monkeypatch: pytest
                                         tmp_path: Path) -> None:
     begun = tmp_path / 'begun'
     instead(monkeypatch, f'import time; open({str(begun)!r}, "w"); time.sleep(60)')
-    monkeypatch.setattr(graphs, 'PATIENCE', 0.2)
+    monkeypatch.setattr(graphs, 'TIMEOUT', 0.2)
     several.update([(launched(), ())])
     wait_until(begun.exists, timeout=20.0, what='its begin')
     (graph,) = several._graphs.values()

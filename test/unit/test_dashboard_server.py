@@ -137,6 +137,14 @@ def test_invalid_delete_request_is_refused(dashboard: Dashboard, body: str) -> N
     assert asked(dashboard) == []
 
 
+@pytest.mark.parametrize('length', ['', '-1', '1e1', '\xb2', '9' * 5000], ids=len)
+def test_request_with_an_invalid_length_is_refused(dashboard: Dashboard, length: str) -> None:
+    status, data, _ = ask(dashboard, '/api/delete', method='POST', body='{"name": "a"}',
+                          Content_Length=length)
+    assert status == 400 and 'length' in json.loads(data)['error']
+    assert asked(dashboard) == []
+
+
 def test_delete_request_of_a_form_is_refused(dashboard: Dashboard) -> None:
     for kind in ('text/plain', 'application/x-www-form-urlencoded', 'multipart/form-data'):
         assert ask(dashboard, '/api/delete', method='POST', body='{"name": "a"}',

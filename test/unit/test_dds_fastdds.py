@@ -94,7 +94,7 @@ def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize(('content', 'words'), [
     (None, "can't be read"), ('<dds', 'no XML'),
     ('<dds><profiles><participant is_default_profile="true"><rtps><useBuiltinTransports>false'
-     '</useBuiltinTransports></rtps></participant></profiles></dds>', 'no place for the VPN')])
+     '</useBuiltinTransports></rtps></participant></profiles></dds>', 'exclude the VPN')])
 def test_a_users_profiles_that_cannot_be_used_are_refused(
         tmp_path: Path, content: str | None, words: str) -> None:
     path = tmp_path / 'own.xml'
@@ -114,5 +114,5 @@ def test_what_keeps_nodes_from_machines_is_refused(name: str, value: str) -> Non
         FastDds().environment('/x', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'})
     with pytest.raises(DdsError, match='no DDS ports'):
         FastDds(300)
-    with pytest.raises(DdsError, match="'<x>' is no host"):
+    with pytest.raises(DdsError, match="'<x>' of ROS_STATIC_PEERS"):
         FastDds().render([], ['<x>'])

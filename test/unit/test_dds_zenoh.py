@@ -50,7 +50,7 @@ def test_local_node_and_machine_meet_no_other_computer(
     {'ZENOH_SESSION_CONFIG_URI': '/mine'}, {'ZENOH_CONFIG_OVERRIDE': 'mode="client"'},
     {'ZENOH_CONFIG_OVERRIDE': 'connect/endpoints=["tcp/a:1"]'}])
 def test_what_leads_nodes_elsewhere_is_refused(user: dict[str, str]) -> None:
-    with pytest.raises(DdsError, match='past the router') as caught:
+    with pytest.raises(DdsError, match="bypass the launch's router") as caught:
         Zenoh().robot_interfaces(ROBOT, None, user)
     assert caught.value.hint
     with pytest.raises(DdsError, match='OFF'):

@@ -459,7 +459,7 @@ def test_port_without_ssh_is_reported_soon(launch, provider, monkeypatch):
 def test_a_host_key_is_taken_from_what_the_machine_prints():
     assert host_key.parse('motd\nssh-ed25519 AAAA+/x== planner\n') == 'ssh-ed25519 AAAA+/x=='
     for said in ('', 'ssh-rsa AAAA x', 'ssh-ed25519 $(id)'):
-        with pytest.raises(HostKeyError, match='made no host key'):
+        with pytest.raises(HostKeyError, match='returned no host key'):
             host_key.parse(said)
 
 
@@ -653,7 +653,7 @@ def test_what_stays_on_a_machine_out_of_reach_is_told_once(
         for name in ('agent', 'VPN', 'nodes'):
             mine.undoing(name, lambda: mine.clean_up([Command(('ip', 'link'))]))
     told, = launch.down()
-    assert 'stays there (nodes, VPN, agent)' in str(told) and hint in told.hint
+    assert 'stay there (nodes, VPN, agent)' in str(told) and hint in told.hint
 
 
 def test_machine_that_vanishes_at_its_end_is_given_up():

@@ -86,7 +86,7 @@ def test_equal_needs_share_a_folder() -> None:
 
 @pytest.mark.parametrize('output', ['', 'bash: python3: command not found', '[1]', '{}'])
 def test_machine_without_python_is_reported(output: str) -> None:
-    with pytest.raises(PrerequisiteError, match='no Python there'):
+    with pytest.raises(PrerequisiteError, match='no Python of the machine'):
         modules.answer(output)
 
 

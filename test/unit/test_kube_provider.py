@@ -535,6 +535,7 @@ def test_exposure_is_read_back_from_text(way):
 def test_invalid_text_of_an_exposure_is_ignored():
     assert Exposure.parse('') is None
     assert Exposure.parse('node_port 1.2.3.4 x') is None
+    assert Exposure.parse('node_port 1.2.3.4 \u00b2') is None
 
 
 @pytest.fixture

@@ -279,4 +279,4 @@ def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robo
     else:
         assert words[4:-5] == [
             '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--vpn', '9000',
-            *(['--image', 'x:1'] if runs else []), '--guarded', '9001', '--allow', *SOURCES]
+            *(['--image', 'x:1'] if runs else []), '--public', '9001', '--allow', *SOURCES]

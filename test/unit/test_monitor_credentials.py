@@ -64,5 +64,5 @@ def test_machine_without_openssl_admits_nobody_else(tmp_path, monkeypatch, capsy
     serve = pytest.importorskip(
         'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
     folder = monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3')
-    assert serve.guard(8766, folder, 'planner') == []
+    assert serve.public_port(8766, folder, 'planner') == []
     assert 'nobody but the robot is let in: ' in capsys.readouterr().err

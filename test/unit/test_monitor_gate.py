@@ -218,7 +218,7 @@ def running(folder: Path, to: int, *words: str) -> Iterator[Running]:
     made = credentials.make(folder, 'planner')
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'127.0.0.1:{to}',
-         '--listen', '127.0.0.1:0', '--guarded', ':0', '--certificate', made.certificate,
+         '--listen', '127.0.0.1:0', '--public', ':0', '--certificate', made.certificate,
          '--key', made.key, '--token-file', made.token, *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:

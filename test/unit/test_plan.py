@@ -41,7 +41,7 @@ def test_interface_names_are_short_and_unique():
 
 
 def test_full_subnet_is_reported():
-    with pytest.raises(ConfigurationError, match='no address'):
+    with pytest.raises(ConfigurationError, match='no free address'):
         plan.machine_interface('a1b2c3', NETWORK, 253, 4, '/k')
 
 
@@ -91,7 +91,7 @@ def test_route_comes_from_provider_report(known, peer, inner, robot):
 
 def test_a_machine_without_any_way_is_refused():
     machine = Machine('id', 'pod', 'fake', MachineState.RUNNING)
-    with pytest.raises(VpnError, match="no way to 'pod'.*UDP"):
+    with pytest.raises(VpnError, match="neither the robot nor 'pod'.*UDP"):
         plan.route(machine, Peer('pod', 'D', '198.18.7.4'), 7, 9)
 
 
@@ -155,7 +155,7 @@ def unsourced(tmp_path):
 
 def test_a_named_workspace_need_not_be_sourced(unsourced):
     check_program('rob_tools', 'params', [], str(unsourced))
-    with pytest.raises(WorkspaceError, match="no package is called 'rob_tools'"):
+    with pytest.raises(WorkspaceError, match="there is no package 'rob_tools'"):
         check_program('rob_tools', 'params', [])
 
 

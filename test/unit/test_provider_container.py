@@ -39,7 +39,7 @@ REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm
 
 def test_tokens_of_machines_are_not_listed_for_others(tmp_path: Path) -> None:
     roots = tmp_path / 'fogros2'
-    words = ('sh', str(roots / '0123-token'), '', '', 'true')
+    words = ('sh', str(roots / '0123-token'), '', '', '', '', 'true')
     subprocess.run(['sh', '-c', container._CREATE, *words], input=archive(), check=True)
     assert (roots / '0123-token/root').is_dir()
     assert stat.S_IMODE(roots.stat().st_mode) == 0o711
@@ -395,7 +395,7 @@ def test_an_engine_inside_is_told_what_it_can_not_do(tmp_path):
     assert not any(name.startswith('etc/containers') for name in content(entry_files()))
 
 
-def test_the_guard_gets_its_configuration_alone():
+def test_the_agent_gets_its_configuration_alone():
     data = entry_files()
     config = json.loads(text(data, 'opt/fogros2/agent.json'))
     assert config['end_command'] == ['kill', '-TERM', '1']
@@ -461,6 +461,28 @@ def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
     provider.cancel.set()
     with pytest.raises(Cancelled):
         provider.create(MachineSpec('m', 'container', {'image': 'large'}), REQUEST)
+
+
+def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):
+    commands = []
+
+    def run(command, **more):
+        commands.append(command)
+        labels = {container_machine.ATTEMPT: '0123-token'}
+        return Result(0, json.dumps([{'State': {'Pid': 77}, 'Config': {'Labels': labels}}]), '')
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    container.ContainerProvider().start('docker:0123456789ab:0123-token')
+    assert [command.argv[1] for command in commands] == [
+        'container', 'start', 'container', '-c']
+    assert commands[-1].argv[-1] == 'fogros2-0123-token' and commands[-1].sudo
+    assert json.loads(commands[-1].input) == {'pid': 77}
+
+
+def test_failing_packet_filter_has_a_remedy():
+    error = container_engine.translate(CommandError(Command(('podman',)), Result(
+        126, '', 'the packet filter takes no rules for bridges'), 'here'))
+    assert 'nf_tables' in error.hint
 
 
 def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):

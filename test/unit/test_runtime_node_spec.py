@@ -139,7 +139,7 @@ def test_environment(context):
 
 
 def test_unknown_programs(context):
-    with pytest.raises(WorkspaceError, match="no package is called 'dmo'"):
+    with pytest.raises(WorkspaceError, match="there is no package 'dmo'"):
         convert(Node(package='dmo', executable='talker'), context)
     with pytest.raises(WorkspaceError, match="no executable 'taker'"):
         convert(Node(package='demo', executable='taker'), context)

@@ -178,7 +178,7 @@ def test_geolocation_reads_what_it_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     assert regions.geolocate() == (48.2085, 16.3721)
     for body in ({'loc': 'moon'}, {}, [], {'loc': '1,2,3'}):
         monkeypatch.setattr(requests, 'get', lambda url, timeout, body=body: Answer(body))
-        with pytest.raises(ProviderError, match='where this computer is'):
+        with pytest.raises(ProviderError, match='location of this computer'):
             regions.geolocate()
 
     def refuse(url: str, timeout: float) -> Answer:

@@ -89,6 +89,6 @@ def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopi
             entries.append(action.entry)
         else:
             raise ConfigurationError(
-                f'{values.describe(action.entry.topic)}: a stream of one part of a launch has no '
-                'condition', 'give the node or the group one')
+                f'{values.describe(action.entry.topic)}: a stream of a node or a group takes no '
+                'condition', 'set the condition of the node or the group')
     return others, entries

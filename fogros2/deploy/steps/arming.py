@@ -77,7 +77,7 @@ class Arming(Step):
 
     def arm(self) -> None:
         """
-        Make sure that an agent guards the machine; connect to the agent.
+        Make sure that an agent watches the machine; connect to the agent.
 
         :raises AgentError: another launch uses the machine.
         """
@@ -89,7 +89,7 @@ class Arming(Step):
             'user': endpoint.user if endpoint else '',
             # the launch keeps in touch from now on: by re-arming the agent, then by heartbeats
             'boot_timeout': job.spec.robot_timeout}
-        with job.step('guard'):
+        with job.step('watchdog'):
             agent = None
             if not program:
                 program = f'{job.directory}/agent.py'
@@ -98,7 +98,7 @@ class Arming(Step):
                         what='look for an agent')).strip():
                     # of a launch that died, or of another robot, which keeps it
                     agent = self._claim(program, config)
-                job.undoing('guard', self._remove)
+                job.undoing('watchdog', self._remove)
                 if agent is None:
                     self._install(program, config)
             job.save(agent=job.directory, agent_program=program)

@@ -30,8 +30,8 @@ def start_router(context: Context, job: MachineJob) -> None:
         return
     if context.index >= MACHINES:
         raise DdsError(
-            f"'{job.name}' is one machine too many: the robot's router knows {MACHINES}",
-            'spread them over several launches, or use another RMW_IMPLEMENTATION')
+            f"'{job.name}' is one machine too many: the robot's router can have {MACHINES}",
+            'use several launches, or another RMW_IMPLEMENTATION')
     node = NodeSpec(
         id=f'{job.name}/router', name='router', package=router.package,
         executable=router.executable, files={'router.json5': router.config},

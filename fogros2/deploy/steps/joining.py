@@ -91,12 +91,12 @@ class Joining(Step):
                         'launch again: each launch takes another port') from error
                 if 'nft: ' in error.result.stderr:
                     raise VpnError(
-                        f"'{job.name}' can't keep strangers from its nodes: "
+                        f"'{job.name}' can't filter the DDS of strangers: "
                         f'{error.result.stderr.strip().splitlines()[-1]}',
                         'use an image or a kernel with nftables (nf_tables)') from error
                 if 'in use already:' in error.result.stderr:
                     raise VpnError(
-                        f"'{job.name}' uses addresses of the VPN's network itself: "
+                        f"'{job.name}' already uses addresses of the VPN's network: "
                         f'{error.result.stderr.strip().splitlines()[-1]}',
                         'launch again: each launch takes another network') from error
                 raise

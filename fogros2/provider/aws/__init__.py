@@ -3,7 +3,7 @@
 EC2 instances, by boto3.
 
 In reading order: ``options``, ``regions``, ``spot`` (the preemption notice), ``failures`` (AWS's
-refusals), ``patience`` and ``clients`` (calls), ``instances``, ``network``, ``ending``,
+refusals), ``retry`` and ``clients`` (calls), ``instances``, ``network``, ``ending``,
 ``images``, ``prices``, ``cloud`` (the adapter).
 """
 

@@ -13,7 +13,7 @@ import time
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws import patience
+from fogros2.provider.aws import retry
 from fogros2.provider.aws.failures import AwsError, translated
 
 T = TypeVar('T')
@@ -161,7 +161,7 @@ class Account:
                     user_agent_extra='fogros2', max_pool_connections=50)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
-                patience.teach(found)
+                retry.teach(found)
                 self._clients[(service, region, hasty)] = found
             return found
 
@@ -208,7 +208,7 @@ class Account:
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 
-        return patience.unless(self._cancel, asked, what)
+        return retry.unless(self._cancel, asked, what)
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

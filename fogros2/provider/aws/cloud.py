@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import threading
 import time
@@ -192,9 +192,9 @@ class Ec2(Ec2Prices):
         """Delete what belongs to an attempt besides its instance."""
         ending.sweep(self._account, region, attempt)
 
-    def leftovers(self, region: str, now: float) -> Mapping[str, str]:
+    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
         """Return attempts of which only a group or a key is left."""
-        return ending.leftovers(self._account, region, now)
+        return ending.leftovers(self._account, region, now, dead)
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Change the rules of the machine's security group."""

@@ -136,13 +136,13 @@ def end_instances(account: Account, region: str, attempt: str) -> None:
                       InstanceIds=[instance['InstanceId'] for instance in found])
 
 
-def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
+def leftovers(
+    account: Account, region: str, now: float, dead: Collection[str],
+) -> dict[str, str]:
     """
     Return this robot's attempts of which only a group or a key is left, with the machine's name.
 
-    The end of a machine deletes its disk and address, but not these.
-
-    :param now: seconds since the epoch; a new group may still get its instance.
+    The end of a machine deletes its disk and address, but not these; see ``VmCloud.leftovers``.
     """
     ours = [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}]
     entries = [
@@ -154,7 +154,7 @@ def leftovers(account: Account, region: str, now: float) -> dict[str, str]:
     # another robot's clock may differ, and its machine may be about to be created
     left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
             if not is_another_robot(t.get(TAG_ROBOT, ''))
-            and now - float(t.get(TAG_MADE, 0)) > SETTLED}
+            and (t[TAG_ATTEMPT] in dead or now - float(t.get(TAG_MADE, 0)) > SETTLED)}
     if left:
         for instance in instances.instances_in(account.pages(
                 'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',

@@ -3,8 +3,9 @@
 Run machines on this computer: containers of podman or docker, each with an SSH server.
 
 ``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
-machine without an image, ``entry`` makes its first process. ``machine`` reads the reports of the
-engine, ``options`` parses the options in launch files.
+machine without an image, ``entry`` makes its first process. ``packet_filter`` keeps machines from
+this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the options
+in launch files.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider
-from fogros2.provider.container import debian_root
+from fogros2.provider.container import debian_root, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
 from fogros2.provider.container import machine as container_machine
@@ -45,18 +46,17 @@ from fogros2.waiting import wait_until
 _NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
 
 # One process does all steps, in its own session: a launch that is killed meanwhile leaves either
-# nothing or a machine with its watchdog. From the fourth argument on, the words are the engine's.
+# nothing or a machine with its watchdog. From the sixth argument on, the words are the engine's.
 _CREATE = """\
-top=$1 hook=$2 layers=$3
-shift 3
+top=$1 begin=$2 end=$3 clean=$4 layers=$5
+shift 5
 engine=$1
 umask 022
 failed() {
     code=$?
     [ $code -eq 0 ] && return
     [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
-    rm -rf -- "$top"
-    rmdir -- "${top%/*}" 2>/dev/null
+    sh -c "$clean"
     exit $code
 }
 tries=0
@@ -70,9 +70,20 @@ done
 trap failed EXIT
 mkdir "$top/root" "$top/hooks"
 chmod 711 "$top"
-[ -z "$hook" ] || echo "$hook" > "$top/hooks/remove.json"
+printf %s "$begin" >"$top/hooks/begin.json"
+printf %s "$end" >"$top/hooks/end.json"
 for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/work"; done
 tar -xpf - --numeric-owner -C "$top/root"
+"$@"
+"""
+
+# Podman forgets the folder of a container's hooks when the container has started.
+_START = """\
+top=$1
+install -d -m 711 "${top%/*}" "$top" "$top/hooks"
+printf %s "$2" >"$top/hooks/begin.json"
+printf %s "$3" >"$top/hooks/end.json"
+shift 3
 "$@"
 """
 
@@ -87,12 +98,11 @@ _GOOD_ENDS = (0, 137, 143)
 _TOKEN_USED = 17
 
 _DESTROY = """\
-identity=$1 top=$2
+identity=$1 clean=$2
 shift 2
 "$@" rm -f -v -t 0 "$identity" >/dev/null || "$@" rm -f -v "$identity" >/dev/null
 code=$?
-rm -rf -- "$top"
-rmdir -- "${top%/*}" 2>/dev/null
+sh -c "$clean"
 exit $code
 """
 
@@ -122,7 +132,7 @@ class ContainerProvider(Provider):
         trouble = process.sudo_trouble() if engine.sudo else None
         if trouble is not None:
             raise PrerequisiteError(
-                f'{engine.name} takes root on this computer, and {trouble[0]}', trouble[1])
+                f'{engine.name} needs root on this computer, and {trouble[0]}', trouble[1])
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')
@@ -154,8 +164,8 @@ class ContainerProvider(Provider):
     def check_containers(self, spec: MachineSpec) -> None:
         """Check that the machine is created with the rights to run containers."""
         if not container_options.runs_containers(spec, Options.parse(spec.options)):
-            raise Unsupported(f"'{spec.name}' was made without the rights that containers take",
-                              'say containers=True where the machine is described')
+            raise Unsupported(f"'{spec.name}' was created without the rights for containers",
+                              'set containers=True where the machine is described')
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create and start the container; return when the engine has started it."""
@@ -208,12 +218,11 @@ class ContainerProvider(Provider):
             archive.file('etc/apt/sources.list', ''.join(
                 f'{line}\n' for line in debian_root.release().sources).encode())
             archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
-        flags = engine.flags if kept else (*engine.flags, *hook_flags(top))
         command = Command(
-            ('sh', '-ec', _CREATE, 'sh', str(top), '' if kept else removal_hook(top),
+            ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept), clean(top),
              ' '.join(system) if kept else '',
-             engine.name, *flags, 'run', '-d', '--cidfile', f'{top}/cid', *words,
-             '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
+             engine.name, *engine.flags, *hook_flags(top), 'run', '-d', '--cidfile', f'{top}/cid',
+             *words, '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
             sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
             input=container_root.skeleton(options.user, base) + archive.data())
         try:
@@ -222,7 +231,7 @@ class ContainerProvider(Provider):
             if error.result.returncode != _TOKEN_USED:
                 raise container_engine.translate(error) from error
             raise ProviderError(
-                f'an attempt to create {spec.name} that was cut short left {top}',
+                f'an interrupted attempt to create {spec.name} left {top}',
                 f'sudo rm -rf {top}') from error
 
     def _create_from_image(
@@ -237,9 +246,10 @@ class ContainerProvider(Provider):
         try:
             engine.call('cp', '-', f'{identity}:/', what=what,
                         data=_entry(spec, request, options).data())
-            engine.call('start', identity, what=what)
+            _start(engine, identity, request.token, kept=spec.on_exit == 'stop', what=what)
         except BaseException:
-            engine.call('rm', '-f', '-v', identity, what='removing it again', check=False)
+            with contextlib.suppress(ProviderError, DeadlineExceeded):
+                self.destroy(container_machine.machine_id(engine, identity, request.token))
             raise
         return identity
 
@@ -285,7 +295,7 @@ class ContainerProvider(Provider):
         engine, identity, token = container_machine.parse_id(machine_id)
         result = process.run(
             Command(('sh', '-c', _DESTROY, 'sh', identity,
-                     str(container_machine.directory(token)), *engine.argv()),
+                     clean(container_machine.directory(token)), *engine.argv()),
                     sudo=engine.sudo, what=f'removing container {identity}'),
             timeout=60.0, check=False)
         self._host_keys.pop(identity, None)
@@ -308,8 +318,9 @@ class ContainerProvider(Provider):
 
     def start(self, machine_id: str) -> None:
         """Start a stopped container again."""
-        engine, identity, _ = _inspected(machine_id)
-        engine.call('start', identity, what=f'starting container {identity}')
+        engine, identity, found = _inspected(machine_id)
+        token = container_machine.labels_of(found)[container_machine.ATTEMPT]
+        _start(engine, identity, token, kept=True, what=f'starting container {identity}')
 
     def _host_key(self, engine: Engine, entry: Mapping[str, Any]) -> Optional[str]:
         """Return the public host key that a machine created at its first boot, None before."""
@@ -362,6 +373,24 @@ def _inspected(machine_id: str) -> tuple[Engine, str, dict[str, Any]]:
     return engine, identity, found[0]
 
 
+def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) -> None:
+    """Start a container with its packet filter; podman sets the filter before the start."""
+    top = container_machine.directory(token)
+    if engine.name == 'podman':
+        words = ('-ec', _START, 'sh', str(top), *hooks(top, kept=kept), engine.name,
+                 *engine.flags, *hook_flags(top), 'start', identity)
+        state = {}
+    else:
+        engine.call('start', identity, what=what)
+        words = ('-c', packet_filter.SET, 'sh', filter_name(top))
+        state = {'pid': engine.inspect([identity])[0]['State']['Pid']}
+    try:
+        process.run(Command(('sh', *words), sudo=True, what=what,
+                            input=json.dumps(state).encode()), timeout=60.0)
+    except CommandError as error:
+        raise container_engine.translate(error) from error
+
+
 def _entry(spec: MachineSpec, request: CreateRequest, options: Options) -> Archive:
     """Return an archive with the first process of a machine, and the files that it needs."""
     archive = Archive()
@@ -393,15 +422,29 @@ def _after(log: str, mark: str) -> str:
     return found[-1] if found else ''
 
 
-def removal_hook(top: Path) -> str:
-    """Return the hook by which podman deletes a machine's root when its container ends."""
-    return json.dumps({
-        'version': '1.0.0',
-        'hook': {'path': '/bin/sh', 'args': [
-            'sh', '-c', f'rm -rf -- {top}; rmdir -- {top.parent} 2>/dev/null; true']},
-        'when': {'always': True},
-        'stages': ['poststop'],
-    })
+def filter_name(top: Path) -> str:
+    """Return the name of a machine's packet filter."""
+    return f'fogros2-{top.name}'
+
+
+def clean(top: Path) -> str:
+    """Return shell text that removes a machine's packet filter and root."""
+    return (f'{packet_filter.unset(filter_name(top))}; '
+            f'rm -rf -- {top}; rmdir -- {top.parent} 2>/dev/null; true')
+
+
+def hooks(top: Path, *, kept: bool) -> Iterator[str]:
+    """
+    Yield the hooks by which podman sets a machine's packet filter, and cleans up at its end.
+
+    :param kept: only the filter ends with the container.
+    """
+    end = packet_filter.unset(filter_name(top)) if kept else clean(top)
+    for stage, words in (('createRuntime', (packet_filter.SET, 'sh', filter_name(top))),
+                         ('poststop', (end,))):
+        yield json.dumps({
+            'version': '1.0.0', 'when': {'always': True}, 'stages': [stage],
+            'hook': {'path': '/bin/sh', 'args': ['sh', '-c', *words]}})
 
 
 def hook_flags(top: Path) -> Iterator[str]:

@@ -139,7 +139,7 @@ def check(folder: Optional[Path] = None) -> None:
         trouble = process.sudo_trouble()
         if trouble is not None:
             raise PrerequisiteError(
-                f'debootstrap takes root on this computer, and {trouble[0]}', trouble[1])
+                f'debootstrap needs root on this computer, and {trouble[0]}', trouble[1])
 
 
 def root(

@@ -25,6 +25,8 @@ _WORKED: dict[str, Engine] = {}
 _HINTS = {
     'overlay.*(invalid argument|not supported)|(invalid argument|not supported).*overlay':
         "this root file system can't be overlaid: name an image with image='...'",
+    'network of its own': 'network= takes a bridge network: podman network ls',
+    'packet filter': 'use a kernel with nftables for bridges (nf_tables, bridge family)',
     'no space left': 'the disk is full',
     'exec format error': f'the image has to be for {os.uname().machine} processors',
     'rlimit|cgroup': 'see `ros2 fog doctor`',

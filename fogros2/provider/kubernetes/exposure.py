@@ -72,7 +72,7 @@ class Exposure:
     def parse(cls, text: str) -> Optional[Exposure]:
         """Parse the result of ``str``; return None for another text."""
         words = text.split(' ', 3)
-        if len(words) < 3 or not words[2].isdigit():
+        if len(words) < 3 or not words[2].isdecimal():
             return None
         return cls(words[0], '' if words[1] == '-' else words[1], int(words[2]),
                    words[3] if len(words) > 3 else '')

@@ -68,8 +68,8 @@ def open_port(
             error, f"a Service for port {port} of '{machine.name}'", where.namespace) from error
     except DeadlineExceeded as error:
         raise ProviderError(
-            f"no load balancer came for port {port} of '{machine.name}' in "
-            f'{LOAD_BALANCER:.0f} s', 'leave monitor_allow= out there') from error
+            f"the cluster created no load balancer for port {port} of '{machine.name}' in "
+            f'{LOAD_BALANCER:.0f} s', 'leave monitor_allow= out on this cluster') from error
     return ways.node_hosts(api, pod, cancel)[0], exposure.node_port(made)
 
 

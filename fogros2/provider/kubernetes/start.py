@@ -17,7 +17,7 @@ from fogros2.provider.kubernetes.pods import Trouble
 
 #: Seconds to wait for the end of a problem that may be temporary: a node that is being freed, a
 #: registry that does not answer at first.
-PATIENCE = 15.0
+TIMEOUT = 15.0
 #: Seconds after which the events are read, if there is no pod or the pod does not start.
 QUIET = 5.0
 
@@ -104,7 +104,7 @@ class Start:
 
     def _tick(self) -> None:
         now = time.monotonic()
-        late = self._trouble is not None and now - self._since >= PATIENCE
+        late = self._trouble is not None and now - self._since >= TIMEOUT
         if now >= self._next_events and (late or self._trouble is None):
             # Polled rarely, because a watch would report the events of all pods.
             self._next_events = now + 4 * QUIET

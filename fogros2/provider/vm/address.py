@@ -67,9 +67,9 @@ class RobotAddress:
             if own:
                 return own  # a computer without IPv4 reaches only machines with IPv6
             raise ProviderError(
-                f"{url} does not tell this robot's public address: {error}", hint) from error
+                f"{url} did not return this robot's public address: {error}", hint) from error
         except ValueError as error:
-            raise ProviderError(f"{url} told no address but '{said[:40]}'", hint) from error
+            raise ProviderError(f"{url} returned '{said[:40]}', not an address", hint) from error
 
 
 def own_ipv6() -> str:

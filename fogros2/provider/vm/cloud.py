@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import copy
 import dataclasses
 from decimal import Decimal
@@ -307,8 +307,13 @@ class VmCloud(abc.ABC):
         """Start a stopped machine."""
         raise Unsupported(f"a machine at {self.title} can't be started")
 
-    def leftovers(self, region: str, now: float) -> Mapping[str, str]:
-        """Return this robot's attempts of which no machine is left, with the machine's name."""
+    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
+        """
+        Return this robot's attempts of which no machine is left, with the machine's name.
+
+        :param now: seconds since the epoch; a new attempt may still get its machine.
+        :param dead: attempts that get none, because their launches have died.
+        """
         return {}
 
     def sweep(self, region: str, attempt: str) -> None:

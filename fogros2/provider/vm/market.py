@@ -106,7 +106,7 @@ class Market:
             else self.price(region, name)
         if price is None:
             raise ProviderError(
-                f"{self._source.title} tells no {'spot ' if spot else ''}price of {name} in "
+                f"{self._source.title} has no {'spot ' if spot else ''}price of {name} in "
                 f'{region}', 'ros2 fog price --region shows the types that a region has')
         return price
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
@@ -26,6 +26,7 @@ from fogros2.provider import Capabilities, Provider, TAG_NAME
 from fogros2.provider.offers import Offers, Region, Wants
 from fogros2.provider.vm.address import RobotAddress
 from fogros2.provider.vm.cloud import (
+    attempt_of,
     CloudError,
     TAG_ATTEMPT,
     TAG_DISK,
@@ -205,7 +206,7 @@ class VmProvider(Provider):
             vpn_host=vm.address if running else '', private_network=vm.private_network,
             private_ip=vm.private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
-            disk_gb=int(disk) if disk.isdigit() else None, tags=tags, end_command=END_COMMAND,
+            disk_gb=int(disk) if disk.isdecimal() else None, tags=tags, end_command=END_COMMAND,
             cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped)
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
@@ -273,10 +274,12 @@ class VmProvider(Provider):
                    what=f'{machine.vm} in {machine.region} to be stopped')
         self._cloud.start(machine)
 
-    def tidy(self) -> list[str]:
+    def tidy(self, dead: Collection[str] = ()) -> list[str]:
         """Delete the firewalls and keys of machines that ended by themselves."""
+        attempts = {attempt_of(token) for token in dead}
+
         def ask(region: str) -> list[str]:
-            found = self._cloud.leftovers(region, time.time())
+            found = self._cloud.leftovers(region, time.time(), attempts)
             for attempt in found:
                 self._cloud.sweep(region, attempt)
             return [f"security group and key of '{name}' in {region}" for name in found.values()]

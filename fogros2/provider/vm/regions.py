@@ -64,7 +64,7 @@ def geolocate() -> tuple[float, float]:
     try:
         import requests
     except ImportError as error:
-        raise PrerequisiteError("the nearest region can't be found out without 'requests'",
+        raise PrerequisiteError("the nearest region can't be found without the package 'requests'",
                                 'python3 -m pip install requests, or name a region') from error
     try:
         answer = requests.get(GEOLOCATION_URL, timeout=4.0)
@@ -72,10 +72,10 @@ def geolocate() -> tuple[float, float]:
         latitude, longitude = str(answer.json()['loc']).split(',')
         return float(latitude), float(longitude)
     except (requests.ConnectionError, requests.Timeout) as error:
-        raise ProviderError(f'{GEOLOCATION_URL}, which would know where this computer is, does '
-                            'not answer either', 'name a region') from error
+        raise ProviderError(f'{GEOLOCATION_URL}, which returns the location of this computer, '
+                            'does not answer either', 'name a region') from error
     except (requests.RequestException, ValueError, KeyError, TypeError) as error:
-        raise ProviderError(f"{GEOLOCATION_URL} doesn't say where this computer is: {error}",
+        raise ProviderError(f'{GEOLOCATION_URL} returned no location of this computer: {error}',
                             'name a region') from error
 
 

@@ -37,9 +37,9 @@ with context.wrap_socket(plain) as link:
 """
 
 
-def knock(box, at, target, patience=20.0):
+def knock(box, at, target, timeout=20.0):
     done = subprocess.run(
-        [*box.on_robot([]), sys.executable, '-c', KNOCK, at, target, str(patience)],
+        [*box.on_robot([]), sys.executable, '-c', KNOCK, at, target, str(timeout)],
         capture_output=True, text=True, timeout=60)
     return (done.stdout or done.stderr).strip()
 
@@ -65,7 +65,7 @@ def test_security_group_admits_viewers_until_the_launch_ends(robot, box, name):
     # from elsewhere nothing even answers
     box.move_robot()
     try:
-        assert knock(box, at, token, patience=1.0) == 'nothing answers'
+        assert knock(box, at, token, timeout=1.0) == 'nothing answers'
     finally:
         box.move_robot(back=True)
     run.interrupt()

@@ -22,7 +22,7 @@ from rigs.launched import launching, ros2
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
 #: Seconds for what takes a few on a computer that has nothing else to do.
-PATIENCE = 150.0
+TIMEOUT = 150.0
 #: Seconds after its end for which a Job stays here, by its ttlSecondsAfterFinished.
 TTL = 5
 #: Has a launch file take the tests' web application for Lichtblick.
@@ -115,7 +115,7 @@ def killed(kubernetes, namespaces_of_module, tmp_path_factory):
             + "        talker(pod('killed', robot_timeout=3)), listener()])\n")
         with launching() as start:
             run = start(str(path))
-            run.wait_for('I heard', timeout=PATIENCE)
+            run.wait_for('I heard', timeout=TIMEOUT)
             (job,) = space.all('jobs')
             assert job['spec']['ttlSecondsAfterFinished'] == 60
             # nobody here has a minute
@@ -144,7 +144,7 @@ def test_example_runs_in_a_pod(namespace):
     with launching() as start:
         run = start('fogros2_examples', 'talker.kube.launch.py', 'name:=planner',
                     f'image:={READY}', 'count:=2')
-        assert run.ended(PATIENCE) == 0, run.text
+        assert run.ended(TIMEOUT) == 0, run.text
     assert run.text.count('I heard: [Hello World from planner ') >= 2
     assert clean(run), run.text
     assert 'node_port' in run.text, f'it says which way UDP took: {run.text}'
@@ -155,7 +155,7 @@ def talks_by_default(path, namespace):
     """Launch a file whose image is KubeInstance()'s own; the cluster has one of that name."""
     with launching() as start:
         run = start(str(path))
-        run.wait_for('I heard: [Hello World from ', timeout=PATIENCE)
+        run.wait_for('I heard: [Hello World from ', timeout=TIMEOUT)
         (pod,) = namespace.all('pods')
         assert pod['spec']['containers'][0]['image'] == DEFAULT
         run.interrupt()
@@ -181,7 +181,7 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
     run = launch(
         "talker(pod('dialler', expose='pod_dials_robot', "
         f"robot_host='{kubernetes.layout.host}'))", 'listener()')
-    run.wait_for('I heard: [Hello World from dialler ', times=2, timeout=PATIENCE)
+    run.wait_for('I heard: [Hello World from dialler ', times=2, timeout=TIMEOUT)
     assert namespace.all('services') == []
     run.interrupt()
     assert run.ended() == 0, run.text
@@ -193,7 +193,7 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
 def test_pod_serves_the_web_application(launch, namespace):
     run = launch("talker(pod('watched', launch_foxglove=True))", 'listener()',
                  before=IMAGE)
-    run.wait_for('I heard', timeout=PATIENCE)
+    run.wait_for('I heard', timeout=TIMEOUT)
     opener = urllib.request.build_opener(
         urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor())
     pages = []
@@ -225,7 +225,7 @@ def test_pod_serves_the_web_application(launch, namespace):
 def test_application_ends_with_a_machine_that_ends_itself(launch, namespace):
     run = launch("talker(pod('watched', launch_foxglove=True, robot_timeout=3))", 'listener()',
                  before=IMAGE)
-    run.wait_for('I heard', timeout=PATIENCE)
+    run.wait_for('I heard', timeout=TIMEOUT)
     run.kill()
 
     def ended():
@@ -244,8 +244,8 @@ def test_two_pods_talk_to_each_other(launch, namespace):
         "talker(pod('speaker'))",
         "CloudNode(machine=pod('hearer'), package='fogros2_examples', executable='listener', "
         "output='screen')", "listener(name='robot_listener')")
-    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2, timeout=PATIENCE)
-    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ', timeout=PATIENCE)
+    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2, timeout=TIMEOUT)
+    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ', timeout=TIMEOUT)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert clean(run), run.text
@@ -255,7 +255,7 @@ def test_two_pods_talk_to_each_other(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
     run = launch("talker(pod('victim'))", 'listener()')
-    run.wait_for('I heard', timeout=PATIENCE)
+    run.wait_for('I heard', timeout=TIMEOUT)
     (pod,) = namespace.all('pods')
     namespace.client.ask(
         'DELETE', f"/api/v1/namespaces/{namespace.name}/pods/{pod['metadata']['name']}",
@@ -268,7 +268,7 @@ def test_a_pod_that_is_killed_ends_the_launch(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_nodes_of_an_evicted_pod_continue_on_the_robot(launch, namespace):
     run = launch("talker(pod('evicted', on_interrupt='robot'))", 'listener()')
-    run.wait_for('I heard: [Hello World from evicted ', timeout=PATIENCE)
+    run.wait_for('I heard: [Hello World from evicted ', timeout=TIMEOUT)
     (pod,) = namespace.all('pods')
     name = pod['metadata']['name']
     namespace.client.create(
@@ -291,14 +291,14 @@ def test_restart_of_the_api_server_is_waited_for(launch, namespace, kubernetes):
     wait_until(lambda: namespace.all('jobs') or None, timeout=60.0, what='the Job')
     kubernetes.stop('kube-apiserver')
     kubernetes.start('kube-apiserver')
-    run.wait_for('I heard: [Hello World from patient ', timeout=PATIENCE)
+    run.wait_for('I heard: [Hello World from patient ', timeout=TIMEOUT)
     kubernetes.stop('kube-apiserver')
     before = run.text.count('I heard')
     run.wait_for('I heard', times=before + 5, timeout=20.0)
     kubernetes.start('kube-apiserver')
     # the agent's events come again
     before = run.text.count('[patient.talker-1]')
-    run.wait_for('[patient.talker-1]', times=before + 5, timeout=PATIENCE)
+    run.wait_for('[patient.talker-1]', times=before + 5, timeout=TIMEOUT)
     run.interrupt()
     assert run.ended() == 0, run.text
     assert namespace.left() == []
@@ -310,7 +310,7 @@ def test_second_launch_reuses_a_kept_pod(launch, namespace):
     pods = []
     for _ in range(2):
         run = launch(*entities)
-        run.wait_for('I heard', timeout=PATIENCE)
+        run.wait_for('I heard', timeout=TIMEOUT)
         run.interrupt()
         assert run.ended() == 0, run.text
         assert clean(run), run.text
@@ -327,7 +327,7 @@ def test_second_launch_reuses_a_kept_pod(launch, namespace):
 @pytest.mark.usefixtures('nothing_left')
 def test_fog_verbs_work_with_pods(launch, namespace, kubernetes, monkeypatch, tmp_path):
     run = launch("talker(pod('known'))", 'listener()')
-    run.wait_for('I heard', timeout=PATIENCE)
+    run.wait_for('I heard', timeout=TIMEOUT)
     with ThreadPoolExecutor() as pool:
         listed, status, logs, connected, swept = pool.map(lambda words: ros2('fog', *words), (
             ['list'], ['status', 'known'], ['logs', 'known'],
@@ -345,7 +345,7 @@ def test_fog_verbs_work_with_pods(launch, namespace, kubernetes, monkeypatch, tm
         everywhere = ros2('fog', 'list')
     assert 'known' in everywhere.stdout and namespace.name in everywhere.stdout, everywhere
     before = run.text.count('I heard')
-    run.wait_for('I heard', times=before + 1, timeout=PATIENCE)  # gc has let it be
+    run.wait_for('I heard', times=before + 1, timeout=TIMEOUT)  # gc has let it be
     run.interrupt()
     assert run.ended() == 0, run.text
     assert namespace.left() == []
@@ -357,7 +357,7 @@ def test_twenty_pods_of_one_launch(launch, namespace):
     run = launch(*(f"talker(pod('many-{n}'), namespace='n{n}')" for n in range(20)),
                  *(f"listener(namespace='n{n}')" for n in (0, 19)))
     for number in (0, 19):
-        run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=2 * PATIENCE)
+        run.wait_for(f'I heard: [Hello World from many-{number} ', timeout=2 * TIMEOUT)
     run.wait_for('.talker-1]', times=20)
     assert len(namespace.all('pods')) == 20
     run.interrupt()

@@ -43,7 +43,7 @@ KERNEL_SETTINGS = (
     'vm/overcommit_memory', 'vm/panic_on_oom', 'kernel/panic', 'kernel/panic_on_oops',
     'kernel/keys/root_maxkeys', 'kernel/keys/root_maxbytes')
 #: Seconds that the start of one service may take on a busy computer.
-PATIENCE = 90.0
+TIMEOUT = 90.0
 
 
 def call(*words: str) -> None:
@@ -53,7 +53,7 @@ def call(*words: str) -> None:
         raise OSError(f'{" ".join(words)}: {done.stderr.strip() or done.returncode}')
 
 
-def wait_until(true: Callable[[], bool], what: str, timeout: float = PATIENCE) -> None:
+def wait_until(true: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
     """Wait for a condition; standard library only, so not ``fogros2.waiting``."""
     deadline = time.monotonic() + timeout
     while not true():

@@ -21,7 +21,7 @@ from rigs.ec2 import computer, guest, metadata, network, told
 from rigs.ec2.computer import Boot, Computer
 
 #: Seconds after which an instance that was asked to go down is cut off.
-_PATIENCE = 2.0
+_TIMEOUT = 2.0
 #: Share of the boot delay for which an instance is 'pending'.
 _PENDING = 0.25
 _STATES = {'pending': 0, 'running': 16, 'shutting-down': 32, 'terminated': 48, 'stopping': 64,
@@ -134,7 +134,7 @@ class Cloud:
 
     def _press(self, machine: Machine) -> None:
         machine.computer.ask_to_end()
-        machine.cutting = threading.Timer(_PATIENCE, machine.computer.cut)
+        machine.cutting = threading.Timer(_TIMEOUT, machine.computer.cut)
         machine.cutting.daemon = True
         machine.cutting.start()
 

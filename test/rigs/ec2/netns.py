@@ -21,7 +21,7 @@ def listener(space: str, address: str, port: int) -> socket.socket:
 
     :raises OSError: there is no such namespace or address, or this process isn't root.
     """
-    return _made_in(space, lambda: socket.create_server((address, port), backlog=64))
+    return made_in(space, lambda: socket.create_server((address, port), backlog=64))
 
 
 def answers(space: str, address: str, port: int) -> bool:
@@ -37,7 +37,7 @@ def answers(space: str, address: str, port: int) -> bool:
             probe.connect((address, port))
         return probe
 
-    with _made_in(space, connect) as probe:
+    with made_in(space, connect) as probe:
         try:
             probe.getpeername()
         except OSError:
@@ -45,9 +45,9 @@ def answers(space: str, address: str, port: int) -> bool:
         return True
 
 
-def _made_in(space: str, make: Callable[[], socket.socket]) -> socket.socket:
+def made_in(space: str, make: Callable[[], socket.socket]) -> socket.socket:
     """
-    Return a socket that was made in a namespace.
+    Return a socket that was made in a namespace, which is a name or the path of its file.
 
     It stays in the one that its thread was in when it was made (setns(2)), so a thread that lives
     for this alone goes over.
