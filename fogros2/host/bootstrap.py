@@ -165,7 +165,7 @@ def ensure(
     :param packages: packages of the nodes that will run there.
     :returns: how ROS programs run there, and what was done in a few words.
     :raises ConfigurationError: the machine has this computer's network.
-    :raises PrerequisiteError: the machine cannot be prepared.
+    :raises PrerequisiteError: the machine cannot be prepared, or its answer is not valid.
     :raises WorkspaceError: the workspace can neither be used nor built there.
     """
     question = host.probe(under.prefixes)
@@ -173,7 +173,11 @@ def ensure(
         here = pool.submit(_robot_facts, under.prefixes, timeout)
         there = shell.run(question, timeout=timeout, cancel=cancel)
         robot = here.result()
-    facts = host.parse_facts(there.stdout)
+    try:
+        facts = host.parse_facts(there.stdout)
+    except ValueError as error:
+        raise PrerequisiteError(
+            f"'{spec.name}' describes itself with a value that is no number: {error}") from error
     if elsewhere:
         check_elsewhere(spec, facts, robot)
     chain = [workspaces.inspect(path) for path in spec.workspaces]

@@ -167,7 +167,11 @@ def probe(environments: Sequence[str] = ()) -> Command:
 
 
 def parse_facts(output: str) -> HostFacts:
-    """Parse the output of :func:`probe`; ignore other lines in it."""
+    """
+    Parse the output of :func:`probe`; ignore other lines in it.
+
+    :raises ValueError: something that must be a number is none.
+    """
     found: dict[str, list[str]] = {}
     for line in output.splitlines():
         key, _, value = line.partition(' ')

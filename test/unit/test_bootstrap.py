@@ -18,8 +18,9 @@ from fogros2.host import bootstrap
 from fogros2.host import inspection as host
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
-from fogros2.model import Bootstrap, Command, MachineSpec
+from fogros2.model import Bootstrap, Command, MachineSpec, Result
 from fogros2.plan import Underlay
+from fogros2.testing.fakes import FakeShell
 
 TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
@@ -177,6 +178,14 @@ installed 0123
 def test_facts_of_nothing_are_defaults() -> None:
     facts = host.parse_facts('')
     assert facts.python is None and not facts.root and facts.free_bytes is None
+
+
+@pytest.mark.parametrize('answer', ['user x robot', 'python three 11 1 /usr/bin/python3',
+                                    f"user {'9' * 5000} robot"])
+def test_machine_that_lies_about_a_number_is_refused(answer: str) -> None:
+    shell = FakeShell(handlers={'sh': lambda command: Result(0, f'{answer}\n', '')})
+    with pytest.raises(PrerequisiteError, match="'m' describes itself with a value"):
+        bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0)
 
 
 def test_a_machine_like_the_robot_needs_nothing() -> None:
