@@ -151,7 +151,7 @@ class Agent:
 
     def open(self) -> None:
         """
-        Create the directory, lock it, and open the socket in it.
+        Create the directory, lock it, open the socket in it, and write the files in it.
 
         :raises Refused: the directory is not writable, or another agent uses it.
         """
@@ -180,6 +180,8 @@ class Agent:
             self._resume()
             self.journal = Journal(self.directory, self.config['log_bytes'])
             self.listener = self._listen()
+            # before the start is reported: another robot's launch reads whose agent this is
+            self.save()
         except OSError as error:
             raise Refused(f"{self.directory} can't be used: {error.strerror or error}") from error
 
@@ -269,7 +271,6 @@ class Agent:
         self.loop.select(
             alarm, selectors.EVENT_READ, lambda mask: self._on_signals(alarm.recv(4096)))
         self.loop.select(self.listener, selectors.EVENT_READ, self._accept)
-        self.save()
         try:
             self.heartbeats.open()
         except Refused as error:

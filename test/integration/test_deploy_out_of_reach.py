@@ -109,7 +109,8 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
                     won[number] = outcome
                 else:
                     refused[number] = outcome
-        assert len(won) == len(refused) == 1, (won, refused)
+        assert len(won) == len(refused) == 1, (
+            won, refused, [str(error.__cause__) for error in refused.values()])
         (winner, agent), = won.items()
         (_, error), = refused.items()
         assert isinstance(error, AgentError), error

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import typing
 
 import pytest
@@ -51,6 +52,12 @@ def test_agent_resumes_the_settings_of_the_first_agent(tmp_path):
     agent.open()
     assert {key: agent.config[key] for key in server.RESUMED} == {
         key: saved[key] for key in server.RESUMED}
+
+
+def test_agent_names_its_launch_before_it_serves(tmp_path):
+    server.Agent({'machine': 'planner', 'launch': 'first', 'directory': str(tmp_path)}).open()
+    assert json.loads((tmp_path / 'config.json').read_text())['launch'] == 'first'
+    assert (tmp_path / 'agent.pid').read_text() == f'{os.getpid()}\n'
 
 
 @pytest.mark.parametrize('value', [0, -1, 2 ** 53])
