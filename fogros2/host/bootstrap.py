@@ -177,7 +177,9 @@ def ensure(
         facts = host.parse_facts(there.stdout)
     except ValueError as error:
         raise PrerequisiteError(
-            f"'{spec.name}' describes itself with a value that is no number: {error}") from error
+            f"'{spec.name}' describes itself with a value that is no number: {error}",
+            'its login shell or its programs are not what they seem: use another machine'
+        ) from error
     if elsewhere:
         check_elsewhere(spec, facts, robot)
     chain = [workspaces.inspect(path) for path in spec.workspaces]

@@ -11,6 +11,7 @@ sends it, must be the page's own.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import hmac
 from http import HTTPStatus
@@ -20,6 +21,7 @@ from pathlib import Path
 import re
 import secrets
 import socket
+import threading
 from typing import Any, Optional, Protocol
 import urllib.parse
 
@@ -69,6 +71,7 @@ class Dashboard:
         self.page = PAGE.read_bytes()
         self.policy = content_policy(self.page.decode())
         self._server = _Server(('127.0.0.1', port), self)
+        self._serving, self._closed = threading.Lock(), False
         self.port: int = self._server.server_address[1]
         self.hosts = (f'127.0.0.1:{self.port}', f'localhost:{self.port}')
 
@@ -79,12 +82,19 @@ class Dashboard:
 
     def serve(self) -> None:
         """Answer requests until a signal, or until another thread calls close()."""
-        # close() does not use shutdown(), so the server need not poll for it.
-        self._server.serve_forever(poll_interval=3600.0)
+        with self._serving:
+            while not self._closed:
+                self._server.handle_request()
 
     def close(self) -> None:
-        """Close the listening socket."""
-        self._server.server_close()
+        """Close the listening socket, and wait until serve() has returned."""
+        self._closed = True
+        # Only this wakes serve(). It would wait on for the socket's number, which the process
+        # gives to the next file that it opens.
+        with contextlib.suppress(OSError):
+            self._server.socket.shutdown(socket.SHUT_RDWR)
+        with self._serving:
+            self._server.server_close()
 
 
 class _Server(ThreadingHTTPServer):

@@ -186,6 +186,18 @@ def test_each_dashboard_has_its_own_token() -> None:
         other.close()
 
 
+def test_closed_dashboard_waits_for_no_file() -> None:
+    dashboard = Dashboard(Canned())
+    thread = threading.Thread(target=dashboard.serve, daemon=True)
+    thread.start()
+    assert ask(dashboard, '/')[0] == 200
+    dashboard.close()
+    # a thread that waits for the closed socket's number keeps the next file with it open
+    thread.join(10.0)
+    assert not thread.is_alive()
+    dashboard.close()
+
+
 def test_page_loads_nothing_and_escapes_its_data() -> None:
     page = PAGE.read_text()
     for words in ('innerHTML', 'outerHTML', 'insertAdjacentHTML', 'document.write', 'eval(',
