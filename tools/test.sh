@@ -35,9 +35,9 @@ suite() {
     say "Tests on $name"
     tools/run.sh "$@" || status=1
 }
-# Two at a time: much of what tests with machines take is waiting. Tests named by hand run in turn,
+# Three at a time: much of what tests with machines take is waiting. Tests named by hand run in turn,
 # so that their output is seen as it comes.
-[ $# = 0 ] && set -- -n 2 --dist loadgroup --no-loadscope-reorder
+[ $# = 0 ] && set -- -n 3 --dist loadgroup --no-loadscope-reorder
 suite 'the embedded default' embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
 if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them
