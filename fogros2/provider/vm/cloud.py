@@ -19,6 +19,7 @@ from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
+from fogros2.provider.vm.user_data import END_COMMAND
 
 #: The tag of every resource of one machine: it identifies the attempt that created them.
 TAG_ATTEMPT = 'fogros2-attempt'
@@ -183,6 +184,10 @@ class VmCloud(abc.ABC):
 
     # -- the account ----------------------------------------------------------------------------
 
+    def account(self: Adapter, options: Any) -> Adapter:
+        """Return an adapter for the account (project, subscription) that options name."""
+        return self
+
     @abc.abstractmethod
     def check_credentials(self) -> None:
         """
@@ -202,6 +207,14 @@ class VmCloud(abc.ABC):
     def enabled_regions(self) -> list[str]:
         """Return the regions that the account may use."""
         return list(self.regions.enabled)
+
+    def searched_regions(self) -> list[str]:
+        """
+        Return the regions of ``find``, ``images`` and ``leftovers`` if the user names none.
+
+        [''] if one request answers for all regions; these methods then get '' as region.
+        """
+        return self.enabled_regions()
 
     # -- types and prices -----------------------------------------------------------------------
 
@@ -279,6 +292,10 @@ class VmCloud(abc.ABC):
         :param tags: of the machine: those of the order, the host key and the price.
         :raises CloudError: with ``full`` if there is no capacity.
         """
+
+    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the command by which a machine with these tags ends itself, as root."""
+        return END_COMMAND
 
     @abc.abstractmethod
     def delete(self, machine: VmId) -> None:
