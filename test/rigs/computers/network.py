@@ -9,7 +9,7 @@ The network of a box: a router, the robot and one place for each instance; nothi
 
 Each is a network namespace, so no address of it exists outside, and boxes side by side don't
 meet. The router enforces the security groups on what an instance is sent, remembers connections
-as EC2 does, and lets nobody dial the robot, as a home's NAT.
+as clouds do, and lets nobody dial the robot, as a home's NAT.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Optional
 
 from fogros2 import process
 from fogros2.model import Command
-from rigs.ec2 import netns
+from rigs.computers import netns
 
 #: Of TEST-NET-2 (RFC 5737): nobody's.
 ROUTER = '198.51.100.1'
