@@ -153,6 +153,21 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def gce(hasty: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
+    """Lead Google's clients to an empty Compute Engine in a box, without computers."""
+    pytest.importorskip('google.auth', reason='needs google-auth')
+    pytest.importorskip('googleapiclient', reason="needs Google's description of the API")
+    from rigs.gce import loopback
+    with loopback.serve(tmp_path) as found:
+        for name in ('GOOGLE_CLOUD_PROJECT', 'CLOUDSDK_CORE_PROJECT', 'CLOUDSDK_COMPUTE_REGION',
+                     'CLOUDSDK_COMPUTE_ZONE', 'FOGROS2_GCP_REGIONS'):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in {**found.variables, 'FOGROS2_ROBOT_ADDRESS': '198.51.100.7'}.items():
+            monkeypatch.setenv(name, value)
+        yield found
+
+
+@pytest.fixture
 def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]

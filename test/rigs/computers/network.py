@@ -38,16 +38,18 @@ PREFIX = 'fogt'
 @dataclasses.dataclass(frozen=True)
 class Allowed:
     """
-    What a security group lets in.
+    What a cloud's firewall lets in.
 
     :param protocol: tcp, udp, icmp, or '-1' for all.
     :param ports: first and last; None for all.
     :param sources: networks in CIDR form.
+    :param accept: False for what it keeps out, unless an earlier entry lets it in.
     """
 
     protocol: str
     ports: Optional[tuple[int, int]]
     sources: tuple[str, ...]
+    accept: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +69,8 @@ def rules(hosts: Sequence[Host]) -> str:
     for host in hosts:
         lines.append(f' chain {host.link} {{')
         for entry in host.allowed:
-            lines += [f'  ip saddr {source} {_what(entry)}accept' for source in entry.sources]
+            verdict = 'accept' if entry.accept else 'drop'
+            lines += [f'  ip saddr {source} {_what(entry)}{verdict}' for source in entry.sources]
         lines.append('  drop\n }')
     lines += [' chain forward {', '  type filter hook forward priority 0; policy drop;',
               '  ct state established,related accept']
