@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, cast, Optional
 import uuid
 
 from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError
@@ -22,7 +22,7 @@ from fogros2.waiting import cancellable, wait_until
 ENDPOINT = 'https://compute.googleapis.com/compute/v1/'
 ENDPOINT_VARIABLE = 'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE'
 _SCOPES = ('https://www.googleapis.com/auth/cloud-platform',)
-#: Variables of credentials, on which the session depends.
+#: Variables on which the credentials depend.
 _VARIABLES = ('GOOGLE_APPLICATION_CREDENTIALS', 'CLOUDSDK_CONFIG', 'HOME')
 #: Seconds in which a request is sent again, and those of a request whose answer is only displayed.
 PATIENCE, HASTE = 20.0, 3.0
@@ -43,24 +43,44 @@ def configured() -> bool:
     return _credentials().is_file()
 
 
+class _Login:
+    """The credentials of this computer's user, with the project of their configuration."""
+
+    def __init__(self) -> None:
+        try:
+            import google.auth
+            from google.auth.exceptions import GoogleAuthError
+            from google.auth.transport import requests as transport
+            import requests
+        except ImportError as error:
+            raise PrerequisiteError(
+                'machines at Google take google-auth and requests, which are not installed',
+                'python3 -m pip install google-auth requests') from error
+        try:
+            # any, because the library has types for a part of it
+            self._credentials, project = cast(Any, google.auth).default(scopes=_SCOPES)
+        except GoogleAuthError as error:
+            raise PrerequisiteError(f"the Google credentials can't be read: {error}",
+                                    'gcloud auth application-default login') from error
+        self.project = str(project or '')
+        self.session = requests.Session()
+        self._request = cast(Any, transport).Request()
+        self._lock = threading.Lock()
+
+    def headers(self) -> dict[str, str]:
+        """Return the headers of a request, with a token that is valid."""
+        found: dict[str, str] = {}
+        with self._lock:
+            if not self._credentials.valid:
+                self._credentials.refresh(self._request)
+            self._credentials.apply(found)
+        return found
+
+
 @functools.lru_cache(maxsize=4)
-def _session(*settings: str) -> tuple[Any, str]:
-    """Return an authorized session and the project of the credentials, once for all callers."""
-    try:
-        import google.auth
-        from google.auth.exceptions import GoogleAuthError
-        from google.auth.transport import requests as transport
-    except ImportError as error:
-        raise PrerequisiteError(
-            'machines at Google take google-auth and requests, which are not installed',
-            'python3 -m pip install google-auth requests') from error
-    try:
-        credentials, project = google.auth.default(scopes=_SCOPES)
-    except GoogleAuthError as error:
-        raise PrerequisiteError(f"the Google credentials can't be read: {error}",
-                                'gcloud auth application-default login') from error
-    open_session: Any = transport.AuthorizedSession  # it has no types
-    return open_session(credentials), str(project or '')
+def _login(*settings: str) -> _Login:
+    """Return the login for these values of ``_VARIABLES``, once for all callers."""
+    return _Login()
 
 
 class Account:
@@ -91,12 +111,12 @@ class Account:
         other._patience = HASTE
         return other
 
-    def _opened(self) -> tuple[Any, str]:
+    def _opened(self) -> _Login:
         if not configured():
             raise PrerequisiteError(
                 'there are no Google credentials on this computer',
                 'gcloud auth application-default login, or set GOOGLE_APPLICATION_CREDENTIALS')
-        return _session(*(os.environ.get(name, '') for name in _VARIABLES))
+        return _login(*(os.environ.get(name, '') for name in _VARIABLES))
 
     @property
     def endpoint(self) -> str:
@@ -111,7 +131,7 @@ class Account:
         :raises PrerequisiteError: there are no credentials, or nobody has named a project.
         """
         project = self._project or os.environ.get('GOOGLE_CLOUD_PROJECT') \
-            or os.environ.get('CLOUDSDK_CORE_PROJECT') or self._opened()[1]
+            or os.environ.get('CLOUDSDK_CORE_PROJECT') or self._opened().project
         if not project:
             raise PrerequisiteError('no project of Google Cloud is named',
                                     "project_id='...', or set GOOGLE_CLOUD_PROJECT")
@@ -138,7 +158,8 @@ class Account:
         :raises GoogleError: Google refused; ``refused`` is False if it may have had an effect.
         :raises PrerequisiteError: no credentials, bad ones, no route to Google.
         """
-        if method != 'GET' and not path.endswith('/wait'):
+        changes = method != 'GET' and not path.endswith('/wait')
+        if changes:
             # Google carries out a repeated request with the same id once
             query.setdefault('requestId', str(uuid.uuid4()))
         end = time.monotonic() + self._patience
@@ -149,7 +170,7 @@ class Account:
             try:
                 return cancellable(
                     lambda: self._send(method, path, what, body, query), cancel, what=what,
-                    grace=lambda: 0.0 if method == 'GET' else ON_ITS_WAY)
+                    grace=lambda: ON_ITS_WAY if changes else 0.0)
             except FogError as error:
                 unsure = unsure or not error.refused
                 if getattr(error, 'temporary', False) and time.monotonic() < end:
@@ -165,10 +186,11 @@ class Account:
     ) -> dict[str, Any]:
         from google.auth.exceptions import GoogleAuthError, TransportError
         import requests
-        session, _ = self._opened()
+        login = self._opened()
         try:
-            answer = session.request(
+            answer = login.session.request(
                 method, f'{self.endpoint}projects/{path}', params=query, json=body,
+                headers=login.headers(),
                 timeout=(5.0, 140.0 if path.endswith('/wait') else 30.0))
         except (requests.RequestException, TransportError) as error:
             unsent = isinstance(error, (requests.ConnectTimeout, TransportError))

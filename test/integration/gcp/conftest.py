@@ -13,7 +13,6 @@ import uuid
 
 import pytest
 
-from fogros2.waiting import wait_until
 from rigs.launched import Launched, launching, ros2
 
 
@@ -77,9 +76,15 @@ def robot(box: Any, tmp_path: Path) -> Iterator[Robot]:
     box.set_boot_delay(0.0)
     with launching() as start:
         yield Robot(box, tmp_path, start)
-    wait_until(lambda: not box.alive() or None, timeout=3.0, what='instances to end') \
-        if box.alive() else None
-    assert box.things() == {}, f'left at Google: {box.things()}'
+    left = box.things()
+    box.clear()
+    assert left == {}, f'left at Google: {left}'
+
+
+@pytest.fixture
+def robot_of(box: Any) -> type[Robot]:
+    """Return what makes a robot beside another box."""
+    return Robot
 
 
 @pytest.fixture

@@ -117,6 +117,7 @@ class Api:
         return status, answer
 
     def _carry_out(self, found: discovery.Route, query: Mapping[str, str], body: Any) -> Any:
+        body = _without_null(body)
         discovery.check_parameters(found, query)
         discovery.check_body(found, body)
         fault = self._fault(found)
@@ -183,3 +184,10 @@ class Api:
                         self.faults.remove(fault)
                 return fault
         return None
+
+
+def _without_null(value: Any) -> Any:
+    """Return a JSON value without fields that are null, which Google takes as absent."""
+    if isinstance(value, dict):
+        return {key: _without_null(item) for key, item in value.items() if item is not None}
+    return [_without_null(item) for item in value] if isinstance(value, list) else value

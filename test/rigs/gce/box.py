@@ -56,6 +56,10 @@ class GceBox(Box):
         """Return the names of what exists in the project, by kind."""
         return {kind: names for kind, names in self._ask({'do': 'things'}).items() if names}
 
+    def clear(self) -> None:
+        """Delete everything, for the next test."""
+        self._ask({'do': 'clear'})
+
     def firewall(self, name: str) -> dict[str, Any]:
         """Return a firewall rule."""
         found: dict[str, Any] = self._ask({'do': 'resource', 'kind': 'firewalls', 'name': name})

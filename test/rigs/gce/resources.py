@@ -103,6 +103,16 @@ class Project:
         return BASE + (path.removeprefix('projects/') if path.startswith('projects/')
                        else f'{self.name}/{path}')
 
+    def clear(self) -> None:
+        """Delete everything but what Google ships."""
+        self._prune()
+        for instance in self.instances.values():
+            self.cloud.end(instance['id'], 'terminate')
+        for name in [name for name in self.firewalls if not name.startswith('default-')]:
+            del self.firewalls[name]
+        for owner, name in [key for key in self.images if key[0] == self.name]:
+            del self.images[owner, name]
+
     # -- operations -----------------------------------------------------------------------
 
     def start(
@@ -434,6 +444,8 @@ class Project:
             'status': 'PROVISIONING', 'zone': f'{BASE}{self.name}/zones/{zone}',
             'machineType': self._url(body['machineType']), 'labels': dict(body.get('labels', {})),
             'labelFingerprint': _print(body.get('labels', {})),
+            **{name: {'fingerprint': _print({}), **body.get(name, {})}
+               for name in ('tags', 'metadata')},
             'scheduling': {'automaticRestart': True, 'onHostMaintenance': 'MIGRATE',
                            **body.get('scheduling', {})},
             'networkInterfaces': [{
@@ -569,12 +581,18 @@ class Project:
                                     if disk['zone'].endswith(f'/{words["zone"]}')], query,
                            f'{self.name}/zones/{words["zone"]}/disks')
 
+    def disks_aggregated_list(self, words: Words, query: Words, body: Any) -> Any:
+        """Return the disks of all zones."""
+        return self.aggregated('disk', self.disks(), query)
+
     def disks(self) -> list[dict[str, Any]]:
         """Return the disks of all instances."""
         self._prune()
         return [{'kind': 'compute#disk', 'id': f'{i["id"]}1', 'name': _last(d['source']),
                  'sizeGb': d['diskSizeGb'], 'zone': i['zone'], 'selfLink': d['source'],
-                 'status': 'READY', 'users': [i['selfLink']]}
+                 'status': 'READY', 'users': [i['selfLink']],
+                 'type': f'{i["zone"]}/diskTypes/pd-standard',
+                 'creationTimestamp': i['creationTimestamp']}
                 for i in self.instances.values() for d in i['disks']]
 
     # -- images ---------------------------------------------------------------------------

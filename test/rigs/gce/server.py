@@ -44,6 +44,8 @@ class Box(server.Box):
         """Preempt a spot instance, or return resources, or a token of the API."""
         if order['do'] == 'interrupt':
             self.api.project.preempt(order['instance'], order['notice'])
+        elif order['do'] == 'clear':
+            self.api.project.clear()
         elif order['do'] == 'things':
             project = self.api.project
             with project.lock:
