@@ -166,6 +166,15 @@ def test_changed_labels_of_another_program_are_kept(gce):
 # -- reports ----------------------------------------------------------------------------------
 
 
+def test_stopped_machine_of_another_launch_is_no_leftover(gce):
+    spec, provider = dataclasses.replace(SPEC, on_exit='stop'), GCPProvider()
+    machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: 'stop'}))
+    provider.stop(machine)
+    provider.adopt(machine, SPEC, {TAG_ON_EXIT: 'delete'})
+    provider.start(machine)
+    assert provider.reachable(machine, name='planner', timeout=5.0).state is MachineState.RUNNING
+
+
 @pytest.mark.parametrize(('status', 'on_exit', 'state'), [
     ('PROVISIONING', 'delete', MachineState.PENDING), ('STAGING', 'delete', MachineState.PENDING),
     ('RUNNING', 'delete', MachineState.RUNNING), ('REPAIRING', 'stop', MachineState.PENDING),
@@ -176,6 +185,7 @@ def test_states_of_google_are_those_of_machines(status, on_exit, state):
     vm = instances.vm_of('robots', {
         'name': 'fogros2-0', 'zone': 'https://x/projects/robots/zones/europe-west3-b',
         'status': status, 'labels': {TAG_ON_EXIT: on_exit},
+        'scheduling': {'instanceTerminationAction': 'STOP' if on_exit == 'stop' else 'DELETE'},
         'machineType': 'https://x/machineTypes/e2-medium',
         'creationTimestamp': '2026-11-23T08:00:00.000-08:00'})
     assert (vm.state, vm.region, vm.kind) == (state, 'europe-west3', 'e2-medium')

@@ -110,7 +110,9 @@ def vm_of(project: str, instance: Mapping[str, Any]) -> Vm:
     tags = RULES.decode(instance.get('labels') or {})
     zone = _last(instance['zone'])
     state = STATES.get(instance['status'], MachineState.PENDING)
-    if state is MachineState.STOPPED and tags.get(TAG_ON_EXIT) == 'delete':
+    words = instance.get('scheduling', {})
+    if state is MachineState.STOPPED and tags.get(TAG_ON_EXIT) == 'delete' \
+            and words.get('instanceTerminationAction') == 'DELETE':
         # it ended itself, and ros2 fog gc deletes it; meanwhile Google bills its disk
         state = MachineState.DELETED
     nic = (instance.get('networkInterfaces') or [{}])[0]
@@ -118,7 +120,7 @@ def vm_of(project: str, instance: Mapping[str, Any]) -> Vm:
     return Vm(
         f'{project}/{zone}/{instance["name"]}', zone[:-2], state, tags,
         kind=_last(instance.get('machineType', '')),
-        spot=instance.get('scheduling', {}).get('provisioningModel') == 'SPOT',
+        spot=words.get('provisioningModel') == 'SPOT',
         address=next(filter(None, public), None) or nic.get('networkIP', ''),
         private_network=f'gcp:{project}/{_last(nic.get("network", ""))}',
         private_ip=nic.get('networkIP', ''), created=when(instance.get('creationTimestamp')),
