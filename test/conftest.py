@@ -46,17 +46,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     Keep together, where several processes share the tests, what shares something costly.
 
-    That is the cluster of the pods and the simulated EC2; of all else, the fixtures of a module.
-    The two take longest, so they come first, and tests without a machine come last: no process
-    begins with something long when the others are done.
+    That is the cluster of the pods and the simulated clouds; of all else, the fixtures of a
+    module. These take longest, so they come first, and tests without a machine come last: no
+    process begins with something long when the others are done.
     """
     def group(item: pytest.Item) -> str:
         folder = item.path.parent.name
-        return folder if folder in ('kubernetes', 'aws') else str(item.path)
+        return folder if folder in ('kubernetes', 'aws', 'gcp') else str(item.path)
 
     for item in items:
         item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws'),
+    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws', 'gcp'),
                                  'integration' not in item.path.parts))
 
 

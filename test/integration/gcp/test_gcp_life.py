@@ -78,6 +78,7 @@ def test_stranger_finds_no_open_port(provider, box, name):
         provider.destroy(machine.id)
 
 
+@pytest.mark.soak
 def test_machine_inside_the_network_is_a_stranger(provider, box, name):
     one, two = make(provider, f'{name}-a'), make(provider, f'{name}-b')
     try:
@@ -94,13 +95,14 @@ def test_machine_inside_the_network_is_a_stranger(provider, box, name):
 
 #: Every request that creates something, and how it fails: at once, late, or after its effect.
 STEPS = [
-    ('firewalls.insert', 'quotaExceeded', False), ('firewalls.insert', 'QUOTA_EXCEEDED', False),
-    ('firewalls.insert', 'forbidden', True), ('globalOperations.wait', 'forbidden', False),
-    ('instances.insert', 'forbidden', False), ('instances.insert', 'INTERNAL_ERROR', False),
     ('instances.insert', 'ZONE_RESOURCE_POOL_EXHAUSTED', False),
-    ('instances.insert', 'forbidden', True), ('zoneOperations.wait', 'forbidden', False),
-    ('instances.get', 'forbidden', False), ('instances.setLabels', 'forbidden', False),
-    ('firewalls.delete', 'forbidden', False)]
+    ('instances.insert', 'forbidden', True), ('instances.setLabels', 'forbidden', False),
+    *(pytest.param(*step, marks=pytest.mark.soak) for step in (
+        ('firewalls.insert', 'quotaExceeded', False), ('firewalls.insert', 'forbidden', True),
+        ('firewalls.insert', 'QUOTA_EXCEEDED', False),
+        ('globalOperations.wait', 'forbidden', False), ('instances.insert', 'forbidden', False),
+        ('instances.insert', 'INTERNAL_ERROR', False), ('zoneOperations.wait', 'forbidden', False),
+        ('instances.get', 'forbidden', False), ('firewalls.delete', 'forbidden', False)))]
 
 
 @pytest.mark.parametrize(('action', 'code', 'after'), STEPS)
@@ -191,6 +193,7 @@ def test_google_ends_a_machine_at_its_lifetime(provider, box, name):
     provider.destroy(machine)
 
 
+@pytest.mark.soak
 def test_stopped_machine_keeps_its_disk(provider, box, name):
     machine = make(provider, name, on_exit='stop')
     (instance,) = box.alive()
@@ -205,6 +208,7 @@ def test_stopped_machine_keeps_its_disk(provider, box, name):
     provider.destroy(machine.id)
 
 
+@pytest.mark.soak
 def test_image_of_a_machine_starts_the_next(provider, box, name):
     machine = make(provider, name)
     (instance,) = box.alive()
