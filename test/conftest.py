@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from typing import Any
 import urllib.request
 
@@ -46,17 +47,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     Keep together, where several processes share the tests, what shares something costly.
 
-    That is the cluster of the pods and the simulated EC2; of all else, the fixtures of a module.
-    The two take longest, so they come first, and tests without a machine come last: no process
-    begins with something long when the others are done.
+    That is the cluster of the pods and the simulated clouds; of all else, the fixtures of a
+    module. These take longest, so they come first, and tests without a machine come last: no
+    process begins with something long when the others are done.
     """
     def group(item: pytest.Item) -> str:
         folder = item.path.parent.name
-        return folder if folder in ('kubernetes', 'aws') else str(item.path)
+        return folder if folder in ('kubernetes', 'aws', 'azure', 'gcp') else str(item.path)
 
     for item in items:
         item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws'),
+    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws', 'azure', 'gcp'),
                                  'integration' not in item.path.parts))
 
 
@@ -153,6 +154,25 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def gce(hasty: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
+    """Lead Google's clients to an empty Compute Engine in a box, without computers."""
+    pytest.importorskip('google.auth', reason='needs google-auth')
+    pytest.importorskip('googleapiclient', reason="needs Google's description of the API")
+    from rigs.gce import loopback
+    with loopback.serve(tmp_path) as found:
+        for name in ('GOOGLE_CLOUD_PROJECT', 'CLOUDSDK_CORE_PROJECT', 'CLOUDSDK_COMPUTE_REGION',
+                     'CLOUDSDK_COMPUTE_ZONE', 'FOGROS2_GCP_REGIONS'):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in {**found.variables, 'FOGROS2_ROBOT_ADDRESS': '198.51.100.7'}.items():
+            monkeypatch.setenv(name, value)
+        look_up = socket.getaddrinfo
+        # clients of Google fall back to Google itself
+        monkeypatch.setattr(socket, 'getaddrinfo', lambda host, *others, **words: look_up(
+            host if host in ('127.0.0.1', 'localhost') else '', *others, **words))
+        yield found
+
+
+@pytest.fixture
 def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
@@ -205,3 +225,27 @@ def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> 
                     DEFAULT_ACCOUNT_ID, path, image.id, 'String', None, None, None,
                     datetime.datetime.now(), 1, 'text')]
     return moto_server
+
+
+@pytest.fixture
+def azure_service(hasty: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Serve a simulated Azure on the loopback, and lead the provider there; yields it."""
+    from werkzeug.serving import make_server
+
+    from fogros2.provider.azure import cloud
+    from fogros2.provider.azure.account import Account
+    from rigs.azure import service
+
+    # what a process asks once is another in each test
+    monkeypatch.setattr(cloud, '_USUAL', Account())
+    logging.getLogger('werkzeug').setLevel(logging.ERROR)
+    azure = service.Service()
+    server = make_server('127.0.0.1', 0, azure, threaded=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    for name, value in service.environment(f'http://127.0.0.1:{server.server_port}').items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
+    yield azure
+    server.shutdown()
+    server.server_close()

@@ -2,7 +2,7 @@
 """
 Check a cloud account: create the smallest machine, run the talker there, delete everything.
 
-    tools/run.sh best -- python tools/cloud_check.py aws|kubernetes [--options KEYWORD=VALUE,...]
+    tools/run.sh best -- python tools/cloud_check.py PROVIDER [--options KEYWORD=VALUE,...]
 
 The program prints what it will create and the price, and begins after a 'yes' at the terminal or
 with YES=1. At the end it prints the cost and asks the provider whether anything is left.
@@ -35,6 +35,10 @@ from fogros2.runtime import cost
 SMALLEST = {
     'aws': ('ec2_instance_type=cheapest,min_cpu=2,min_memory_gb=2',
             'an EC2 instance with a 30 GB disk, a security group and a key pair'),
+    'azure': ('vm_size=cheapest,min_cpu=2,min_memory_gb=2',
+              'a resource group with a virtual machine, a 30 GB disk, a network and an address'),
+    'gcp': ('machine_type=e2-medium',
+            'a Compute Engine instance with a 30 GB disk, and three firewall rules'),
     'kubernetes': ('mcpu=500,mb=1024', 'a Job with a pod, and a Service for UDP'),
 }
 #: The machine ends itself after this time, even if this computer fails.
@@ -97,7 +101,7 @@ def announce(provider: Provider, asked: MachineSpec, things: str) -> Optional[De
     print(f"-- creates '{asked.name}': {things}")
     print(f"   {', '.join(provider.choices(asked, chosen)) or asked.options}")
     print(f'   {plan.price(price)}, disk and traffic aside' if price is not None else
-          '   the provider names no price: a pod costs what the node below it costs')
+          '   the provider names no price; a pod costs what the node below it costs')
     print(f'-- runs the talker for {MESSAGES} messages, then deletes all of it')
     return price
 

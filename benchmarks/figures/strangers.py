@@ -38,7 +38,7 @@ from fogros2.plan import HEARTBEAT_PORT
 from fogros2.vpn.wireguard import dds_ports
 from fogros2.waiting import wait_until
 from rigs import rtps
-from rigs.ec2.netns import answers, made_in
+from rigs.computers.netns import answers, made_in
 from rigs.launched import Launched, ros2
 from rigs.traces import RUN
 

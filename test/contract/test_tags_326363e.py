@@ -74,7 +74,7 @@ def test_ec2_instance_is_deleted_with_group_and_key(instance):
 
 def test_group_of_an_ended_instance_is_collected(instance, monkeypatch):
     boto3.client('ec2', REGION).terminate_instances(InstanceIds=[instance.split('/')[1]])
-    assert AWSProvider().tidy() == [f"security group and key of 'aws-kept' in {REGION}"]
+    assert AWSProvider().tidy() == [f"firewall and key of 'aws-kept' in {REGION}"]
     assert remains() == ([], [])
 
 

@@ -310,7 +310,7 @@ def test_tidy_deletes_leftovers_but_no_machine_in_creation(aws, monkeypatch):
     alive = aws.provider.create(*ask('mapper'))
     assert aws.provider.tidy() == []
     monkeypatch.setattr('fogros2.provider.aws.ending.SETTLED', -1.0)
-    assert aws.provider.tidy() == [f"security group and key of 'planner' in {HOME}"]
+    assert aws.provider.tidy() == [f"firewall and key of 'planner' in {HOME}"]
     assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
     assert len(left()['groups']) == 1
 
@@ -321,7 +321,7 @@ def test_tidy_deletes_a_dead_launch_s_group_at_once(aws):
     ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
     alive = aws.provider.create(*(mapper := ask('mapper')))
     assert aws.provider.tidy(dead=[request.token, mapper[1].token]) == [
-        f"security group and key of 'planner' in {HOME}"]
+        f"firewall and key of 'planner' in {HOME}"]
     assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
 
 

@@ -46,10 +46,12 @@ MACHINES = {
     'pod': ("fogros2.KubeInstance(container_image='robots/base', zone='us-central1-a', "
             "mcpu=500, mb=512)", ''),
     'pod by default': ('fogros2.KubeInstance()', ''),
-    'Google Cloud': ("fogros2.GCPCloudInstance(project_id='robots')",
-                     'GCPCloudInstance is not available'),
-    'Azure': ("fogros2.AzureCloudInstance(resource_group='robots')",
-              'AzureCloudInstance is not available'),
+    'Google Cloud': ("fogros2.GCPCloudInstance(project_id='robots')", ''),
+    'Google Cloud by position': ("fogros2.GCPCloudInstance('robots-prod', 'projects/p12345/global/"
+                                 "images/i', 'us-central1-a', 'e2-medium', 10)", ''),
+    'Azure': ("fogros2.AzureCloudInstance(resource_group='robots')", ''),
+    'Azure by position': ("fogros2.AzureCloudInstance('robots', 'UbuntuLTS', 'eastus', "
+                          "'Standard_DS2_v2', 10)", ''),
 }
 
 
@@ -107,7 +109,7 @@ FILES = {
     'FogROS2/fogros2_examples/launch/talker.local.launch.py': '',
     'FogROS2/fogros2_examples/launch/talker.aws.launch.py': '',
     'FogROS2/fogros2_examples/launch/talker.kube.launch.py': '',
-    'FogROS2/fogros2_examples/launch/talker.gcp.launch.py': 'GCPCloudInstance is not available',
+    'FogROS2/fogros2_examples/launch/talker.gcp.launch.py': '',
     'FogROS2/fogros2_examples/launch/talker.auto_aws.launch.py': "No module named 'utils'",
     'fogros2-examples/gqcnn_docker.launch.py': '',
     'fogros2-examples/vslam/vslam.launch.py': '',

@@ -15,8 +15,9 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from rigs.ec2 import cloud_config, market, network
-from rigs.ec2.cloud_config import parse, Plan, UserDataError
+from rigs.computers import cloud_config, network
+from rigs.computers.cloud_config import parse, Plan, UserDataError
+from rigs.ec2 import market
 
 
 def test_a_cloud_config_is_understood():

@@ -19,6 +19,7 @@ from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
+from fogros2.provider.vm.user_data import END_COMMAND
 
 #: The tag of every resource of one machine: it identifies the attempt that created them.
 TAG_ATTEMPT = 'fogros2-attempt'
@@ -79,6 +80,7 @@ class Vm:
     :param created: seconds since the epoch; ``stopped`` is when it was stopped.
     :param key: the cloud's name of its login key.
     :param reason: why it ended, in the cloud's words.
+    :param note: a warning for people, shown when the machine is reached.
     """
 
     id: str
@@ -95,6 +97,7 @@ class Vm:
     image: str = ''
     key: str = ''
     reason: str = ''
+    note: str = ''
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,6 +186,10 @@ class VmCloud(abc.ABC):
 
     # -- the account ----------------------------------------------------------------------------
 
+    def account(self: Adapter, options: Any) -> Adapter:
+        """Return an adapter for the account (project, subscription) that options name."""
+        return self
+
     @abc.abstractmethod
     def check_credentials(self) -> None:
         """
@@ -202,6 +209,14 @@ class VmCloud(abc.ABC):
     def enabled_regions(self) -> list[str]:
         """Return the regions that the account may use."""
         return list(self.regions.enabled)
+
+    def searched_regions(self) -> list[str]:
+        """
+        Return the regions of ``find``, ``images`` and ``leftovers`` if the user names none.
+
+        [''] if one request answers for all regions; these methods then get '' as region.
+        """
+        return self.enabled_regions()
 
     # -- types and prices -----------------------------------------------------------------------
 
@@ -270,15 +285,20 @@ class VmCloud(abc.ABC):
 
     @abc.abstractmethod
     def insert(
-        self, place: Place, order: Order, prepared: Any, created: Sequence[str],
+        self, place: Place, order: Order, prepared: Any, created: list[str],
         tags: Mapping[str, str],
     ) -> str:
         """
         Request a machine and return the cloud's id; the same token never creates two.
 
+        :param created: ids for ``undo_begin``; what it creates besides is added.
         :param tags: of the machine: those of the order, the host key and the price.
         :raises CloudError: with ``full`` if there is no capacity.
         """
+
+    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the command by which a machine with these tags ends itself, as root."""
+        return END_COMMAND
 
     @abc.abstractmethod
     def delete(self, machine: VmId) -> None:

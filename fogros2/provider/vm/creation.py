@@ -101,7 +101,7 @@ class Creation:
             # all look-ups come before the first creation, at the same time
             there = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
             sources = pool.submit(lambda: list(options.ssh_from) or self._sources())
-            data = pool.submit(self._user_data, options)
+            data = pool.submit(self._user_data, options, tags)
             order = Order(self._spec, self._request, options, tags, b'', ())
             prepared = pool.submit(self._cloud.prepare, region, order, options.types)
             found = there.result()
@@ -126,11 +126,14 @@ class Creation:
                 f'give the machine another name=, or: ros2 fog delete {self._spec.name}')
         return None
 
-    def _user_data(self, options: VmOptions) -> bytes:
+    def _user_data(self, options: VmOptions, tags: Mapping[str, str]) -> bytes:
+        agent = self._request.agent_config
+        if agent:
+            agent = {**agent, 'end_command': list(self._cloud.end_command(tags))}
         return user_data(
             name=self._spec.name, user=options.user,
             authorized_key=self._request.authorized_key,
-            host_key=one_time(self._request.token), agent_config=self._request.agent_config)
+            host_key=one_time(self._request.token), agent_config=agent)
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []

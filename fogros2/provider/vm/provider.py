@@ -40,7 +40,7 @@ from fogros2.provider.vm.cloud import (
 from fogros2.provider.vm.creation import Creation
 from fogros2.provider.vm.market import Market
 from fogros2.provider.vm.options import CHEAPEST, NEAREST, VmOptions
-from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM, END_COMMAND
+from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM
 from fogros2.waiting import cancellable, wait_until
 
 T = TypeVar('T')
@@ -87,7 +87,7 @@ class VmProvider(Provider):
     def check(self, spec: MachineSpec) -> None:
         """Check options and credentials without a request."""
         options = self._cloud.options.of(spec)
-        self._cloud.check_credentials()
+        self._cloud.account(options).check_credentials()
         region = self._region(options)
         for one in (*((region,) if region != NEAREST else ()), *options.regions):
             options.in_region(one)
@@ -108,7 +108,7 @@ class VmProvider(Provider):
                                      if among is None or one in among]
         options = options.in_region(region)
         kind = options.named_type
-        market = Market(self._cloud.until(self.cancel))
+        market = Market(self._cloud.account(options).until(self.cancel))
         if options.chooses_type:
             choice = market.choose([region], options.wants())
             kind = choice.chosen.type.name
@@ -141,7 +141,8 @@ class VmProvider(Provider):
         """Return the architecture of the types that a resolved spec may use, if it is one."""
         options = self._cloud.options.parse(spec.options)
         region = self._region(options)
-        arch = self._cloud.architecture(region, options.in_region(region).types)
+        arch = self._cloud.account(options).architecture(
+            region, options.in_region(region).types)
         return 'aarch64' if arch == 'arm64' else arch
 
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
@@ -153,13 +154,14 @@ class VmProvider(Provider):
         options = options.in_region(region)
         if options.named_type == CHEAPEST or options.chooses_type:
             return None
-        return self._price(region, options.types[0], options.spot, self.cancel)
+        return self._price(region, options.types[0], options, self.cancel)
 
     def _price(
-        self, region: str, kind: str, spot: bool, cancel: Optional[threading.Event],
+        self, region: str, kind: str, options: VmOptions, cancel: Optional[threading.Event],
     ) -> Optional[Decimal]:
         with contextlib.suppress(FogError):
-            return Market(self._cloud.until(cancel).hasty()).price_of(region, kind, spot=spot)
+            market = Market(self._cloud.account(options).until(cancel).hasty())
+            return market.price_of(region, kind, spot=options.spot)
         return None
 
     # -- a machine's life -----------------------------------------------------------------------
@@ -170,10 +172,11 @@ class VmProvider(Provider):
         if options.chooses_type or self._region(options) == NEAREST:
             spec = self._resolved(spec)
             options = self._cloud.options.of(spec)
+        cloud = self._cloud.account(options)
         creation = Creation(
-            self._cloud.until(cancel), self._cloud.lasting(), spec, request, options,
+            cloud.until(cancel), cloud.lasting(), spec, request, options,
             sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
-            price=lambda region, kind: self._price(region, kind, options.spot, cancel))
+            price=lambda region, kind: self._price(region, kind, options, cancel))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
         if creation.undo_failures:
             self._notes[machine.vm] = '; '.join(map(str, creation.undo_failures))
@@ -206,7 +209,8 @@ class VmProvider(Provider):
             vpn_host=vm.address if running else '', private_network=vm.private_network,
             private_ip=vm.private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
-            disk_gb=int(disk) if disk.isdecimal() else None, tags=tags, end_command=END_COMMAND,
+            disk_gb=int(disk) if disk.isdecimal() else None, tags=tags,
+            end_command=self._cloud.end_command(tags),
             cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped)
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
@@ -230,9 +234,9 @@ class VmProvider(Provider):
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
                     f'the console of {cloud.title} has its system log')
             found = self.machine_of(vm)
+            notes = '; '.join(filter(None, (vm.note, self._notes.get(machine.vm))))
             return dataclasses.replace(
-                found, id=machine_id, note=self._notes.get(machine.vm, ''),
-            ) if found.shell is not None else None
+                found, id=machine_id, note=notes) if found.shell is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(
@@ -282,7 +286,8 @@ class VmProvider(Provider):
             found = self._cloud.leftovers(region, time.time(), attempts)
             for attempt in found:
                 self._cloud.sweep(region, attempt)
-            return [f"security group and key of '{name}' in {region}" for name in found.values()]
+            where = f' in {region}' if region else ''
+            return [f"firewall and key of '{name}'{where}" for name in found.values()]
         return [words for found in self._everywhere(self._cloud, ask) for words in found]
 
     # -- its network ----------------------------------------------------------------------------
@@ -374,7 +379,7 @@ class VmProvider(Provider):
         regions = self._named_regions()
         named = bool(regions) and ALL not in regions
         if not named:
-            regions = sorted(cloud.enabled_regions())
+            regions = sorted(cloud.searched_regions())
 
         def attempt(region: str) -> tuple[Optional[T], Optional[FogError]]:
             try:

@@ -3,9 +3,8 @@
 EC2 in a box, for tests of what uses EC2: see :class:`Ec2Box`.
 
 ``box`` is what a test holds; ``server`` the process behind it, which has Moto (``api``, ``rules``,
-``market``, ``hooks``), the computers (``cloud``, ``computer``, ``guest``, ``told``,
-``cloud_config``, ``metadata``) and the network (``network``, ``netns``). ``iam`` has the policy
-that ``doc/aws.md`` gives to robots.
+``market``, ``hooks``) in front of ``rigs.computers`` (``cloud``, ``told``, ``metadata``). ``iam``
+has the policy that ``doc/aws.md`` gives to robots.
 """
 
 from rigs.ec2.box import Call, Ec2Box, Instance

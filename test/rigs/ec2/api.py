@@ -3,7 +3,7 @@
 The box's AWS: Moto's server, with faults to order, the rules it lacks, and a record of calls.
 
 A WSGI application around Moto's. What Moto can't answer (prices, public parameters) is answered
-here; an ``/checkip`` tells callers their own address.
+here.
 """
 
 from __future__ import annotations
@@ -82,10 +82,7 @@ class Api:
 
     def __call__(self, environ: dict[str, Any], start_response: Start) -> Iterable[bytes]:
         """Answer a request."""
-        if environ.get('PATH_INFO') == '/checkip':
-            answer = Answer(200, 'text/plain', f"{environ['REMOTE_ADDR']}\n".encode())
-        else:
-            answer = self._answer(environ)
+        answer = self._answer(environ)
         start_response(f'{answer.status} {answer.status}', [
             ('Content-Type', answer.content_type), ('Content-Length', str(len(answer.body)))])
         return [answer.body]

@@ -51,7 +51,9 @@ def install(cloud: Cloud) -> None:
     def run_instances(self: Any, *args: Any, **kwargs: Any) -> Any:
         reservation = MOTO['run'](self, *args, **kwargs)
         for instance in reservation.instances:
-            cloud.launch(instance, spot=bool(kwargs.get('instance_market_options')))
+            cloud.launch(
+                str(instance.id), instance, spot=bool(kwargs.get('instance_market_options')),
+                disk_of=str(instance.image_id))
         return reservation
 
     def start(self: Any) -> Any:
@@ -59,23 +61,23 @@ def install(cloud: Cloud) -> None:
             before = copy.copy(self._state)
             if before.name == 'stopped':
                 MOTO['start'](self)
-                cloud.start(self)
+                cloud.start(str(self.id))
         return before
 
     def stop(self: Any) -> Any:
         before = copy.copy(self._state)
         if before.name in ('pending', 'running'):
-            cloud.end(self, 'stop')
+            cloud.end(str(self.id), 'stop')
         return before
 
     def terminate(self: Any) -> Any:
         before = copy.copy(self._state)
         if before.name not in ('shutting-down', 'terminated'):
-            cloud.end(self, 'terminate')
+            cloud.end(str(self.id), 'terminate')
         return before
 
     def reboot(self: Any) -> None:
-        cloud.reboot(self)
+        cloud.reboot(str(self.id))
 
     def create_image(
         self: Any, instance_id: str, name: str, description: str,

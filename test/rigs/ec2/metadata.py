@@ -17,8 +17,8 @@ import threading
 import time
 from typing import Optional
 
-from rigs.ec2 import netns
-from rigs.ec2.network import METADATA
+from rigs.computers import netns
+from rigs.computers.network import METADATA
 
 _TOKENS_PATH = '/latest/api/token'
 _LONGEST = 21600

@@ -15,7 +15,8 @@ import hashlib
 import threading
 from typing import Any, Optional
 
-from rigs.ec2 import cloud_config, hooks, market
+from rigs.computers import cloud_config
+from rigs.ec2 import hooks, market
 from rigs.ec2.answers import Answer, Refusal
 from rigs.ec2.cloud import Cloud
 

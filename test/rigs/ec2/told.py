@@ -9,8 +9,8 @@ import dataclasses
 import json
 from typing import Any
 
-from rigs.ec2 import cloud_config, network
-from rigs.ec2.computer import USER
+from rigs.computers import cloud_config, network
+from rigs.computers.computer import USER
 
 
 def plan(instance: Any) -> dict[str, Any]:

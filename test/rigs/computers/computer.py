@@ -25,7 +25,7 @@ from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
 from fogros2.provider.container.engine import Engine
-from rigs.ec2 import guest
+from rigs.computers import guest
 
 #: Roots of all boxes; the file systems of /tmp and /run may not take an overlay's layer.
 DISKS = Path('/var/lib/fogros2-ec2')

@@ -9,7 +9,7 @@ The network of a box: a router, the robot and one place for each instance; nothi
 
 Each is a network namespace, so no address of it exists outside, and boxes side by side don't
 meet. The router enforces the security groups on what an instance is sent, remembers connections
-as EC2 does, and lets nobody dial the robot, as a home's NAT.
+as clouds do, and lets nobody dial the robot, as a home's NAT.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Optional
 
 from fogros2 import process
 from fogros2.model import Command
-from rigs.ec2 import netns
+from rigs.computers import netns
 
 #: Of TEST-NET-2 (RFC 5737): nobody's.
 ROUTER = '198.51.100.1'
@@ -38,16 +38,18 @@ PREFIX = 'fogt'
 @dataclasses.dataclass(frozen=True)
 class Allowed:
     """
-    What a security group lets in.
+    What a cloud's firewall lets in.
 
     :param protocol: tcp, udp, icmp, or '-1' for all.
     :param ports: first and last; None for all.
     :param sources: networks in CIDR form.
+    :param accept: False for what it keeps out, unless an earlier entry lets it in.
     """
 
     protocol: str
     ports: Optional[tuple[int, int]]
     sources: tuple[str, ...]
+    accept: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +69,8 @@ def rules(hosts: Sequence[Host]) -> str:
     for host in hosts:
         lines.append(f' chain {host.link} {{')
         for entry in host.allowed:
-            lines += [f'  ip saddr {source} {_what(entry)}accept' for source in entry.sources]
+            verdict = 'accept' if entry.accept else 'drop'
+            lines += [f'  ip saddr {source} {_what(entry)}{verdict}' for source in entry.sources]
         lines.append('  drop\n }')
     lines += [' chain forward {', '  type filter hook forward priority 0; policy drop;',
               '  ct state established,related accept']

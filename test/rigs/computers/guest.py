@@ -245,7 +245,7 @@ def systemctl(words: Sequence[str]) -> None:
     elif order[:1] == ['is-active'] and set(order[1:]) <= ssh:
         print('active')
     elif order[:1] != ['daemon-reload']:
-        print(f'systemctl of EC2 in a box knows no {" ".join(words)!r}', file=sys.stderr)
+        print(f'systemctl of a cloud in a box knows no {" ".join(words)!r}', file=sys.stderr)
         sys.exit(1)
 
 

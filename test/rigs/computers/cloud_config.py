@@ -20,7 +20,7 @@ import zlib
 
 import yaml
 
-#: EC2 takes no more, before base64.
+#: The smallest limit of the clouds, before base64.
 LIMIT = 16384
 #: What a cloud-config may ask for here. The last line's are understood and change nothing.
 KNOWN = (
@@ -134,7 +134,8 @@ def _configured(plan: Plan, text: str) -> Plan:
         raise UserDataError('the cloud-config holds no settings')
     unknown = sorted(set(config) - set(KNOWN))
     if unknown:
-        raise UserDataError(f"EC2 in a box knows no {', '.join(map(str, unknown))} in user data")
+        raise UserDataError(
+            f"a cloud in a box knows no {', '.join(map(str, unknown))} in user data")
     return dataclasses.replace(
         plan,
         bootcmd=(*plan.bootcmd, *_commands(config.get('bootcmd'))),

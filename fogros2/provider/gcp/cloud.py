@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compute Engine as a cloud of virtual machines."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import copy
+from decimal import Decimal
+import os
+from typing import Any, Callable, ClassVar, Optional
+
+from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.model import Image, MachineState
+from fogros2.provider import TAG_NAME, TAG_ON_EXIT, TAG_ROBOT
+from fogros2.provider.gcp import firewall, guest, images, instances
+from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
+from fogros2.provider.gcp.failures import GoogleError
+from fogros2.provider.gcp.options import Options
+from fogros2.provider.gcp.regions import api_host, REGIONS
+from fogros2.provider.offers import MachineType
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    Order,
+    own_name,
+    Place,
+    TAG_ATTEMPT,
+    TAG_MADE,
+    Vm,
+    VmCloud,
+    VmId,
+)
+from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.regions import Regions
+from fogros2.store import is_another_robot
+
+#: Seconds after which firewall rules without an instance are leftovers.
+SETTLED = 900.0
+#: The region of FogROS2's default zone.
+DEFAULT_REGION = 'us-central1'
+
+
+class ComputeEngine(VmCloud):
+    """
+    Compute Engine instances, each with its own firewall rules.
+
+    :param account: None for the account of this computer's user.
+    """
+
+    name: ClassVar[str] = 'gcp'
+    title: ClassVar[str] = 'Google Cloud'
+    options: ClassVar[type[VmOptions]] = Options
+    regions: ClassVar[Regions] = Regions('Google Cloud', REGIONS, api_host)
+    #: Project, zone and name.
+    id_form: ClassVar[str] = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
+    base_region: ClassVar[str] = DEFAULT_REGION
+    regions_variable: ClassVar[str] = 'FOGROS2_GCP_REGIONS'
+
+    def __init__(self, account: Optional[Account] = None) -> None:
+        self._account = account or Account()
+
+    def _with(self, account: Account) -> ComputeEngine:
+        other = copy.copy(self)
+        other._account = account
+        return other
+
+    def hasty(self) -> ComputeEngine:
+        """Return an adapter with few attempts."""
+        return self._with(self._account.hasty())
+
+    # -- the account ----------------------------------------------------------------------------
+
+    def account(self, options: Any) -> ComputeEngine:
+        """Return an adapter for the project that options name."""
+        return self._with(self._account.of_project(options.project_id))
+
+    def check_credentials(self) -> None:
+        """Check that there are credentials and a project."""
+        self._account.check()
+
+    def whoami(self, region: str) -> str:
+        """Return the project."""
+        project = self._account.hasty().project
+        self._account.hasty().call('GET', project, f"asking Google for the project '{project}'")
+        return f'project {project}, {region}'
+
+    def default_region(self) -> str:
+        """Return the region of gcloud's variables, else the one of FogROS2."""
+        zone = os.environ.get('CLOUDSDK_COMPUTE_ZONE', '')
+        return os.environ.get('CLOUDSDK_COMPUTE_REGION', '') or zone[:-2] or DEFAULT_REGION
+
+    def searched_regions(self) -> list[str]:
+        """Return that one request answers for all regions."""
+        return ['']
+
+    # -- types and prices -----------------------------------------------------------------------
+
+    def account_key(self) -> str:
+        """Return what distinguishes this project and endpoint from others in the cache."""
+        return f'{self._account.project}|{os.environ.get(ENDPOINT_VARIABLE, "")}'
+
+    def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
+        """Return the types of every zone of a region; all types if none is named."""
+        key = (region, *names)
+        if key not in self._account.types:
+            kinds = ' OR '.join(f'(name = "{name}")' for name in names)
+            zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
+            self._account.types[key] = list(self._account.pages(
+                f'{self._account.project}/aggregated/machineTypes', 'asking for the machine types',
+                cancel=self.cancel, maxResults='500',
+                filter=f'({kinds}) AND ({zones})' if names else f'({zones})'))
+        return self._account.types[key]
+
+    def types(self, region: str) -> list[MachineType]:
+        """Return the types of a region."""
+        found = {entry['name']: entry for entry in self._types(region, ())}
+        return [instances.machine_type(entry) for entry in found.values()]
+
+    def zones(self, region: str) -> dict[str, list[str]]:
+        """Return the zones of a region that have each type."""
+        found: dict[str, list[str]] = {}
+        for entry in self._types(region, ()):
+            found.setdefault(entry['name'], []).append(entry['zone'])
+        return found
+
+    def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
+        """Refuse: Google's API has no prices of types."""
+        raise ProviderError("Google's prices are not known here",
+                            'name a machine_type=, and leave max_price= out')
+
+    def architecture(self, region: str, types: Sequence[str]) -> str:
+        """Return the architecture of types, if it is the same for all."""
+        found = {instances.machine_type(entry).arch for entry in self._types(region, types)}
+        return found.pop() if len(found) == 1 else ''
+
+    # -- machines -------------------------------------------------------------------------------
+
+    def _instances(self, tags: Mapping[str, str]) -> list[Vm]:
+        project = self._account.project
+        return [instances.vm_of(project, entry) for entry in self._account.pages(
+            f'{project}/aggregated/instances', 'looking for machines', cancel=self.cancel,
+            filter=instances.label_filter(tags))]
+
+    def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
+        """Return the instances with all of ``tags``."""
+        return [vm for vm in self._instances(tags)
+                if region in ('', vm.region) and vm.state is not MachineState.DELETED
+                # one that is being deleted looks like one that is being stopped
+                and (vm.state is not MachineState.STOPPING or vm.tags.get(TAG_ON_EXIT) == 'stop')]
+
+    def get(self, region: str, vm: str) -> Optional[Vm]:
+        """Return an instance."""
+        project = vm.partition('/')[0]
+        try:
+            found = self._account.call('GET', _path(vm), f'looking for {vm}', cancel=self.cancel)
+        except GoogleError as error:
+            if error.gone:
+                raise MachineNotFound(f'there is no {vm} any more') from error
+            raise
+        self._account.labels[vm] = found['labelFingerprint'], found.get('labels', {})
+        known = instances.vm_of(project, found)
+        if known.state is MachineState.DELETED:
+            raise MachineNotFound(f'{vm} has ended')
+        return known
+
+    def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
+        """Return the zones and the image of each type."""
+        options: Options = order.options
+        chosen: dict[str, Any] = {}
+        for entry in self._types(region, types):
+            kind = instances.machine_type(entry)
+            if entry['zone'] == (options.zone or entry['zone']):
+                chosen.setdefault(kind.name, {
+                    'arch': kind.arch, 'gpus': bool(kind.gpus or options.accelerators),
+                    'zones': []})['zones'].append(entry['zone'])
+        if not chosen:
+            raise ConfigurationError(
+                f'{options.zone or region} has no machine type {" or ".join(types)}',
+                'gcloud compute machine-types list shows what it has')
+        found: dict[Any, tuple[str, int]] = {}
+        for entry in chosen.values():
+            key = entry['arch'], entry['gpus']
+            if key not in found:
+                found[key] = images.choose(
+                    self._account, options, *key, order.request.dependencies, self.cancel)
+            entry['path'], entry['size'] = found[key]
+        return {kind: chosen[kind] for kind in types if kind in chosen}
+
+    def begin(self, region: str, order: Order, created: list[str]) -> None:
+        """Create the firewall rules."""
+        network = f'global/networks/{order.options.network}'
+        tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
+                'region': region}
+        rules = [firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
+                 firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
+                               order.request.vpn_port)]
+        if firewall.ipv4(order.sources):
+            rules.append(firewall.rule(
+                order.attempt, f'tcp-{firewall.SSH}', network, tags,
+                firewall.ipv4(order.sources), 'tcp', firewall.SSH))
+        firewall.create(self._account, rules, self.cancel)
+
+    def undo_begin(
+        self, region: str, attempt: str, created: Sequence[str],
+    ) -> Iterator[tuple[str, Callable[[], None]]]:
+        """Yield the deletion of the firewall rules."""
+        yield 'the firewall rules', lambda: firewall.delete(
+            self._account, self._account.project, attempt)
+
+    def places(self, region: str, order: Order) -> Iterator[str]:
+        """Yield the zones of the region that have one of the types."""
+        types = self._types(region, order.options.types)
+        yield from [order.options.zone] if order.options.zone else sorted(
+            {str(entry['zone']) for entry in types})
+
+    def insert(
+        self, place: Place, order: Order, prepared: Any, created: Sequence[str],
+        tags: Mapping[str, str],
+    ) -> str:
+        """Request an instance, and wait until Google has found capacity for it."""
+        if place.zone not in prepared['zones']:
+            raise CloudError(f'{place.zone} has no machine type {place.kind}', full='zone')
+        name, project = own_name(order.attempt), self._account.project
+        try:
+            self._account.run(
+                'POST', f'{project}/zones/{place.zone}/instances',
+                f"creating '{order.spec.name}' ({place.kind} in {place.zone})", cancel=self.cancel,
+                requestId=order.token(place),
+                body=instances.insertion(place, order, prepared, self._subnet(place, order), tags))
+        except GoogleError as error:
+            if error.code not in ('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
+                raise
+        return f'{project}/{place.zone}/{name}'
+
+    def _subnet(self, place: Place, order: Order) -> str:
+        """Return the subnetwork of a network that the user has named."""
+        name = order.options.network
+        if name == 'default':
+            return ''
+        found = self._account.call(
+            'GET', f'{self._account.project}/global/networks/{name}',
+            f"looking for the network '{name}'", cancel=self.cancel)
+        return next((str(url) for url in found.get('subnetworks', ())
+                     if f'/regions/{place.region}/' in url), '')
+
+    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the deletion; an instance that is to be stopped shuts down."""
+        return super().end_command(tags) if tags.get(TAG_ON_EXIT) == 'stop' \
+            else guest.deletion(self._account.endpoint)
+
+    def delete(self, machine: VmId) -> None:
+        """Delete an instance with its disk, then its firewall rules."""
+        self._account.remove(_path(machine.vm), f'deleting {machine.vm}')
+        self._account.labels.pop(machine.vm, None)
+        firewall.delete(self._account, machine.vm.partition('/')[0], machine.attempt)
+
+    def end_attempt(self, region: str, attempt: str) -> None:
+        """Delete the instances of an attempt."""
+        for vm in self._instances({TAG_ATTEMPT: attempt}):
+            self._account.remove(_path(vm.id), f'deleting {vm.id}')
+
+    def sweep(self, region: str, attempt: str) -> None:
+        """Delete an instance that ended itself, and the firewall rules."""
+        self.end_attempt(region, attempt)
+        firewall.delete(self._account, self._account.project, attempt)
+
+    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
+        """Return attempts of which only firewall rules or a stopped disk are left."""
+        project = self._account.project
+        tags = [firewall.tags_of(found) for found in self._account.pages(
+            f'{project}/global/firewalls', 'looking for what is left', cancel=self.cancel,
+            filter='name eq fogros2-.*')]
+        left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
+                if TAG_ATTEMPT in t and region in ('', t.get('region'))
+                and not is_another_robot(t.get(TAG_ROBOT, ''))
+                and (t[TAG_ATTEMPT] in dead or now - float(t.get(TAG_MADE, 0)) > SETTLED)}
+        if left:
+            for vm in self._instances({}):
+                if vm.state is not MachineState.DELETED:
+                    left.pop(vm.tags.get(TAG_ATTEMPT, ''), None)
+        return left
+
+    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
+        """Change the machine's rule for a port."""
+        firewall.allow(self._account, machine.vm.partition('/')[0], machine.attempt, port, sources,
+                       self.cancel)
+
+    def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
+        """Replace labels, which Google takes only as a whole and with their fingerprint."""
+        for again in (True, False):
+            if machine.vm not in self._account.labels:
+                self.get(machine.region, machine.vm)
+            fingerprint, labels = self._account.labels.pop(machine.vm)
+            kept = {key: value for key, value in labels.items()
+                    if not any(key == tag or key.startswith(f'{tag}_') for tag in tags)}
+            try:
+                self._account.run(
+                    'POST', f'{_path(machine.vm)}/setLabels', f'writing labels of {machine.vm}',
+                    cancel=self.cancel, body={'labelFingerprint': fingerprint, 'labels': {
+                        **kept, **instances.RULES.encode(tags)}})
+                return
+            except GoogleError as error:
+                if error.code != 'CONDITION_NOT_MET' or not again:
+                    raise
+
+    def stop(self, machine: VmId) -> None:
+        """Stop an instance."""
+        self._account.call('POST', f'{_path(machine.vm)}/stop', f'stopping {machine.vm}')
+
+    def start(self, machine: VmId) -> None:
+        """Start an instance."""
+        self._account.run('POST', f'{_path(machine.vm)}/start', f'starting {machine.vm}')
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        """Make an image of an instance."""
+        vm = self.get(machine.region, machine.vm)
+        assert vm is not None
+        return images.bake(self._account, vm, name, dependencies)
+
+    def images(self, region: str) -> Iterable[Image]:
+        """Return the images of FogROS2."""
+        return images.images_in(self._account, region, self.cancel)
+
+    def delete_image(self, image_id: str) -> None:
+        """Delete an image."""
+        images.delete(self._account, image_id)
+
+
+def _path(vm: str) -> str:
+    """Return the path of an instance below ``projects/``."""
+    project, zone, name = vm.split('/')
+    return f'{project}/zones/{zone}/instances/{name}'

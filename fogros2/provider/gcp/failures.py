@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Convert Google's refusals to FogErrors: one table from error codes to hints.
+
+A request is refused with a *reason* in camel case, and an operation that fails later with a
+*code* in capitals. Source: "Troubleshooting errors" of Compute Engine's documentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import re
+from typing import Any, NamedTuple
+
+from fogros2.errors import FogError, PrerequisiteError, ProviderError
+from fogros2.provider.vm.cloud import CloudError
+
+#: No capacity in this zone; another zone may have some.
+NO_ROOM_IN_ZONE = frozenset({
+    'ZONE_RESOURCE_POOL_EXHAUSTED', 'ZONE_RESOURCE_POOL_EXHAUSTED_WITH_DETAILS', 'STOCKOUT',
+    'RESOURCE_POOL_EXHAUSTED', 'UNSUPPORTED_OPERATION'})
+#: The project's quota is used up; another type or region may have some.
+NO_ROOM_IN_REGION = frozenset({'QUOTA_EXCEEDED', 'LIMIT_EXCEEDED'})
+#: Google did nothing, and a later request may succeed.
+_TEMPORARY = frozenset({
+    'RATE_LIMIT_EXCEEDED', 'USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY', 'BACKEND_ERROR'})
+_LENGTH = 300
+
+
+class Failure(NamedTuple):
+    """The meaning of a code: a reason ('' keeps Google's own), a remedy, the kind of error."""
+
+    reason: str
+    hint: str
+    kind: type[FogError] = ProviderError
+
+
+_QUOTA = Failure('', 'ask for more at IAM & Admin, Quotas, or take another type or region')
+_FAILURES = {
+    'AUTH_ERROR': Failure(
+        'Google does not take these credentials', 'gcloud auth application-default login',
+        PrerequisiteError),
+    'ACCESS_NOT_CONFIGURED': Failure(
+        'the project has not enabled the Compute Engine API',
+        'gcloud services enable compute.googleapis.com', PrerequisiteError),
+    'PROJECT_NOT_FOUND': Failure('', 'check project_id=', PrerequisiteError),
+    **dict.fromkeys(NO_ROOM_IN_ZONE, Failure(
+        'Google has no free machine of this type here at the moment',
+        'try later, or give more types and places: machine_types=, regions=')),
+    **dict.fromkeys(NO_ROOM_IN_REGION, _QUOTA),
+    'RATE_LIMIT_EXCEEDED': Failure('Google asks for fewer requests', 'try again in a minute'),
+    'FORBIDDEN': Failure('', 'give it the roles of doc/gcp.md'),
+    'PERMISSIONS_ERROR': Failure('', 'give it the roles of doc/gcp.md'),
+    'RESOURCE_IN_USE_BY_ANOTHER_RESOURCE': Failure('', 'ros2 fog delete again in a minute'),
+    'BACKEND_ERROR': Failure('', 'try again; https://status.cloud.google.com has what is known'),
+}
+
+
+class GoogleError(CloudError):
+    """Google refused; ``code`` is its error code, in capitals."""
+
+    def __init__(self, message: str, hint: str = '', *, code: str = '', status: int = 0) -> None:
+        super().__init__(
+            message, hint, gone=code in ('NOT_FOUND', 'RESOURCE_NOT_FOUND'),
+            denied=code in ('FORBIDDEN', 'PERMISSIONS_ERROR'),
+            full='zone' if code in NO_ROOM_IN_ZONE else
+            'region' if code in NO_ROOM_IN_REGION else '')
+        self.code = code
+        self.temporary = code in _TEMPORARY or status >= 500 and not self.full
+        # after a fault of Google, the request may have had its effect
+        self.refused = status < 500 or bool(self.full)
+
+
+def refused(status: int, answer: Any, what: str) -> FogError:
+    """
+    Return the error for a refused request.
+
+    :param answer: the answer, decoded from JSON; anything from a proxy.
+    """
+    try:
+        error = answer['error']
+        details: Mapping[str, Any] = (error.get('errors') or [{}])[0]
+        said = str(error.get('message') or '')
+        code = re.sub('([a-z])([A-Z])', r'\1_\2', str(details.get('reason') or '')).upper()
+    except (TypeError, KeyError, AttributeError, IndexError):
+        return PrerequisiteError(f'{what} failed: what answered is not Google (HTTP {status})',
+                                 'is there a proxy, or a page to log in to this network?')
+    if status == 401:
+        code = 'AUTH_ERROR'
+    elif status == 404 and re.search(r"resource 'projects/[^/']+'", said):
+        code = 'PROJECT_NOT_FOUND'
+    elif status in (404, 429):
+        code = 'NOT_FOUND' if status == 404 else 'RATE_LIMIT_EXCEEDED'
+    return failure(code or str(error.get('status') or status), said, what, status)
+
+
+def failed(operation: Mapping[str, Any], what: str) -> FogError:
+    """Return the error for an operation that ended with one."""
+    first = operation['error']['errors'][0]
+    return failure(str(first.get('code', '')), str(first.get('message') or ''), what)
+
+
+def failure(code: str, said: str, what: str, status: int = 0) -> FogError:
+    """Return the error for a code and Google's own words."""
+    known = _FAILURES.get(code, Failure('', ''))
+    said = ' '.join(said.split())[:_LENGTH]
+    message = f'{what} failed: {known.reason or said or "Google gave no reason"} [{code}]'
+    if known.kind is not ProviderError:
+        return known.kind(message, known.hint)
+    return GoogleError(message, known.hint, code=code, status=status)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Google's refusals: at once with a reason, or late, as the error of an operation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: HTTP status of reasons; others have 400.
+STATUS = {
+    'notFound': 404, 'alreadyExists': 409, 'forbidden': 403, 'quotaExceeded': 403,
+    'rateLimitExceeded': 403, 'accessNotConfigured': 403, 'conditionNotMet': 412,
+    'authError': 401, 'backendError': 503, 'internalError': 500, 'duplicate': 409}
+_MESSAGES = {
+    'forbidden': "Required 'compute.instances.create' permission for 'projects/robots'",
+    'rateLimitExceeded': 'Rate Limit Exceeded',
+    'authError': 'Request had invalid authentication credentials.',
+    'backendError': 'Backend Error',
+    'accessNotConfigured': 'Compute Engine API has not been used in project robots before',
+    'ZONE_RESOURCE_POOL_EXHAUSTED':
+        'The zone does not have enough resources available to fulfill the request.',
+    'QUOTA_EXCEEDED': "Quota 'CPUS' exceeded. Limit: 24.0 in region us-central1.",
+}
+
+
+class Refusal(Exception):
+    """An error that Google answers at once; ``reason`` is Google's."""
+
+    def __init__(self, reason: str, message: str = '') -> None:
+        super().__init__(message or _MESSAGES.get(reason, reason))
+        self.reason = reason
+        self.status = STATUS.get(reason, 400)
+
+    def body(self) -> dict[str, Any]:
+        """Return the answer."""
+        return {'error': {'code': self.status, 'message': str(self), 'errors': [
+            {'domain': 'global', 'reason': self.reason, 'message': str(self)}]}}
+
+
+def late(code: str, message: str = '') -> dict[str, Any]:
+    """Return the error of an operation."""
+    return {'errors': [{'code': code, 'message': message or _MESSAGES.get(code, code)}]}

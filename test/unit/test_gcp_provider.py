@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decisions of the provider of Google Cloud, by value: options, requests, states, errors."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from fogros2.errors import (
+    ConfigurationError,
+    MachineNotFound,
+    PrerequisiteError,
+    ProviderError,
+)
+from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
+from fogros2.provider.gcp import account, failures, firewall, GCPProvider, instances
+from fogros2.provider.gcp.options import Options
+from fogros2.provider.vm import cloud
+from fogros2.provider.vm.cloud import Order, Place
+from fogros2.testing import request_for
+
+SPEC = MachineSpec('planner', 'gcp', {})
+REQUEST = CreateRequest('5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37', 'ssh-ed25519 AAAA robot',
+                        {'fogros2-launch': 'l1'}, 51820)
+IMAGE = {'path': 'projects/ubuntu-os-cloud/global/images/family/ubuntu-2404-lts-amd64',
+         'size': 10, 'gpus': False}
+
+
+# -- options ----------------------------------------------------------------------------------
+
+
+def test_options_of_fogros2_are_accepted_in_every_form():
+    options = Options.parse({
+        'project_id': 'shade-prod', 'ami_image': 'projects/ubuntu-os-cloud/global/images/'
+        'ubuntu-2204-jammy-v20220712a', 'zone': 'us-central1-a', 'machine_type': 'e2-medium',
+        'disk_size': '10', 'spot': 'true', 'labels': {'team': 'slam'}, 'tags': {'note': 'A b'}})
+    assert (options.region, options.zone) == ('us-central1', 'us-central1-a')
+    assert options.disk_size == 10
+    assert options.spot is True
+    assert Options.parse({}).types == ['e2-medium']
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'machine_typ': 'e2-medium'}, "did you mean 'machine_type'"),
+    ({'zone': 'us-central1'}, "it takes 'us-central1-a'"),
+    ({'zone': 'us-central1-a', 'region': 'europe-west3'}, 'is not in the region europe-west3'),
+    ({'zone': 'us-central1-a', 'regions': ['europe-west3']}, 'belongs to one region'),
+    ({'project_id': '12345'}, "it takes the project's id, not its name or number"),
+    ({'project_id': 'My Project'}, "can't be the project_id"),
+    ({'machine_type': 'medium'}, "it takes 'e2-medium' or 'cheapest'"),
+    ({'accelerators': 'T4'}, "it takes 'nvidia-tesla-t4'"),
+    ({'service_account': 'robot'}, 'the email address'),
+    ({'disk_size': 9}, 'disk_size= takes 10'),
+    ({'labels': {'Team': 'slam'}}, "can't be a label"),
+    ({'labels': {'team': 'Slam'}}, "can't be a label"),
+    ({'labels': {'team': 'x' * 64}}, "can't be a label"),
+    ({'labels': {'fogros2-name': 'x'}}, "can't be a label"),
+    ({'tags': {'Team': 'slam'}}, "can't be a label"),
+    ({'spot': True, 'max_price': 1}, 'Google takes no limit for a spot price'),
+])
+def test_wrong_option_is_named_with_what_to_do(options, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        Options.parse(options)
+
+
+def test_cheapest_says_that_googles_prices_are_unknown(gce):
+    spec = MachineSpec('planner', 'gcp', {'machine_type': 'cheapest', 'region': 'europe-west3'})
+    with pytest.raises(ProviderError, match="Google's prices are not known here"):
+        GCPProvider().resolve(spec)
+
+
+# -- requests ---------------------------------------------------------------------------------
+
+
+def body(spec=SPEC, image=IMAGE, kind='e2-medium', **options):
+    parsed = Options.parse(options)
+    tags = cloud.own_tags(spec, REQUEST, parsed)
+    order = Order(spec, REQUEST, parsed, tags, b'data', ())
+    return instances.insertion(Place('us-central1', kind, 'us-central1-a'), order, image, '', tags)
+
+
+def test_request_keeps_the_projects_users_out():
+    items = {item['key']: item['value'] for item in body()['metadata']['items']}
+    assert items['block-project-ssh-keys'] == 'TRUE'
+    assert base64.b64decode(items['user-data']) == b'data'
+    assert items['user-data-encoding'] == 'base64'
+    assert body()['serviceAccounts'] == []
+
+
+def test_disk_fits_the_image_and_the_type():
+    assert body(disk_size=20)['disks'][0]['initializeParams']['diskSizeGb'] == '20'
+    large = body(image={**IMAGE, 'size': 50})['disks'][0]['initializeParams']
+    assert large['diskSizeGb'] == '50' and large['diskType'].endswith('/pd-balanced')
+    new = body(kind='c4-standard-2')['disks'][0]['initializeParams']
+    assert new['diskType'].endswith('/hyperdisk-balanced')
+
+
+@pytest.mark.parametrize(('on_exit', 'options', 'gpus', 'expected'), [
+    ('delete', {}, False, {'instanceTerminationAction': 'DELETE',
+                           'maxRunDuration': {'seconds': '28800'}}),
+    ('stop', {}, False, {'instanceTerminationAction': 'STOP',
+                         'maxRunDuration': {'seconds': '28800'}}),
+    ('keep', {}, False, {}),
+    ('delete', {}, True, {'onHostMaintenance': 'TERMINATE'}),
+    ('delete', {'spot': True}, False, {
+        'provisioningModel': 'SPOT', 'onHostMaintenance': 'TERMINATE',
+        'instanceTerminationAction': 'DELETE'}),
+    ('keep', {'spot': True}, False, {'instanceTerminationAction': 'DELETE'}),
+])
+def test_google_ends_the_machine_at_its_lifetime(on_exit, options, gpus, expected):
+    spec = dataclasses.replace(SPEC, on_exit=on_exit)
+    found = instances.scheduling(spec, Options.parse(options), gpus=gpus)
+    assert expected.items() <= found.items()
+    assert found['automaticRestart'] is False
+    if on_exit == 'keep':
+        assert 'maxRunDuration' not in found
+
+
+@pytest.mark.parametrize(('lifetime', 'seconds'), [(1.0, '30'), (90.2, '91'), (1e9, '10368000')])
+def test_lifetime_is_within_googles_limits(lifetime, seconds):
+    spec = dataclasses.replace(SPEC, lifetime=lifetime)
+    found = instances.scheduling(spec, Options(), gpus=False)
+    assert found['maxRunDuration'] == {'seconds': seconds}
+
+
+def test_accelerators_are_those_of_the_zone():
+    (gpu,) = body(accelerators='nvidia-tesla-t4:2')['guestAccelerators']
+    assert gpu == {'acceleratorType': 'zones/us-central1-a/acceleratorTypes/nvidia-tesla-t4',
+                   'acceleratorCount': 2}
+
+
+def test_labels_carry_tags_of_any_characters(gce):
+    provider = GCPProvider()
+    spec = MachineSpec('planner', 'gcp', {
+        'labels': {'team': 'slam'}, 'tags': {'note': 'Grüße, Robot_7!' * 6}})
+    machine = provider.create(spec, request_for(spec))
+    (instance,) = gce.instances
+    assert instance['labels']['team'] == 'slam' and 'Name' not in instance['labels']
+    assert all(re.fullmatch('[a-z0-9_-]{0,63}', value) for value in instance['labels'].values())
+    assert provider.describe(machine).tags['note'] == 'Grüße, Robot_7!' * 6
+    # a shorter value leaves nothing of the longer one
+    provider.adopt(machine, spec, {'note': 'B'})
+    assert provider.describe(machine).tags['note'] == 'B'
+    assert not [key for key in gce.instances[0]['labels'] if key.startswith('note_')]
+
+
+def test_changed_labels_of_another_program_are_kept(gce):
+    provider = GCPProvider()
+    machine = provider.create(SPEC, request_for(SPEC))
+    provider.describe(machine)
+    (instance,) = gce.instances
+    instance['labels']['other'] = 'x'
+    instance['labelFingerprint'] = 'changed='
+    provider.adopt(machine, SPEC, {'fogros2-launch': 'l2'})
+    labels = gce.instances[0]['labels']
+    assert (labels['other'], labels['fogros2-launch']) == ('x', 'l2')
+
+
+# -- reports ----------------------------------------------------------------------------------
+
+
+def test_stopped_machine_of_another_launch_is_no_leftover(gce):
+    spec, provider = dataclasses.replace(SPEC, on_exit='stop'), GCPProvider()
+    machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: 'stop'}))
+    provider.stop(machine)
+    provider.adopt(machine, SPEC, {TAG_ON_EXIT: 'delete'})
+    provider.start(machine)
+    assert provider.reachable(machine, name='planner', timeout=5.0).state is MachineState.RUNNING
+
+
+@pytest.mark.parametrize(('status', 'on_exit', 'state'), [
+    ('PROVISIONING', 'delete', MachineState.PENDING), ('STAGING', 'delete', MachineState.PENDING),
+    ('RUNNING', 'delete', MachineState.RUNNING), ('REPAIRING', 'stop', MachineState.PENDING),
+    ('STOPPING', 'stop', MachineState.STOPPING), ('TERMINATED', 'stop', MachineState.STOPPED),
+    ('TERMINATED', 'keep', MachineState.STOPPED), ('TERMINATED', 'delete', MachineState.DELETED),
+    ('SUSPENDED', 'stop', MachineState.STOPPED)])
+def test_states_of_google_are_those_of_machines(status, on_exit, state):
+    vm = instances.vm_of('robots', {
+        'name': 'fogros2-0', 'zone': 'https://x/projects/robots/zones/europe-west3-b',
+        'status': status, 'labels': {TAG_ON_EXIT: on_exit},
+        'scheduling': {'instanceTerminationAction': 'STOP' if on_exit == 'stop' else 'DELETE'},
+        'machineType': 'https://x/machineTypes/e2-medium',
+        'creationTimestamp': '2026-11-23T08:00:00.000-08:00'})
+    assert (vm.state, vm.region, vm.kind) == (state, 'europe-west3', 'e2-medium')
+    assert vm.id == 'robots/europe-west3-b/fogros2-0'
+    assert vm.created == 1795449600.0
+
+
+def test_machine_that_shut_itself_down_is_a_leftover(gce):
+    provider = GCPProvider()
+    machine = provider.create(SPEC, request_for(SPEC, **{TAG_ON_EXIT: 'delete'}))
+    number = gce.instances[0]['id']
+    gce.project.cloud.shut_down(number)
+    gce.project.cloud.machines[number].thread.join()
+    with pytest.raises(MachineNotFound, match='has ended'):
+        provider.describe(machine)
+    assert not list(provider.find({}))
+    for rule in gce.own_firewalls:
+        rule['description'] = re.sub('"fogros2-made": "[0-9]+"', '"fogros2-made": "1"',
+                                     rule['description'])
+    assert GCPProvider().tidy() == ["firewall and key of 'planner'"]
+    assert gce.instances == [] and gce.own_firewalls == []
+
+
+def test_leftovers_of_another_robot_stay(gce):
+    provider = GCPProvider()
+    provider.create(SPEC, request_for(SPEC, **{TAG_ROBOT: 'another'}))
+    gce.project.cloud.end(gce.instances[0]['id'], 'terminate')
+    for rule in gce.own_firewalls:
+        rule['description'] = rule['description'].replace('"fogros2-made": "', '"x": "')
+    assert provider.tidy() == []
+
+
+@pytest.mark.parametrize(('on_exit', 'program'), [('delete', 'python3'), ('stop', 'shutdown')])
+def test_machine_deletes_or_stops_itself(gce, on_exit, program):
+    spec = dataclasses.replace(SPEC, on_exit=on_exit)
+    provider = GCPProvider()
+    machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: on_exit}))
+    assert provider.describe(machine).end_command[0] == program
+
+
+# -- firewall ---------------------------------------------------------------------------------
+
+
+def test_denial_is_between_our_rules_and_googles(gce):
+    provider = GCPProvider()
+    spec = MachineSpec('planner', 'gcp', {'ssh_from': ['198.51.100.0/28', '2001:db8::/64']})
+    machine = provider.create(spec, request_for(spec))
+    rules = {rule['name'].partition('-')[2].partition('-')[2]: rule for rule in gce.own_firewalls}
+    assert rules['tcp-22']['sourceRanges'] == ['198.51.100.0/28']
+    assert rules['vpn']['allowed'] == [{'IPProtocol': 'udp', 'ports': ['51820']}]
+    for name in ('tcp-22', 'vpn'):
+        assert rules[name]['priority'] < rules['deny']['priority'] < 65534
+    # the networks of ssh_from= are admitted together with the others, at port 22 only
+    provider.allow(machine, 22, ['198.51.100.77/32'])
+    provider.allow(machine, 8766, ['198.51.100.78/32'])
+    rules = {rule['name'].partition('-')[2].partition('-')[2]: rule for rule in gce.own_firewalls}
+    assert rules['tcp-22']['sourceRanges'] == ['198.51.100.0/28', '198.51.100.77/32']
+    assert rules['tcp-8766']['sourceRanges'] == ['198.51.100.78/32']
+    provider.allow(machine, 22, [])
+    assert not [rule for rule in gce.own_firewalls if rule['name'].endswith('tcp-22')]
+    provider.destroy(machine)
+    assert gce.own_firewalls == []
+
+
+def test_rule_of_somebody_else_has_no_tags():
+    assert firewall.tags_of({'description': 'made by hand'}) == {}
+    assert firewall.tags_of({}) == {}
+
+
+# -- errors -----------------------------------------------------------------------------------
+
+
+def answer(reason, message='said', code=400):
+    return {'error': {'code': code, 'message': message, 'errors': [{'reason': reason}]}}
+
+
+@pytest.mark.parametrize(('status', 'reason', 'full', 'certain'), [
+    (403, 'quotaExceeded', 'region', True), (403, 'forbidden', '', True),
+    (503, 'backendError', '', False), (400, 'invalid', '', True)])
+def test_refusal_tells_what_can_be_tried(status, reason, full, certain):
+    error = failures.refused(status, answer(reason), 'creating it')
+    assert (error.full, error.refused) == (full, certain)
+    assert 'creating it failed' in str(error)
+
+
+@pytest.mark.parametrize(('status', 'found', 'kind', 'words'), [
+    (401, answer('authError'), PrerequisiteError, 'gcloud auth application-default login'),
+    (403, answer('accessNotConfigured'), PrerequisiteError, 'gcloud services enable'),
+    (404, answer('notFound', "The resource 'projects/x' was not found"), PrerequisiteError,
+     'check project_id='),
+    (407, None, PrerequisiteError, 'is there a proxy'), (200, 'x', PrerequisiteError, 'a proxy')])
+def test_unusable_accounts_are_named(status, found, kind, words):
+    error = failures.refused(status, found, 'looking')
+    assert isinstance(error, kind) and words in str(error)
+
+
+@pytest.mark.parametrize(('code', 'full'), [
+    ('ZONE_RESOURCE_POOL_EXHAUSTED', 'zone'), ('QUOTA_EXCEEDED', 'region'),
+    ('INTERNAL_ERROR', '')])
+def test_late_failure_of_an_operation_is_certain(code, full):
+    error = failures.failed({'error': {'errors': [{'code': code, 'message': 'm'}]}}, 'creating')
+    assert (error.full, error.refused) == (full, True)
+
+
+def test_full_quota_tries_the_next_type_with_a_new_token(gce):
+    gce.api.faults.append(fault('QUOTA_EXCEEDED', 'instances.insert'))
+    spec = MachineSpec('planner', 'gcp', {'machine_types': ['n2-standard-2']})
+    GCPProvider().create(spec, request_for(spec))
+    assert gce.instances[0]['machineType'].endswith('/n2-standard-2')
+
+
+def test_throttled_request_is_sent_again(gce):
+    gce.api.faults.append(fault('rateLimitExceeded', 'instances.aggregatedList'))
+    assert list(GCPProvider().find({})) == []
+
+
+def test_missing_credentials_are_named(monkeypatch, tmp_path):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('CLOUDSDK_CONFIG', str(tmp_path))
+    monkeypatch.delenv('GOOGLE_APPLICATION_CREDENTIALS', raising=False)
+    assert GCPProvider.configured() is False
+    with pytest.raises(PrerequisiteError, match='there are no Google credentials'):
+        GCPProvider().check(SPEC)
+
+
+def test_project_is_that_of_the_options_first(gce, monkeypatch):
+    assert account.Account().project == 'robots'
+    monkeypatch.setenv('GOOGLE_CLOUD_PROJECT', 'other-project')
+    assert account.Account().project == 'other-project'
+    assert account.Account().of_project('third-project').project == 'third-project'
+
+
+def fault(code, action):
+    from rigs.gce.api import Fault
+    return Fault(code, action)
+
+
+# -- where ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('options', 'image', 'zone'), [
+    ({'machine_type': 't2a-standard-1'}, 'ubuntu-2404-lts-arm64', 'us-central1-a'),
+    ({'machine_type': 'g2-standard-4'}, 'ubuntu-accelerator-2404-amd64-with-nvidia-580',
+     'us-central1-b'),
+    ({'machine_type': 'n1-standard-4', 'accelerators': 'nvidia-tesla-t4', 'zone': 'us-east1-c'},
+     'ubuntu-accelerator-2404-amd64-with-nvidia-580', 'us-east1-c'),
+    ({'zone': 'europe-west3-c'}, 'ubuntu-2404-lts-amd64', 'europe-west3-c')])
+def test_image_and_zone_fit_the_type(gce, options, image, zone):
+    spec = MachineSpec('planner', 'gcp', options)
+    machine = GCPProvider().create(spec, request_for(spec))
+    assert GCPProvider().describe(machine).image.endswith(f'/{image}')
+    assert gce.instances[0]['zone'].endswith(f'/{zone}')
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'ami_image': 'no-such'}, "there is no image 'no-such'"),
+    ({'machine_type': 't2a-standard-1', 'ami_image':
+      'projects/ubuntu-os-cloud/global/images/ubuntu-2204-jammy-v20220712a'}, 'X86_64 processors'),
+    ({'machine_type': 'g2-standard-4', 'zone': 'us-central1-a'}, 'has no machine type')])
+def test_what_does_not_exist_is_refused_before_creation(gce, options, words):
+    spec = MachineSpec('planner', 'gcp', options)
+    with pytest.raises(ConfigurationError, match=words):
+        GCPProvider().create(spec, request_for(spec))
+    assert gce.own_firewalls == []
+
+
+def test_network_in_custom_mode_gets_its_subnetwork(gce):
+    spec = MachineSpec('planner', 'gcp', {'network': 'robots', 'region': 'europe-west3'})
+    GCPProvider().create(spec, request_for(spec))
+    (nic,) = gce.instances[0]['networkInterfaces']
+    assert nic['subnetwork'].endswith('/regions/europe-west3/subnetworks/robots')
+    assert all(rule['network'].endswith('/robots') for rule in gce.own_firewalls)
+
+
+def test_one_request_lists_the_machines_of_all_regions(gce):
+    provider = GCPProvider()
+    for region in ('us-central1', 'europe-west3'):
+        spec = MachineSpec(f'in-{region}', 'gcp', {'region': region})
+        provider.create(spec, request_for(spec))
+    gce.api.calls.clear()
+    assert {machine.region for machine in provider.find({})} == {'us-central1', 'europe-west3'}
+    assert [call.action for call in gce.api.calls] == ['instances.aggregatedList']
+    provider.search_in(['europe-west3'])
+    assert [machine.region for machine in provider.find({})] == ['europe-west3']
+
+
+def test_lists_have_all_pages(gce):
+    gce.project.page = 1
+    provider = GCPProvider()
+    for name in ('one', 'two', 'three'):
+        spec = MachineSpec(name, 'gcp', {})
+        provider.create(spec, request_for(spec))
+    assert {machine.name for machine in provider.find({})} == {'one', 'two', 'three'}
+
+
+def test_no_google_library_before_the_cloud_is_used():
+    program = ('import sys; from fogros2.provider.gcp import GCPProvider; GCPProvider(); '
+               'print(sorted(n for n in sys.modules if n.split(".")[0] in '
+               '("google", "requests", "googleapiclient")))')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          check=True, timeout=60)
+    assert done.stdout.strip() == '[]'
+
+
+def test_box_refuses_what_google_refuses(gce):
+    import requests
+    head = {'Authorization': f'Bearer {gce.api.token()}'}
+
+    def post(path, **words):
+        found = requests.post(f'{gce.endpoint}projects/robots/{path}', headers=head, timeout=5,
+                              **words)
+        return found.status_code, json.loads(found.text)['error']['errors'][0]['reason']
+
+    assert post('global/firewalls', json={'name': 'Capital'}) == (400, 'badRequest')
+    assert post('global/firewalls', json={'nme': 'x'}) == (400, 'badRequest')
+    assert post('global/firewalls', json={'name': 'x'}, params={'a': 'b'}) == (400, 'badRequest')
+    assert post('global/firewalls', json={
+        'name': 'x', 'allowed': [{'IPProtocol': 'tcp'}], 'sourceRanges': ['198.51.100.0/24']},
+        params={'requestId': '1'}) == (400, 'invalid')
+    assert requests.get(f'{gce.endpoint}projects/robots', timeout=5).status_code == 401
