@@ -92,7 +92,7 @@ class Account:
 
     def __init__(self, project: str = '') -> None:
         self._project = project
-        #: Types of machines by region, which each machine of a launch would ask for again.
+        #: Types of machines by project and region: each machine of a launch would ask again.
         self.types: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
         #: Fingerprint of the labels of instances, by id, as last reported.
         self.labels: dict[str, tuple[str, Mapping[str, str]]] = {}
@@ -101,7 +101,6 @@ class Account:
         """Return the account of another project; '' for the same."""
         other = copy.copy(self)
         other._project = project or self._project
-        other.types = {}
         return other
 
     def _opened(self) -> _Login:

@@ -96,7 +96,7 @@ class ComputeEngine(VmCloud):
 
     def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
         """Return the types of every zone of a region; all types if none is named."""
-        key = (region, *names)
+        key = (self._account.project, region, *names)
         if key not in self._account.types:
             kinds = ' OR '.join(f'(name = "{name}")' for name in names)
             zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
