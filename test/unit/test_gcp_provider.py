@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+from decimal import Decimal
 import json
 import re
 import subprocess
@@ -20,7 +21,7 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
-from fogros2.provider.gcp import account, failures, firewall, GCPProvider, instances
+from fogros2.provider.gcp import account, failures, firewall, GCPProvider, instances, prices
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
@@ -70,10 +71,59 @@ def test_wrong_option_is_named_with_what_to_do(options, words):
         Options.parse(options)
 
 
-def test_cheapest_says_that_googles_prices_are_unknown(gce):
-    spec = MachineSpec('planner', 'gcp', {'machine_type': 'cheapest', 'region': 'europe-west3'})
+# -- prices -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def catalogue(gce, monkeypatch):
+    """Set a key for Google's catalogue of prices."""
+    from rigs.gce.catalogue import API_KEY
+    prices._asked.cache_clear()
+    monkeypatch.setenv(prices.KEY_VARIABLE, API_KEY)
+    monkeypatch.setenv(prices.ENDPOINT_VARIABLE, f'{gce.url}/')
+    yield gce
+    prices._asked.cache_clear()
+
+
+def priced(**options):
+    provider = GCPProvider()
+    spec = provider.resolve(MachineSpec('planner', 'gcp', {'region': 'europe-west3', **options}))
+    return spec.options['machine_type'], provider.cost_per_hour(spec)
+
+
+@pytest.mark.parametrize(('options', 'kind', 'price'), [
+    ({'min_cpu': 4, 'arch': 'x86_64'}, 'e2-standard-4', '0.17267112'),
+    ({'machine_type': 'cheapest', 'arch': 'x86_64'}, 'e2-medium', '0.04316778'),
+    ({'machine_type': 'cheapest', 'arch': 'x86_64', 'spot': True}, 'e2-medium', '0.0086319'),
+    ({'machine_type': 'n1-standard-1'}, 'n1-standard-1', '0.0611975'),
+    ({'machine_type': 'n1-standard-1', 'accelerators': 'nvidia-tesla-t4:2'}, 'n1-standard-1',
+     '0.8811975')])
+def test_price_is_the_sum_of_a_types_parts(catalogue, options, kind, price):
+    assert priced(**options) == (kind, Decimal(price))
+
+
+def test_type_with_an_unknown_part_has_no_price(catalogue):
+    assert priced(machine_type='c4-standard-2') == ('c4-standard-2', None)
+
+
+def test_launch_says_what_a_machine_costs(catalogue):
+    spec = MachineSpec('planner', 'gcp', {'region': 'europe-west3', 'machine_type': 'e2-medium'})
+    provider = GCPProvider()
+    machine = provider.describe(provider.create(spec, request_for(spec)))
+    assert machine.cost_per_hour == Decimal('0.04316778')
+
+
+def test_cheapest_without_a_key_says_what_is_missing(gce, monkeypatch):
+    monkeypatch.delenv(prices.KEY_VARIABLE, raising=False)
     with pytest.raises(ProviderError, match="Google's prices are not known here"):
-        GCPProvider().resolve(spec)
+        priced(machine_type='cheapest')
+
+
+def test_refused_key_is_not_in_the_error(catalogue, monkeypatch):
+    monkeypatch.setenv(prices.KEY_VARIABLE, 'AIza-of-another')
+    with pytest.raises(ProviderError, match='a key for the Cloud Billing API') as caught:
+        priced(machine_type='cheapest')
+    assert 'AIza' not in str(caught.value)
 
 
 # -- requests ---------------------------------------------------------------------------------

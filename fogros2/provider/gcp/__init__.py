@@ -3,8 +3,8 @@
 Google Compute Engine, by its REST API.
 
 In reading order: ``options``, ``regions``, ``guest`` (commands on the machine), ``failures``
-(Google's refusals), ``account`` (requests), ``instances``, ``firewall``, ``images``, ``cloud``
-(the adapter).
+(Google's refusals), ``account`` (requests), ``instances``, ``firewall``, ``images``, ``prices``,
+``cloud`` (the adapter).
 """
 
 from __future__ import annotations

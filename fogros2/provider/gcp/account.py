@@ -24,8 +24,8 @@ ENDPOINT_VARIABLE = 'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE'
 _SCOPES = ('https://www.googleapis.com/auth/cloud-platform',)
 #: Variables on which the credentials depend.
 _VARIABLES = ('GOOGLE_APPLICATION_CREDENTIALS', 'CLOUDSDK_CONFIG', 'HOME')
-#: Seconds in which a request is sent again, and those of a request whose answer is only displayed.
-PATIENCE, HASTE = 20.0, 3.0
+#: Seconds in which a request is sent again that Google refuses, or does not answer.
+PATIENCE, UNANSWERED = 20.0, 2.0
 #: Seconds to wait for the answer to a sent request, which may create something.
 ON_ITS_WAY = 4.0
 #: Time-out in seconds of an operation; Google answers a waiting request within two minutes.
@@ -92,8 +92,7 @@ class Account:
 
     def __init__(self, project: str = '') -> None:
         self._project = project
-        self._patience = PATIENCE
-        #: Types of machines by region, which each machine of a launch would ask for again.
+        #: Types of machines by project and region: each machine of a launch would ask again.
         self.types: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
         #: Fingerprint of the labels of instances, by id, as last reported.
         self.labels: dict[str, tuple[str, Mapping[str, str]]] = {}
@@ -102,13 +101,6 @@ class Account:
         """Return the account of another project; '' for the same."""
         other = copy.copy(self)
         other._project = project or self._project
-        other.types = {}
-        return other
-
-    def hasty(self) -> Account:
-        """Return this account with few attempts."""
-        other = copy.copy(self)
-        other._patience = HASTE
         return other
 
     def _opened(self) -> _Login:
@@ -162,8 +154,7 @@ class Account:
         if changes:
             # Google carries out a repeated request with the same id once
             query.setdefault('requestId', str(uuid.uuid4()))
-        end = time.monotonic() + self._patience
-        unsure = False
+        begin, unsure = time.monotonic(), False
 
         def attempt() -> Optional[dict[str, Any]]:
             nonlocal unsure
@@ -173,12 +164,13 @@ class Account:
                     grace=lambda: ON_ITS_WAY if changes else 0.0)
             except FogError as error:
                 unsure = unsure or not error.refused
-                if getattr(error, 'temporary', False) and time.monotonic() < end:
+                if isinstance(error, GoogleError) and error.temporary \
+                        and time.monotonic() - begin < (PATIENCE if error.code else UNANSWERED):
                     return None
                 error.refused = not unsure
                 raise
 
-        return wait_until(attempt, timeout=2 * self._patience + OPERATION_TIMEOUT, cancel=cancel,
+        return wait_until(attempt, timeout=2 * PATIENCE + OPERATION_TIMEOUT, cancel=cancel,
                           interval=0.5, longest=5.0, what=what)
 
     def _send(

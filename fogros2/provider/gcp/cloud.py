@@ -9,10 +9,10 @@ from decimal import Decimal
 import os
 from typing import Any, Callable, ClassVar, Optional
 
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import Image, MachineState
 from fogros2.provider import TAG_NAME, TAG_ON_EXIT, TAG_ROBOT
-from fogros2.provider.gcp import firewall, guest, images, instances
+from fogros2.provider.gcp import firewall, guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.options import Options
@@ -57,21 +57,17 @@ class ComputeEngine(VmCloud):
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or Account()
-
-    def _with(self, account: Account) -> ComputeEngine:
-        other = copy.copy(self)
-        other._account = account
-        return other
-
-    def hasty(self) -> ComputeEngine:
-        """Return an adapter with few attempts."""
-        return self._with(self._account.hasty())
+        #: GPUs to attach, for the price.
+        self._gpus: Mapping[str, int] = {}
 
     # -- the account ----------------------------------------------------------------------------
 
     def account(self, options: Any) -> ComputeEngine:
-        """Return an adapter for the project that options name."""
-        return self._with(self._account.of_project(options.project_id))
+        """Return an adapter for the project and the GPUs that options name."""
+        other = copy.copy(self)
+        other._account = self._account.of_project(options.project_id)
+        other._gpus = {gpu['acceleratorType']: gpu['acceleratorCount'] for gpu in options.gpus()}
+        return other
 
     def check_credentials(self) -> None:
         """Check that there are credentials and a project."""
@@ -79,8 +75,8 @@ class ComputeEngine(VmCloud):
 
     def whoami(self, region: str) -> str:
         """Return the project."""
-        project = self._account.hasty().project
-        self._account.hasty().call('GET', project, f"asking Google for the project '{project}'")
+        project = self._account.project
+        self._account.call('GET', project, f"asking Google for the project '{project}'")
         return f'project {project}, {region}'
 
     def default_region(self) -> str:
@@ -95,12 +91,12 @@ class ComputeEngine(VmCloud):
     # -- types and prices -----------------------------------------------------------------------
 
     def account_key(self) -> str:
-        """Return what distinguishes this project and endpoint from others in the cache."""
-        return f'{self._account.project}|{os.environ.get(ENDPOINT_VARIABLE, "")}'
+        """Return what distinguishes this project, endpoint and GPUs from others in the cache."""
+        return f'{self._account.project}|{os.environ.get(ENDPOINT_VARIABLE, "")}|{self._gpus}'
 
     def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
         """Return the types of every zone of a region; all types if none is named."""
-        key = (region, *names)
+        key = (self._account.project, region, *names)
         if key not in self._account.types:
             kinds = ' OR '.join(f'(name = "{name}")' for name in names)
             zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
@@ -122,10 +118,24 @@ class ComputeEngine(VmCloud):
             found.setdefault(entry['name'], []).append(entry['zone'])
         return found
 
+    def _priced(self, region: str, names: Sequence[str], spot: bool) -> dict[str, Decimal]:
+        known = prices.rates()
+        costs = {entry['name']: prices.price(known, region, entry, self._gpus, spot)
+                 for entry in self._types(region, names)}
+        return {name: cost for name, cost in costs.items() if cost is not None}
+
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Refuse: Google's API has no prices of types."""
-        raise ProviderError("Google's prices are not known here",
-                            'name a machine_type=, and leave max_price= out')
+        """Return the prices on demand by Google's catalogue, if a key for it is set."""
+        return self._priced(region, (name,) if name else (), False)
+
+    def spot_prices(
+        self, region: str, names: Optional[Sequence[str]],
+    ) -> dict[str, dict[str, Decimal]]:
+        """Return the spot prices, which are the same in all zones of a region."""
+        zones = self.zones(region)
+        return {name: dict.fromkeys(zones[name], cost)
+                for name, cost in self._priced(region, (), True).items()
+                if names is None or name in names}
 
     def architecture(self, region: str, types: Sequence[str]) -> str:
         """Return the architecture of types, if it is the same for all."""

@@ -25,6 +25,9 @@ STATES = {
                     MachineState.STOPPING),
     **dict.fromkeys(('TERMINATED', 'STOPPED', 'SUSPENDED'), MachineState.STOPPED),
 }
+#: GB of GPUs, which the API does not tell.
+_GPU_GB = {'nvidia-tesla-t4': 16, 'nvidia-l4': 24, 'nvidia-tesla-v100': 16,
+           'nvidia-tesla-a100': 40, 'nvidia-a100-80gb': 80, 'nvidia-h100-80gb': 80}
 #: Google's limits of ``maxRunDuration`` in seconds.
 _SHORTEST, _LONGEST = 30, 120 * 86400
 
@@ -131,12 +134,14 @@ def vm_of(project: str, instance: Mapping[str, Any]) -> Vm:
 def machine_type(entry: Mapping[str, Any]) -> MachineType:
     """Convert an entry of machineTypes."""
     vcpus, gpus = int(entry['guestCpus']), (entry.get('accelerators') or [{}])[0]
+    gpu = str(gpus.get('guestAcceleratorType', ''))
     arch = {'ARM64': 'arm64'}.get(entry.get('architecture', ''), 'x86_64')
     one = arch == 'arm64' or vcpus == 1  # arm64 has one thread on each core
     return MachineType(
         entry['name'], vcpus, vcpus if one else vcpus // 2, entry['memoryMb'] / 1024, arch,
         gpus=int(gpus.get('guestAcceleratorCount', 0)),
-        gpu=str(gpus.get('guestAcceleratorType', '')).replace('-', ' ').upper(), spot=True)
+        gpu=gpu.replace('-', ' ').upper(),
+        gpu_memory_gb=round(_GPU_GB.get(gpu, 0) / 1.024 ** 3, 1), spot=True)
 
 
 def when(text: Optional[str]) -> Optional[float]:

@@ -35,3 +35,37 @@ def test_gcp_talker_from_nothing_to_nothing(robot, box, name):
     assert clean(run), run.text
     calls = box.calls()
     assert len(calls) <= CALLS, [call.action for call in calls]
+
+
+TWO = '''\
+from fogros2 import CloudNode, FogROSLaunchDescription, GCPCloudInstance
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    one = GCPCloudInstance(name='{name}-one', region='nearest')
+    two = GCPCloudInstance(name='{name}-two', zone='europe-west3-b', machine_type='n2-standard-2')
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        CloudNode(machine=one, executable='talker', **words),
+        CloudNode(machine=two, executable='listener', **words),
+        Node(executable='listener', name='here', **words),
+    ])
+'''
+
+
+@pytest.mark.soak
+def test_machines_of_two_zones_hear_each_other(robot, box, name):
+    path = robot.write('two.launch.py', TWO.format(name=name))
+    shown = robot.ros2('launch', path, '-s')
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert box.calls() == []
+    run = robot.launch(path)
+    run.wait_for(f'[listener]: I heard: [Hello World from {name}-one ')
+    run.wait_for(f'[here]: I heard: [Hello World from {name}-one ')
+    found = {i.tags['fogros2-name']: i for i in box.alive()}
+    assert found[f'{name}-one'].region in ('us-central1', 'europe-west3')
+    assert found[f'{name}-two'].zone == 'europe-west3-b'
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text

@@ -19,7 +19,7 @@ from typing import Any, Optional
 from urllib.parse import parse_qsl
 
 from rigs.computers.box import Call
-from rigs.gce import discovery
+from rigs.gce import catalogue, discovery
 from rigs.gce.cloud import GUEST_TOKEN
 from rigs.gce.errors import late, Refusal
 from rigs.gce.resources import Project
@@ -65,6 +65,8 @@ class Api:
         body = environ['wsgi.input'].read(int(environ.get('CONTENT_LENGTH') or 0))
         if environ['PATH_INFO'] == '/token':
             status, answer = self._token(dict(parse_qsl(body.decode())))
+        elif environ['PATH_INFO'] == '/v1/services/6F81-5844-456A/skus':
+            status, answer = self._skus(dict(parse_qsl(environ.get('QUERY_STRING', ''))))
         else:
             status, answer = self._answer(environ, body)
         data = json.dumps(answer).encode()
@@ -87,6 +89,17 @@ class Api:
         token = f'ya29.{secrets.token_urlsafe(20)}'
         self._tokens.add(token)
         return 200, {'access_token': token, 'expires_in': 3599, 'token_type': 'Bearer'}
+
+    def _skus(self, query: Mapping[str, str]) -> tuple[int, Any]:
+        """Answer for the catalogue of prices, which has pages."""
+        self.calls.append(Call('cloudbilling', '', 'services.skus.list', ''))
+        if query.get('key') != catalogue.API_KEY:
+            return 400, {'error': {'code': 400, 'message': 'API key not valid.'}}
+        begin, found = int(query.get('pageToken') or 0), catalogue.skus()
+        answer = {'skus': found[begin:begin + 5],
+                  'nextPageToken': str(begin + 5) if begin + 5 < len(found) else ''}
+        discovery.check({'$ref': 'ListSkusResponse'}, answer, 'skus', 'cloudbilling')
+        return 200, answer
 
     def token(self) -> str:
         """Return a token for a client of a test."""

@@ -61,3 +61,35 @@ DEFAULT_RULES: tuple[tuple[str, str, str, list[str]], ...] = (
     ('internal', INTERNAL, 'tcp', ['0-65535']), ('internal-udp', INTERNAL, 'udp', ['0-65535']),
     ('ssh', ANYWHERE, 'tcp', ['22']), ('rdp', ANYWHERE, 'tcp', ['3389']),
     ('icmp', ANYWHERE, 'icmp', []))
+
+#: Key of the catalogue of prices in a box.
+API_KEY = 'AIza-in-a-box'
+#: Entries of the catalogue: description, region, dollars an hour, two tiers if it is free first.
+SKUS = (
+    ('E2 Instance Core running in Frankfurt', 'europe-west3', '0.02810370'),
+    ('E2 Instance Ram running in Frankfurt', 'europe-west3', '0.00376602'),
+    ('Spot Preemptible E2 Instance Core running in Frankfurt', 'europe-west3', '0.00562350'),
+    ('Spot Preemptible E2 Instance Ram running in Frankfurt', 'europe-west3', '0.00075210'),
+    ('N1 Predefined Instance Core running in Frankfurt', 'europe-west3', '0.04073000'),
+    ('N1 Predefined Instance Ram running in Frankfurt', 'europe-west3', '0.00545800'),
+    ('N2 Instance Core running in Frankfurt', 'europe-west3', '0.04073000'),
+    ('N2 Instance Ram running in Frankfurt', 'europe-west3', '0.00545800'),
+    ('Nvidia Tesla T4 GPU running in Frankfurt', 'europe-west3', '0.41000000'),
+    ('E2 Custom Instance Core running in Frankfurt', 'europe-west3', '9.00000000'),
+    ('N2 Sole Tenancy Instance Core running in Frankfurt', 'europe-west3', '9.00000000'),
+    ('Commitment v1: N2 Cpu in Frankfurt for 1 Year', 'europe-west3', '9.00000000'),
+    ('Storage PD Capacity in Frankfurt', 'europe-west3', '0.04800000'))
+
+
+def skus() -> list[dict[str, Any]]:
+    """Return the entries of Google's catalogue of prices."""
+    found = []
+    for number, (text, region, dollars) in enumerate(SKUS):
+        units, _, nanos = dollars.partition('.')
+        found.append({
+            'name': f'services/6F81-5844-456A/skus/{number}', 'skuId': str(number),
+            'description': text, 'serviceRegions': [region],
+            'pricingInfo': [{'pricingExpression': {'tieredRates': [{
+                'startUsageAmount': 0, 'unitPrice': {
+                    'currencyCode': 'USD', 'units': units, 'nanos': int(f'{nanos}0')}}]}}]})
+    return found

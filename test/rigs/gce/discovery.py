@@ -27,11 +27,11 @@ class Mismatch(ValueError):
     """A value is not what the description says."""
 
 
-@functools.lru_cache(maxsize=1)
-def document() -> Mapping[str, Any]:
-    """Return the discovery document."""
+@functools.lru_cache(maxsize=2)
+def document(api: str = 'compute') -> Mapping[str, Any]:
+    """Return the discovery document of an API."""
     text = (resources.files('googleapiclient') / 'discovery_cache' / 'documents'
-            / 'compute.v1.json').read_text()
+            / f'{api}.v1.json').read_text()
     found: Mapping[str, Any] = json.loads(text)
     return found
 
@@ -98,19 +98,19 @@ def check_answer(found: Route, answer: Any) -> None:
     check(document()['schemas'][found.method['response']['$ref']], answer, found.name)
 
 
-def check(schema: Mapping[str, Any], value: Any, where: str) -> None:
+def check(schema: Mapping[str, Any], value: Any, where: str, api: str = 'compute') -> None:
     """
     Check a value against a schema.
 
     :raises Mismatch: it does not fit.
     """
-    for problem in _problems(schema, value, where):
+    for problem in _problems(schema, value, where, api):
         raise Mismatch(problem)
 
 
-def _problems(schema: Mapping[str, Any], value: Any, where: str) -> Iterator[str]:
+def _problems(schema: Mapping[str, Any], value: Any, where: str, api: str) -> Iterator[str]:
     if '$ref' in schema:
-        schema = document()['schemas'][schema['$ref']]
+        schema = document(api)['schemas'][schema['$ref']]
     kind = schema.get('type', 'any')
     types: dict[str, Any] = {
         'string': str, 'integer': int, 'number': (int, float), 'boolean': bool, 'array': list,
@@ -127,11 +127,11 @@ def _problems(schema: Mapping[str, Any], value: Any, where: str) -> Iterator[str
             yield f'{where} is {value!r}, no number'
     elif kind == 'array':
         for index, item in enumerate(value):
-            yield from _problems(schema['items'], item, f'{where}[{index}]')
+            yield from _problems(schema['items'], item, f'{where}[{index}]', api)
     elif kind == 'object':
         for name, item in value.items():
             known = schema.get('properties', {}).get(name) or schema.get('additionalProperties')
             if known is None:
                 yield f'{where} has no field {name!r}'
             else:
-                yield from _problems(known, item, f'{where}.{name}')
+                yield from _problems(known, item, f'{where}.{name}', api)
