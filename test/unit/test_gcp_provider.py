@@ -26,6 +26,7 @@ from fogros2.provider.gcp.options import Options
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.testing import request_for
+from fogros2.waiting import wait_until
 
 SPEC = MachineSpec('planner', 'gcp', {})
 REQUEST = CreateRequest('5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37', 'ssh-ed25519 AAAA robot',
@@ -220,7 +221,11 @@ def test_stopped_machine_of_another_launch_is_no_leftover(gce):
     spec, provider = dataclasses.replace(SPEC, on_exit='stop'), GCPProvider()
     machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: 'stop'}))
     provider.stop(machine)
-    provider.adopt(machine, SPEC, {TAG_ON_EXIT: 'delete'})
+    wait_until(lambda: provider.describe(machine).state is MachineState.STOPPED, timeout=5,
+               what='it to be stopped')
+    again = dataclasses.replace(SPEC, lifetime=60.0)
+    provider.adopt(machine, again, {TAG_ON_EXIT: 'delete'})
+    assert gce.instances[0]['scheduling']['maxRunDuration'] == {'seconds': '60'}
     provider.start(machine)
     assert provider.reachable(machine, name='planner', timeout=5.0).state is MachineState.RUNNING
 
@@ -297,6 +302,13 @@ def test_denial_is_between_our_rules_and_googles(gce):
     provider.allow(machine, 22, [])
     assert not [rule for rule in gce.own_firewalls if rule['name'].endswith('tcp-22')]
     provider.destroy(machine)
+    assert gce.own_firewalls == []
+
+
+def test_robot_without_ipv4_is_told_before_creation(gce):
+    spec = MachineSpec('planner', 'gcp', {'ssh_from': ['2001:db8::/64']})
+    with pytest.raises(ConfigurationError, match='the robot has none'):
+        GCPProvider().create(spec, request_for(spec))
     assert gce.own_firewalls == []
 
 

@@ -12,6 +12,7 @@ import threading
 import time
 from typing import Any, cast, Optional
 import uuid
+import warnings
 
 from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError
 from fogros2.provider.gcp import failures
@@ -23,7 +24,8 @@ ENDPOINT = 'https://compute.googleapis.com/compute/v1/'
 ENDPOINT_VARIABLE = 'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE'
 _SCOPES = ('https://www.googleapis.com/auth/cloud-platform',)
 #: Variables on which the credentials depend.
-_VARIABLES = ('GOOGLE_APPLICATION_CREDENTIALS', 'CLOUDSDK_CONFIG', 'HOME')
+_VARIABLES = (
+    'GOOGLE_APPLICATION_CREDENTIALS', 'GOOGLE_CLOUD_PROJECT', 'CLOUDSDK_CONFIG', 'HOME')
 #: Seconds in which a request is sent again that Google refuses, or does not answer.
 PATIENCE, UNANSWERED = 20.0, 2.0
 #: Seconds to wait for the answer to a sent request, which may create something.
@@ -57,8 +59,10 @@ class _Login:
                 'machines at Google take google-auth and requests, which are not installed',
                 'python3 -m pip install google-auth requests') from error
         try:
-            # any, because the library has types for a part of it
-            self._credentials, project = cast(Any, google.auth).default(scopes=_SCOPES)
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore')  # of credentials of a person
+                # any, because the library has types for a part of it
+                self._credentials, project = cast(Any, google.auth).default(scopes=_SCOPES)
         except GoogleAuthError as error:
             raise PrerequisiteError(f"the Google credentials can't be read: {error}",
                                     'gcloud auth application-default login') from error
@@ -122,8 +126,7 @@ class Account:
 
         :raises PrerequisiteError: there are no credentials, or nobody has named a project.
         """
-        project = self._project or os.environ.get('GOOGLE_CLOUD_PROJECT') \
-            or os.environ.get('CLOUDSDK_CORE_PROJECT') or self._opened().project
+        project = self._project or self._opened().project
         if not project:
             raise PrerequisiteError('no project of Google Cloud is named',
                                     "project_id='...', or set GOOGLE_CLOUD_PROJECT")

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
-from typing import Any, Callable, ClassVar, Optional
+from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
-from fogros2.model import Image, MachineState
+from fogros2.model import Image, MachineSpec, MachineState
 from fogros2.provider import TAG_NAME, TAG_ON_EXIT, TAG_ROBOT
 from fogros2.provider.gcp import firewall, guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
@@ -18,6 +18,7 @@ from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.gcp.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
+from fogros2.provider.vm.address import ADDRESS_VARIABLE
 from fogros2.provider.vm.cloud import (
     CloudError,
     Order,
@@ -200,14 +201,17 @@ class ComputeEngine(VmCloud):
         network = f'global/networks/{order.options.network}'
         tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
                 'region': region}
-        rules = [firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
-                 firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
-                               order.request.vpn_port)]
-        if firewall.ipv4(order.sources):
-            rules.append(firewall.rule(
-                order.attempt, f'tcp-{firewall.SSH}', network, tags,
-                firewall.ipv4(order.sources), 'tcp', firewall.SSH))
-        firewall.create(self._account, rules, self.cancel)
+        sources = firewall.ipv4(order.sources)
+        if not sources:
+            raise ConfigurationError(
+                'machines at Google have IPv4 addresses, and the robot has none',
+                f'{ADDRESS_VARIABLE}= or ssh_from= names an address or a network of IPv4')
+        firewall.create(self._account, [
+            firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
+            firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
+                          order.request.vpn_port),
+            firewall.rule(order.attempt, f'tcp-{firewall.SSH}', network, tags, sources, 'tcp',
+                          firewall.SSH)], self.cancel)
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
@@ -311,6 +315,18 @@ class ComputeEngine(VmCloud):
             except GoogleError as error:
                 if error.code != 'CONDITION_NOT_MET' or not again:
                     raise
+
+    def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
+        """Change when Google ends an instance, which it takes for stopped instances only."""
+        path, what = _path(machine.vm), f'writing how {machine.vm} ends'
+        found = self._account.call('GET', path, what, cancel=self.cancel)
+        words = {key: value for key, value in found['scheduling'].items()
+                 if key not in ('maxRunDuration', 'instanceTerminationAction')}
+        if found['status'] == 'TERMINATED':
+            # stopped, with the action of a machine that is deleted, would mean that it has ended
+            words.update(instances.limit(spec, spot=False, action='STOP'))
+            self._account.run('POST', f'{path}/setScheduling', what, cancel=self.cancel,
+                              body=words)
 
     def stop(self, machine: VmId) -> None:
         """Stop an instance."""

@@ -90,21 +90,29 @@ def insertion(
 
 
 def scheduling(spec: MachineSpec, options: Options, *, gpus: bool) -> dict[str, Any]:
+    """Return how Google places an instance, and when it ends it."""
+    return {
+        'automaticRestart': False,
+        'onHostMaintenance': 'TERMINATE' if options.spot or gpus else 'MIGRATE',
+        'provisioningModel': 'SPOT' if options.spot else 'STANDARD',
+        **limit(spec, spot=options.spot, action='STOP' if spec.on_exit == 'stop' else 'DELETE')}
+
+
+def limit(spec: MachineSpec, *, spot: bool, action: str) -> dict[str, Any]:
     """
-    Return how Google ends an instance: at its lifetime, and when it preempts a spot instance.
+    Return when Google ends an instance: at its lifetime, and when it preempts a spot instance.
 
     A machine that is kept has no such end: another launch may use it for longer, and Google
     changes the time of stopped instances only.
+
+    :param action: STOP or DELETE.
     """
-    words: dict[str, Any] = {
-        'automaticRestart': False,
-        'onHostMaintenance': 'TERMINATE' if options.spot or gpus else 'MIGRATE',
-        'provisioningModel': 'SPOT' if options.spot else 'STANDARD'}
+    words: dict[str, Any] = {}
     if spec.on_exit != 'keep':
         seconds = min(max(math.ceil(spec.lifetime), _SHORTEST), _LONGEST)
         words['maxRunDuration'] = {'seconds': str(seconds)}
-    if options.spot or spec.on_exit != 'keep':
-        words['instanceTerminationAction'] = 'STOP' if spec.on_exit == 'stop' else 'DELETE'
+    if spot or spec.on_exit != 'keep':
+        words['instanceTerminationAction'] = action
     return words
 
 

@@ -472,20 +472,8 @@ class Project:
         if not subnet['autoCreateSubnetworks'] and not body['networkInterfaces'][0].get(
                 'subnetwork', '').endswith(f'/regions/{zone[:-2]}/subnetworks/{name}'):
             raise Refusal('invalid', 'a subnetwork is required for a network in custom mode')
-        words = body.get('scheduling', {})
-        spot = words.get('provisioningModel') == 'SPOT' or words.get('preemptible')
-        gpus = body.get('guestAccelerators') or kind.get('accelerators')
-        if (spot or gpus) and words.get('onHostMaintenance') != 'TERMINATE':
-            raise Refusal('invalid', 'Instances with guest accelerators, and Spot VMs, do not '
-                          'support live migration.')
-        if spot and words.get('automaticRestart', True):
-            raise Refusal('invalid', 'Scheduling must have automaticRestart false for Spot VMs.')
-        if 'instanceTerminationAction' in words and not spot and 'maxRunDuration' not in words:
-            raise Refusal('invalid', 'Instance termination action needs a Spot VM or a limit.')
-        if 'maxRunDuration' in words and not (
-                30 <= int(words['maxRunDuration']['seconds']) <= 120 * 86400
-                and 'instanceTerminationAction' in words):
-            raise Refusal('invalid', "Invalid value for field 'scheduling.maxRunDuration'")
+        _check_scheduling(body.get('scheduling', {}), bool(
+            body.get('guestAccelerators') or kind.get('accelerators')))
         for gpu in body.get('guestAccelerators', ()):
             if _last(gpu['acceleratorType']) not in catalogue.ACCELERATORS:
                 raise Refusal('notFound', f"The resource '{gpu['acceleratorType']}' was not found")
@@ -560,6 +548,15 @@ class Project:
             self.cloud.start(instance['id'])
             self._limit(instance)
         return self.start('start', instance, over=lambda: self._state(instance) != 'pending')
+
+    def instances_set_scheduling(self, words: Words, query: Words, body: Any) -> Any:
+        """Replace the scheduling of a stopped instance."""
+        instance = self._instance(words)
+        if self._state(instance) != 'stopped':
+            raise Refusal('resourceInUseByAnotherResource', 'The instance must be terminated.')
+        _check_scheduling(body, False)
+        instance['scheduling'] = body
+        return self.start('setScheduling', instance)
 
     def instances_set_labels(self, words: Words, query: Words, body: Any) -> Any:
         """Replace all labels."""
@@ -671,6 +668,21 @@ def _check_firewall(body: Mapping[str, Any]) -> None:
         raise Refusal('invalid', "Invalid value for field 'description'")
     if not ranges and not body.get('sourceTags'):
         raise Refusal('invalid', 'a rule without sources is for everybody: name them here')
+
+
+def _check_scheduling(words: Mapping[str, Any], gpus: bool) -> None:
+    spot = words.get('provisioningModel') == 'SPOT' or words.get('preemptible')
+    if (spot or gpus) and words.get('onHostMaintenance') != 'TERMINATE':
+        raise Refusal('invalid', 'Instances with guest accelerators, and Spot VMs, do not '
+                      'support live migration.')
+    if spot and words.get('automaticRestart', True):
+        raise Refusal('invalid', 'Scheduling must have automaticRestart false for Spot VMs.')
+    if 'instanceTerminationAction' in words and not spot and 'maxRunDuration' not in words:
+        raise Refusal('invalid', 'Instance termination action needs a Spot VM or a limit.')
+    if 'maxRunDuration' in words and not (
+            30 <= int(words['maxRunDuration']['seconds']) <= 120 * 86400
+            and 'instanceTerminationAction' in words):
+        raise Refusal('invalid', "Invalid value for field 'scheduling.maxRunDuration'")
 
 
 def _check_labels(labels: Mapping[str, str]) -> None:
