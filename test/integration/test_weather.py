@@ -219,4 +219,5 @@ def test_launch_survives_a_bad_network(weather, engine, cloud_network, tmp_path,
             run.interrupt()
             assert run.ended() == 0, run.text
         finally:
+            print(run.text)  # shown if the test fails
             relay.close()
