@@ -80,6 +80,7 @@ class Vm:
     :param created: seconds since the epoch; ``stopped`` is when it was stopped.
     :param key: the cloud's name of its login key.
     :param reason: why it ended, in the cloud's words.
+    :param note: a warning for people, shown when the machine is reached.
     """
 
     id: str
@@ -96,6 +97,7 @@ class Vm:
     image: str = ''
     key: str = ''
     reason: str = ''
+    note: str = ''
 
 
 @dataclasses.dataclass(frozen=True)
@@ -283,12 +285,13 @@ class VmCloud(abc.ABC):
 
     @abc.abstractmethod
     def insert(
-        self, place: Place, order: Order, prepared: Any, created: Sequence[str],
+        self, place: Place, order: Order, prepared: Any, created: list[str],
         tags: Mapping[str, str],
     ) -> str:
         """
         Request a machine and return the cloud's id; the same token never creates two.
 
+        :param created: ids for ``undo_begin``; what it creates besides is added.
         :param tags: of the machine: those of the order, the host key and the price.
         :raises CloudError: with ``full`` if there is no capacity.
         """

@@ -234,9 +234,9 @@ class VmProvider(Provider):
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
                     f'the console of {cloud.title} has its system log')
             found = self.machine_of(vm)
+            notes = '; '.join(filter(None, (vm.note, self._notes.get(machine.vm))))
             return dataclasses.replace(
-                found, id=machine_id, note=self._notes.get(machine.vm, ''),
-            ) if found.shell is not None else None
+                found, id=machine_id, note=notes) if found.shell is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(
